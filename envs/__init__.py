@@ -1,0 +1,38 @@
+"""Environments: random mazes as TorchRL and Gymnasium environments."""
+
+from __future__ import annotations
+
+from torchrl_hmcts.envs.gridworld import GridworldMazeEnv
+from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
+from torchrl_hmcts.envs.mazes import (
+    check_mazes,
+    free_tiles,
+    generate_mazes,
+    maze_from_text,
+    maze_pool,
+    maze_to_text,
+    shortest_path,
+    shortest_path_lengths,
+    wall_centers,
+)
+from torchrl_hmcts.envs.rendering import draw_maze
+from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
+
+__all__ = [
+    "GridworldMazeEnv",
+    "TorchRLGymnasiumEnv",
+    "WaterworldMazeEnv",
+    "check_mazes",
+    "draw_maze",
+    "free_tiles",
+    "generate_mazes",
+    "maze_from_text",
+    "maze_pool",
+    "maze_to_text",
+    "register_envs",
+    "shortest_path",
+    "shortest_path_lengths",
+    "wall_centers",
+]
+
+register_envs()

@@ -1,0 +1,38 @@
+"""What every test gets: one thread, fixed seeds, a maze cache of its own."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Iterator
+
+os.environ.setdefault("MPLBACKEND", "Agg")  # before anything imports matplotlib
+
+import hypothesis
+import numpy as np
+import pytest
+import torch
+
+# Numba compiles within the first example, so a deadline would fail it by chance. Derandomised:
+# a red test is red again for whoever looks into it.
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("tests")
+
+# Batches are small; the second thread of a two-core machine only makes them wait.
+torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def fixed_seeds() -> None:
+    """Gives each test the same random numbers whatever ran before it."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002  third-party code draws from the global generator
+    torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def maze_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keeps the tests off the user's cache folder, in sub-processes too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHRL_HMCTS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield

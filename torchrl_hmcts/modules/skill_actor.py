@@ -1,0 +1,168 @@
+"""The skill-conditioned actor, for losses and, stripped to its network, for use inside options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import nn
+from torchrl.data import Categorical, Composite, OneHot, TensorSpec
+from torchrl.modules import OneHotCategorical, ProbabilisticActor
+
+from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
+
+
+class SkillActor(ProbabilisticActor):
+    r"""A discrete policy pi(a | s, z) with shared layers and one head per skill.
+
+    .. math:: \pi(a \mid s, z) = \mathrm{softmax}_a(\mathrm{SkillMLP}(s, z))
+
+    It is the actor TorchRL's discrete losses want (a ``ProbabilisticTensorDictSequential``). Inside
+    options use the lean :class:`SkillPolicy` over the same parameters.
+
+    Args:
+        in_features (int): summed sizes of the entries ``in_keys``.
+        action_spec (TensorSpec): the env's action spec, a ``Categorical`` (action int64 ``[*B]``)
+            or a ``OneHot`` (action ``[*B, A]``) with ``A`` actions.
+        num_skills (int): number of skills.
+        in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
+        skill_key (NestedKey): entry of the skill, int64 ``[*B]``. Default ``"skill"``.
+        action_key (NestedKey): entry the action is written to. Default ``"action"``.
+        hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
+        activation (callable): builds the activations. Default ``torch.nn.ReLU``.
+
+    Raises:
+        ValueError: if the action spec is neither ``Categorical`` nor ``OneHot``.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.modules import SkillActor
+        >>> actor = SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"])
+        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
+        ...                 batch_size=[5])
+        >>> actor(td)["action"].shape
+        torch.Size([5])
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        action_spec: TensorSpec,
+        num_skills: int,
+        *,
+        in_keys: Sequence[NestedKey],
+        skill_key: NestedKey = "skill",
+        action_key: NestedKey = "action",
+        hidden: Sequence[int] = (64, 64),
+        activation: Callable[[], nn.Module] = nn.ReLU,
+    ) -> None:
+        spec, one_hot = _leaf_spec(action_spec, action_key)
+        num_actions = int(spec.space.n)
+        action_key = unravel_key(action_key)
+        logits_key = (
+            "logits" if isinstance(action_key, str) else (*action_key[:-1], "logits")
+        )
+        network = SkillMLP(in_features, num_actions, num_skills, hidden, activation)
+        keys = [*key_list("SkillActor", in_keys), skill_key]
+        super().__init__(
+            SkillNetwork(network, keys, logits_key),
+            in_keys={"logits": logits_key},
+            out_keys=[action_key],
+            spec=Composite({action_key: spec}),
+            distribution_class=OneHotCategorical if one_hot else torch.distributions.Categorical,
+            return_log_prob=False,
+        )
+        self.num_skills = num_skills
+        self.num_actions = num_actions
+        self.one_hot = one_hot
+        self.skill_key = unravel_key(skill_key)
+        self.action_key = action_key
+
+    @property
+    def network(self) -> SkillMLP:
+        """The shared trunk and heads that compute the action logits."""
+        return self.module[0].network
+
+
+class SkillPolicy(TensorDictModuleBase):
+    """Acts like a :class:`SkillActor` at a fraction of its cost, sharing its parameters.
+
+    No distribution objects, no spec checks, no gradients: it reads the features and the skill and
+    writes the action. That makes it the worker to run inside options and the collection policy of
+    the trainer.
+
+    Args:
+        actor (SkillActor): the actor whose parameters are used; later updates are seen.
+        deterministic (bool): take the most probable action instead of sampling. Default ``False``.
+        generator (torch.Generator, optional): source of the samples. Default ``None``: torch's
+            global one.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.modules import SkillActor, SkillPolicy
+        >>> actor = SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"])
+        >>> policy = SkillPolicy(actor, deterministic=True)
+        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
+        ...                 batch_size=[5])
+        >>> policy(td)["action"].dtype
+        torch.int64
+    """
+
+    def __init__(
+        self,
+        actor: SkillActor,
+        *,
+        deterministic: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(actor, SkillActor):
+            raise TypeError(
+                "SkillPolicy runs the network of a SkillActor without its distribution; got "
+                f"{type(actor).__name__}. Pass a SkillActor, or use your module itself as policy."
+            )
+        self.network = actor.network
+        self.num_skills = actor.num_skills
+        self.num_actions = actor.num_actions
+        self.in_keys = list(actor.module[0].in_keys)
+        self.out_keys = [actor.action_key]
+        self.action_key = actor.action_key
+        self.one_hot = actor.one_hot
+        self.deterministic = bool(deterministic)
+        self.generator = generator
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        scores = self.network(*[tensordict.get(key) for key in self.in_keys])
+        if not self.deterministic:
+            # Gumbel-max: argmax(logits - log E) with E exponential is a draw from softmax(logits).
+            noise = torch.empty_like(scores).exponential_(generator=self.generator)
+            scores -= noise.log_()
+        action = scores.argmax(-1)
+        if self.one_hot:
+            action = nn.functional.one_hot(action, self.num_actions)
+        return tensordict.set(self.action_key, action)
+
+
+def _leaf_spec(action_spec: TensorSpec, action_key: NestedKey) -> tuple[TensorSpec, bool]:
+    """Returns the unbatched leaf spec and whether it is one-hot."""
+    if isinstance(action_spec, Composite):
+        action_spec = action_spec[action_key]
+    if isinstance(action_spec, OneHot):
+        return OneHot(int(action_spec.space.n), dtype=action_spec.dtype), True
+    if isinstance(action_spec, Categorical):
+        return Categorical(int(action_spec.space.n)), False
+    raise ValueError(
+        "SkillActor chooses among a fixed number of actions, so it needs a Categorical or OneHot "
+        f"action spec; got {type(action_spec).__name__}. Pass env.action_spec of a discrete env."
+    )

@@ -1,0 +1,68 @@
+"""The discriminator that tells skills apart by where they lead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_hmcts.modules.skill_mlp import SkillNetwork, check_positive, key_list, shared_layers
+
+
+class SkillDiscriminator(SkillNetwork):
+    r"""Logits of q(z | features of s'), the guess which skill led to a state.
+
+    .. math:: q(z \mid s') = \mathrm{softmax}_z(\mathrm{MLP}(\phi(s')))
+
+    What the features :math:`\phi` are decides what "different skills" means: with the displacement
+    since the skill began they are directions, with the position they are places. Losses and reward
+    transforms call it on the ``"next"`` part of a transition, so ``in_keys`` are written without
+    ``"next"``.
+
+    Args:
+        in_features (int): summed sizes of the entries ``in_keys``.
+        num_skills (int): number of skills ``Z``.
+        in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
+            ``["displacement"]``.
+        skill_logits_key (NestedKey): entry written, ``[*B, Z]``. Default ``"skill_logits"``.
+        hidden (sequence of int): widths of the hidden layers. Default ``(64, 64)``.
+        activation (callable): builds the activations. Default ``torch.nn.ReLU``.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.modules import SkillDiscriminator
+        >>> discriminator = SkillDiscriminator(2, num_skills=4)
+        >>> td = TensorDict(displacement=torch.randn(5, 2), batch_size=[5])
+        >>> discriminator(td)["skill_logits"].shape
+        torch.Size([5, 4])
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        num_skills: int,
+        *,
+        in_keys: Sequence[NestedKey] = ("displacement",),
+        skill_logits_key: NestedKey = "skill_logits",
+        hidden: Sequence[int] = (64, 64),
+        activation: Callable[[], nn.Module] = nn.ReLU,
+    ) -> None:
+        check_positive("SkillDiscriminator", in_features=in_features, num_skills=num_skills)
+        layers = shared_layers("SkillDiscriminator", in_features, hidden, activation)
+        network = _Concat(*layers, nn.Linear(hidden[-1], num_skills))
+        super().__init__(network, key_list("SkillDiscriminator", in_keys), skill_logits_key)
+        self.num_skills = num_skills
+
+
+class _Concat(nn.Sequential):
+    """A Sequential that concatenates its inputs first."""
+
+    def forward(self, *features: Tensor) -> Tensor:
+        x = features[0] if len(features) == 1 else torch.cat(features, -1)
+        return super().forward(x)

@@ -1,0 +1,60 @@
+"""Plans: what a search found, as tensors.
+
+Letters: *B batch of roots, L length of the longest plan.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase, tensorclass
+from torch import Tensor
+
+from torchrl_hmcts.planners.search import Search
+
+
+@tensorclass
+class Plan:
+    """The best plan of each root: options that earn a reward when carried out one after the other.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=4)
+        >>> plan = MCTSPlanner(env, gamma=0.9).plan(env.reset())
+        >>> plan.options.tolist(), plan.found.item(), round(plan.returns.item(), 2)
+        ([1, 1, 1], True, 0.81)
+    """
+
+    options: Tensor  # [*B, L] int64, -1 behind a plan's end
+    lengths: Tensor  # [*B] int64, 0 where no plan was found
+    found: Tensor  # [*B] bool
+    returns: Tensor  # [*B] float32, discounted return of the plan, 0 without one
+    durations: Tensor  # [*B] int64, base steps of the plan in the simulator
+    states: TensorDictBase  # [*B, L + 1] states between the options, the last one repeated
+
+
+def extract_plans(search: Search) -> Plan:
+    """Read the best plan of each root out of a search, batch ``[B]``."""
+    tree, best = search.tree, search.best_node
+    paths = [
+        np.array(tree.path(b, node)) if node >= 0 else np.zeros(1, np.int64)
+        for b, node in enumerate(best)
+    ]
+    lengths = np.array([len(path) - 1 for path in paths])
+    width = int(lengths.max(initial=0))
+    nodes = np.stack([np.pad(path, (0, width + 1 - len(path)), "edge") for path in paths])
+    rows = np.arange(search.num_roots)[:, None]
+    options = tree.nodes[rows, nodes[:, 1:]]["option"].astype(np.int64)
+    options[np.arange(width) >= lengths[:, None]] = -1
+    last = tree.nodes[np.arange(search.num_roots), nodes[:, -1]]
+    assert tree.states is not None
+    return Plan(
+        options=torch.from_numpy(options),
+        lengths=torch.from_numpy(lengths),
+        found=torch.from_numpy(best >= 0),
+        returns=torch.from_numpy(last["path_return"].copy()),
+        durations=torch.from_numpy(last["base_steps"].astype(np.int64)),
+        states=tree.states[torch.from_numpy(rows), torch.from_numpy(nodes)],
+        batch_size=[search.num_roots],
+    )

@@ -1,0 +1,196 @@
+"""Tiny environments with known solutions, with which to test a planner, worker or loss.
+
+Letters: *B batch of the tensordict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+__all__ = ["ChainEnv", "TableEnv"]
+
+
+class TableEnv(EnvBase):
+    """A deterministic (semi-)Markov decision process given by its table of transitions.
+
+    Stateless, batched and settable: ``"state"`` (int64 ``[*B]``) is its whole state. With
+    durations other than 1 it is a macro environment by itself.
+
+    Args:
+        transitions: ``{(state, action): (next_state, reward, duration)}``; all states and actions
+            from 0 up. A pair that is missing is an action that may not be taken there.
+        terminal: states that end an episode.
+        start: state after a reset. Default 0.
+        device: of all tensors. Default: CPU.
+
+    Raises:
+        ValueError: if the table is empty or a state leads nowhere and is not terminal.
+
+    Example:
+        >>> env = TableEnv({(0, 0): (1, 2.0, 3), (0, 1): (1, 1.0, 1)}, terminal=[1])
+        >>> td = env.step(env.reset().set("action", torch.tensor(0)))
+        >>> td["next", "reward"].item(), td["next", "duration"].item(), td["next", "done"].item()
+        (2.0, 3, True)
+    """
+
+    batch_locked = False
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        transitions: Mapping[tuple[int, int], tuple[int, float, int]],
+        *,
+        terminal: Sequence[int] = (),
+        start: int = 0,
+        device: torch.device | str | None = None,
+    ) -> None:
+        if not transitions:
+            raise ValueError("TableEnv needs at least one transition; the table is empty.")
+        super().__init__(device=device, batch_size=[])
+        num_states = 1 + max(max(s, row[0]) for (s, _), row in transitions.items())
+        num_states = max(num_states, 1 + max(terminal, default=0), 1 + start)
+        num_actions = 1 + max(a for _, a in transitions)
+        self.start = start
+        self._next_state = torch.zeros(num_states, num_actions, dtype=torch.int64, device=device)
+        self._reward = torch.zeros(num_states, num_actions, device=device)
+        self._duration = torch.ones(num_states, num_actions, dtype=torch.int64, device=device)
+        self._allowed = torch.zeros(num_states, num_actions, dtype=torch.bool, device=device)
+        for (state, action), (next_state, reward, duration) in transitions.items():
+            self._next_state[state, action] = next_state
+            self._reward[state, action] = reward
+            self._duration[state, action] = duration
+            self._allowed[state, action] = True
+        self._terminal = torch.zeros(num_states, dtype=torch.bool, device=device)
+        self._terminal[list(terminal)] = True
+        stuck = ~self._allowed.any(-1) & ~self._terminal
+        if stuck.any():
+            raise ValueError(
+                f"State {int(stuck.nonzero()[0])} has no transition and is not terminal. Add one, or "
+                f"name it in terminal={list(terminal)}."
+            )
+        self.state_spec = Composite(state=Categorical(num_states, shape=(), device=device))
+        self.observation_spec = Composite(
+            state=Categorical(num_states, shape=(), device=device),
+            action_mask=Binary(num_actions, dtype=torch.bool, device=device),
+            duration=Unbounded((1,), dtype=torch.int64, device=device),
+        )
+        self.action_spec = Categorical(num_actions, shape=(), device=device)
+        self.reward_spec = Unbounded((1,), device=device)
+        self.done_spec = Composite(
+            {k: Binary(1, dtype=torch.bool, device=device) for k in ("done", "terminated")}
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        state, action = tensordict.get("state"), tensordict.get("action")
+        next_state = self._next_state[state, action]
+        terminated = self._terminal[next_state].unsqueeze(-1)
+        return TensorDict(
+            {
+                "state": next_state,
+                "action_mask": self._allowed[next_state] | terminated,
+                "duration": self._duration[state, action].unsqueeze(-1),
+                "reward": self._reward[state, action].unsqueeze(-1),
+                "terminated": terminated,
+                "done": terminated.clone(),
+            },
+            batch_size=tensordict.batch_size,
+            device=self.device,
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        shape = self.batch_size if tensordict is None else tensordict.batch_size
+        if kwargs.get("set_state") and tensordict is not None:
+            state = tensordict.get("state")
+        else:
+            state = torch.full(shape, self.start, dtype=torch.int64, device=self.device)
+        return TensorDict(
+            {
+                "state": state.clone(),
+                "action_mask": self._allowed[state] | self._terminal[state].unsqueeze(-1),
+                "duration": torch.zeros((*shape, 1), dtype=torch.int64, device=self.device),
+            },
+            batch_size=shape,
+            device=self.device,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is random."""
+
+
+class ChainEnv(EnvBase):
+    """Walk along a chain of states; the right end terminates with reward 1.
+
+    Action 0 goes left (and stays at state 0), action 1 goes right. Stateless, batched and settable:
+    ``"state"`` (int64 ``[*B]``) is its whole state. The best return is ``gamma ** (length - 2)``.
+
+    Args:
+        length: number of states, at least 2.
+        reward_per_step: further reward of every step. Default 0.
+        batch_size: copies that ``reset()`` makes. Default none.
+        device: of all tensors. Default: CPU.
+
+    Raises:
+        ValueError: if ``length`` is below 2.
+
+    Example:
+        >>> env = ChainEnv(length=3)
+        >>> td = env.rollout(5, policy=lambda td: td.set("action", torch.ones((), dtype=torch.int64)))
+        >>> td["next", "reward"].flatten().tolist()
+        [0.0, 1.0]
+    """
+
+    batch_locked = False
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        length: int = 5,
+        *,
+        reward_per_step: float = 0.0,
+        batch_size: Sequence[int] = (),
+        device: torch.device | str | None = None,
+    ) -> None:
+        if length < 2:
+            raise ValueError(f"ChainEnv needs at least 2 states; got length={length}.")
+        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        self.length = length
+        self.reward_per_step = reward_per_step
+        shape = self.batch_size
+        state = Bounded(0, length - 1, shape=shape, dtype=torch.int64, device=device)
+        self.state_spec = Composite(state=state.clone(), shape=shape)
+        self.observation_spec = Composite(state=state, shape=shape)
+        self.action_spec = Categorical(2, shape=shape, device=device)
+        self.reward_spec = Unbounded((*shape, 1), device=device)
+        done = Binary(1, shape=(*shape, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(done=done, terminated=done.clone(), shape=shape)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        state = (tensordict.get("state") + 2 * tensordict.get("action") - 1).clamp_min(0)
+        terminated = (state >= self.length - 1).unsqueeze(-1)
+        return TensorDict(
+            {
+                "state": state.clamp_max(self.length - 1),
+                "reward": terminated.to(torch.float32) + self.reward_per_step,
+                "terminated": terminated,
+                "done": terminated.clone(),
+            },
+            batch_size=tensordict.batch_size,
+            device=self.device,
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        shape = self.batch_size if tensordict is None else tensordict.batch_size
+        if kwargs.get("set_state") and tensordict is not None:
+            state = tensordict.get("state").clone()
+        else:
+            state = torch.zeros(shape, dtype=torch.int64, device=self.device)
+        return TensorDict({"state": state}, batch_size=shape, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is random."""

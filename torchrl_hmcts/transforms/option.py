@@ -1,0 +1,469 @@
+"""Options: a worker's rollout as one step of a macro environment.
+
+Letters: *B batch of the tensordict, n its elements that still run, T ``max_steps``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, Transform
+
+from torchrl_hmcts.transforms.trajectory import OptionTrajectory
+
+Termination = Callable[[TensorDictBase], Tensor]
+
+
+class OptionTransform(Transform):
+    r"""Wraps each rollout of a worker as one macro-step, so that a planner or a loss sees an SMDP.
+
+    The action of the transformed env is an **option**. One step runs the worker closed-loop in the
+    base env, until the option's termination, ``max_steps`` base steps or ``done``. With
+    :math:`r_{i+1}` the base rewards and :math:`k` the base steps taken, it writes
+
+    .. math:: \text{reward} = \sum_{i<k} \gamma^i\, r_{i+1}, \qquad \text{duration} = k,
+
+    the done flags, and observation and state after the last base step. Every batch element has its
+    own option and its own end; an element that has ended does not step any more.
+
+    TorchRL's estimators discount by ``gamma ** steps_to_next_obs``. With
+    ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
+    ``make_value_estimator``, any TorchRL loss is correct for the SMDP.
+
+    Append it last of the transforms that must see base steps; what is appended after it sees
+    macro-steps. The worker is not registered as a sub-module: its owner moves, trains and saves it.
+
+    Args:
+        worker (TensorDictModuleBase): reads observation or state entries and ``skill_key``, writes
+            the env's action.
+        num_options (int): number of options.
+        max_steps (int): base steps after which an option ends at the latest.
+        gamma (float): discount per base step, in ``(0, 1]``.
+        termination (callable, optional): ``termination(td) -> bool`` tensor ``[*B]`` or ``[*B, 1]``,
+            True where the option ends. ``td`` holds the entries after a base step, ``skill_key`` and
+            the base steps taken so far under ``duration_key``. Default: none.
+        option_key (NestedKey): the macro action, int64 ``[*B]`` (one-hot bool ``[*B, num_options]``
+            with ``one_hot=True``). Default ``"option"``.
+        skill_key (NestedKey): the entry by which the worker is told the option, int64 ``[*B]``.
+            Default ``"skill"``.
+        duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
+        one_hot (bool): options are one-hot instead of categorical. Default ``False``.
+        trajectory_keys (sequence of NestedKey, optional): base transitions to hand out, e.g. to
+            train the worker: entries as ``"position"``, ``"action"`` or ``("next", "reward")``, as
+            ``("next", "trajectory", ...)`` of shape ``[*B, T]``, zero after the option's end, with
+            ``("next", "trajectory", "mask")``. Default: none.
+
+    Raises:
+        ValueError: if a number is out of range; when attached to an env: if the worker reads an
+            entry the env does not have or writes an action that does not fit the env's action spec;
+            when stepping: if an option index is out of range.
+
+    Reference:
+        Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999; dissertation, sections 2.2
+        and 3.1 (options as the edges of the manager's tree).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.transforms import OptionTransform
+        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+        >>> env = TransformedEnv(ChainEnv(length=6), OptionTransform(worker, 2, 4, gamma=0.5))
+        >>> td = env.step(env.reset().set("option", torch.tensor(1)))  # 1: to the right
+        >>> td["next", "state"].item(), td["next", "duration"].item()
+        (4, 4)
+    """
+
+    invertible = True
+
+    def __init__(
+        self,
+        worker: TensorDictModuleBase,
+        num_options: int,
+        max_steps: int,
+        gamma: float = 0.99,
+        termination: Termination | None = None,
+        option_key: NestedKey = "option",
+        *,
+        skill_key: NestedKey = "skill",
+        duration_key: NestedKey = "duration",
+        one_hot: bool = False,
+        trajectory_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        if not callable(worker):
+            raise ValueError(
+                f"OptionTransform needs a worker that it can call on a tensordict; got {worker!r}."
+            )
+        for name, value in (("num_options", num_options), ("max_steps", max_steps)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"OptionTransform needs {name} to be an int >= 1; got {value!r}.")
+        if not 0.0 < gamma <= 1.0:
+            raise ValueError(
+                f"OptionTransform needs a discount gamma in (0, 1] per base step; got {gamma}."
+            )
+        self.option_key = unravel_key(option_key)
+        self.skill_key = unravel_key(skill_key)
+        self.duration_key = unravel_key(duration_key)
+        super().__init__(in_keys=[], out_keys=[self.duration_key])
+        # Not sub-modules: an env must not put its owner's worker into eval mode or onto its device.
+        self.__dict__["worker"] = worker
+        self.__dict__["termination"] = termination
+        self.num_options = num_options
+        self.max_steps = max_steps
+        self.gamma = float(gamma)
+        self.one_hot = one_hot
+        self.trajectory = (
+            None if trajectory_keys is None else OptionTrajectory(trajectory_keys, max_steps)
+        )
+        self._fit: _Fit | None = None
+
+    # ---------------------------------------------------------------- stepping
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Choose the first base action; the env then takes the first base step as it always does."""
+        option = tensordict.get(self.option_key, None)
+        if option is None:
+            raise KeyError(
+                f"OptionTransform found no option under {self.option_key!r}. Write it with a "
+                f"planner or policy, or with env.rand_action(td)."
+            )
+        skill = self._skill(option)
+        fit = self._fitted()
+        inner = tensordict.copy()
+        inner.set(self.skill_key, skill)
+        with torch.no_grad():
+            self.worker(inner)
+        for key in (self.skill_key, *fit.action_keys):
+            tensordict.set(key, inner.get(key))
+        return tensordict
+
+    def _step(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> TensorDictBase:
+        fit = self._fitted()
+        batch_size = next_tensordict.batch_size
+        skipped = tensordict.get("_step", None)
+        if skipped is not None:
+            skipped = ~skipped.reshape(batch_size)
+        root = tensordict.exclude("_step", self.option_key)
+        flatten = not fit.batch_locked and len(batch_size) != 1
+        if flatten:  # one batch dimension is all the loop has to know
+            root, next_tensordict = root.reshape(-1), next_tensordict.reshape(-1)
+        with torch.no_grad():
+            if fit.batch_locked:
+                out = self._run_locked(fit, root, next_tensordict, skipped)
+            else:
+                out = self._run(fit, root, next_tensordict)
+        return out.reshape(batch_size) if flatten else out
+
+    def _run(self, fit: _Fit, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+        """Go on in a stateless env, with fewer rows whenever some have ended."""
+        n = after.batch_size[0]
+        reward = after.get(fit.reward_key).clone()  # [n, 1], of all rows
+        duration = torch.ones((n, 1), dtype=torch.int64, device=reward.device)
+        trajectory = self._begin_trajectory(fit, root, after)
+        out: TensorDictBase | None = None
+        rows: Tensor | None = None  # the rows that still run; None: all of them
+        discount = 1.0
+        for taken in range(1, self.max_steps + 1):
+            if taken == self.max_steps:
+                break
+            ended = self._ended(fit, root, after, taken)
+            if ended.any():
+                if out is None:
+                    out = after.clone()
+                if rows is None:
+                    rows = torch.arange(n, device=reward.device)
+                else:
+                    out[rows[ended]] = after[ended]
+                rows = rows[~ended]
+                if not rows.numel():
+                    break
+                running = ~ended
+                root, after = root[running], after[running]
+            discount *= self.gamma
+            root = self._advance(fit, root, after)
+            after = fit.step(root)
+            gained = after.get(fit.reward_key) * discount
+            if rows is None:
+                reward += gained
+                duration += 1
+            else:
+                reward.index_add_(0, rows, gained)
+                duration.index_add_(0, rows, torch.ones_like(duration[: rows.numel()]))
+            if trajectory is not None:
+                trajectory.write(taken, rows, root, after)
+        if out is None:
+            out = after
+        elif rows is not None and rows.numel():
+            out[rows] = after
+        return self._finish(fit, out, reward, duration, trajectory)
+
+    def _run_locked(
+        self,
+        fit: _Fit,
+        root: TensorDictBase,
+        after: TensorDictBase,
+        skipped: Tensor | None,
+    ) -> TensorDictBase:
+        """Go on in an env of fixed batch size, which is told by ``_step`` whom to leave alone."""
+        batch_size = after.batch_size
+        out = after.clone()
+        reward = out.get(fit.reward_key).clone()
+        duration = torch.ones((*batch_size, 1), dtype=torch.int64, device=reward.device)
+        running = torch.ones(batch_size, dtype=torch.bool, device=reward.device)
+        if skipped is not None:
+            running &= ~skipped
+            duration[skipped] = 0
+        trajectory = self._begin_trajectory(fit, root, after, running)
+        discount = 1.0
+        for taken in range(1, self.max_steps):
+            running = running & ~self._ended(fit, root, out, taken)
+            if not running.any():
+                break
+            discount *= self.gamma
+            root = self._advance(fit, root, out)
+            if batch_size and not running.all():
+                root.set("_step", running)
+            after = fit.step(root)
+            root = root.exclude("_step")
+            mask = running.unsqueeze(-1)
+            reward = torch.where(mask, reward + discount * after.get(fit.reward_key), reward)
+            duration = duration + mask
+            out = after.clone() if running.all() else _where(running, after, out)
+            if trajectory is not None:
+                trajectory.write(taken, running, root, after)
+        return self._finish(fit, out, reward, duration, trajectory)
+
+    def _advance(self, fit: _Fit, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+        """The next root: what the env wrote becomes its input, and the worker acts on it."""
+        root = fit.step_mdp(root, after)
+        self.worker(root)
+        return root
+
+    def _ended(
+        self, fit: _Fit, root: TensorDictBase, after: TensorDictBase, taken: int
+    ) -> Tensor:
+        shape = after.batch_size
+        ended = after.get(fit.done_keys[0]).reshape(shape)
+        for key in fit.done_keys[1:]:
+            ended = ended | after.get(key).reshape(shape)
+        if self.termination is not None:
+            seen = after.copy()
+            seen.set(self.skill_key, root.get(self.skill_key))
+            seen.set(self.duration_key, torch.full((*shape, 1), taken, device=ended.device))
+            ended = ended | self.termination(seen).reshape(shape)
+        return ended
+
+    def _begin_trajectory(
+        self,
+        fit: _Fit,
+        root: TensorDictBase,
+        after: TensorDictBase,
+        running: Tensor | None = None,
+    ) -> OptionTrajectory | None:
+        if self.trajectory is None:
+            return None
+        trajectory = self.trajectory.start(fit.trajectory_spec, after.batch_size)
+        trajectory.write(0, running, root, after)
+        return trajectory
+
+    def _finish(
+        self,
+        fit: _Fit,
+        out: TensorDictBase,
+        reward: Tensor,
+        duration: Tensor,
+        trajectory: OptionTrajectory | None,
+    ) -> TensorDictBase:
+        out.set(fit.reward_key, reward)
+        out.set(self.duration_key, duration)
+        if trajectory is not None:
+            out.set(OptionTrajectory.KEY, trajectory.data)
+        return out
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        shape, device = tensordict_reset.batch_size, tensordict_reset.device
+        zero = torch.zeros((*shape, 1), dtype=torch.int64, device=device)
+        tensordict_reset.set(self.duration_key, zero)
+        if self.trajectory is not None:
+            empty = self.trajectory.start(self._fitted().trajectory_spec, shape)
+            tensordict_reset.set(OptionTrajectory.KEY, empty.data)
+        return tensordict_reset
+
+    def _skill(self, option: Tensor) -> Tensor:
+        if self.one_hot:
+            return option.to(torch.int64).argmax(-1)
+        if option.numel():
+            low, high = torch.aminmax(option)
+            if low < 0 or high >= self.num_options:
+                bad = int(low) if low < 0 else int(high)
+                raise ValueError(
+                    f"Option {bad} does not exist: options are 0 to {self.num_options - 1}. Choose "
+                    f"one of them, or make OptionTransform with a larger num_options."
+                )
+        return option
+
+    # ---------------------------------------------------------------- specs
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        self._fitted()
+        input_spec = input_spec.clone()
+        old = input_spec["full_action_spec"]
+        shape, device = old.shape, old.device
+        option: TensorSpec
+        if self.one_hot:
+            option = OneHot(self.num_options, shape=(*shape, self.num_options), device=device)
+        else:
+            option = Categorical(self.num_options, shape=shape, device=device)
+        spec = Composite(shape=shape, device=device)
+        spec[self.option_key] = option
+        input_spec["full_action_spec"] = spec
+        return input_spec
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        reward_spec = reward_spec.clone()
+        key = self._fitted().reward_key
+        leaf = reward_spec[key]
+        reward_spec[key] = Unbounded(shape=leaf.shape, dtype=leaf.dtype, device=leaf.device)
+        return reward_spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        observation_spec = observation_spec.clone()
+        shape, device = observation_spec.shape, observation_spec.device
+        observation_spec[self.duration_key] = Bounded(
+            0, self.max_steps, shape=(*shape, 1), dtype=torch.int64, device=device
+        )
+        if self.trajectory is not None:
+            spec = self._fitted().trajectory_spec
+            observation_spec[OptionTrajectory.KEY] = spec
+        return observation_spec
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        self._fit = None
+        super().set_container(container)
+
+    def reset_parent(self) -> None:
+        self._fit = None
+        super().reset_parent()
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**super().__getstate__(), "_fit": None}
+
+    def _fitted(self) -> _Fit:
+        if self._fit is None:
+            parent = self.parent
+            if parent is None:
+                raise RuntimeError(
+                    "OptionTransform runs its worker in an env and has none. Use it as "
+                    "TransformedEnv(env, OptionTransform(...)); it has no meaning in a replay buffer."
+                )
+            self._fit = _Fit(parent, self)
+        return self._fit
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Not defined: an option can be run in an env only."""
+        raise RuntimeError(
+            "OptionTransform cannot be applied to data: running an option needs an env. Append it "
+            "to a TransformedEnv, and store the macro transitions that env gives."
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}(num_options={self.num_options}, max_steps={self.max_steps}, "
+            f"gamma={self.gamma})"
+        )
+
+
+class _Fit:
+    """What an OptionTransform has found out about the env it is attached to."""
+
+    def __init__(self, parent: EnvBase, transform: OptionTransform) -> None:
+        base = parent.base_env
+        self.batch_locked = parent.batch_locked
+        if len(parent.reward_keys) != 1:
+            raise ValueError(
+                f"OptionTransform sums one reward; {type(base).__name__} has the rewards "
+                f"{parent.reward_keys}. Reduce them to one with a transform before it."
+            )
+        self.reward_key = parent.reward_keys[0]
+        self.action_keys = list(parent.action_keys)
+        self.done_keys = [k for k in parent.done_keys if _last(k) == "done"]
+        self._env = base if not len(parent.transform) else parent
+        self._parent = parent
+        keys = [*parent.full_observation_spec.keys(True, True), *parent.state_keys]
+        self._flat = all(isinstance(k, str) for k in (*keys, *parent.done_keys, self.reward_key))
+        self._done_spec = parent.full_done_spec
+        self._complete = set(map(unravel_key, parent.done_keys))
+        self._drop = {self.reward_key, *self._complete} - set(keys)
+        self._check_worker(parent, transform)
+        if transform.trajectory is not None:
+            self.trajectory_spec = transform.trajectory.make_spec(parent)
+
+    def step(self, root: TensorDictBase) -> TensorDictBase:
+        """Take a base step, without the bookkeeping of ``EnvBase.step`` where it can be spared."""
+        if self.batch_locked:
+            return self._parent.step(root).get("next")
+        after = self._env._step(root)
+        if not self._complete.issubset(after.keys(True, True)):
+            self._env._complete_done(self._done_spec, after)
+        return after
+
+    def step_mdp(self, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+        if not self._flat:
+            root = root.copy()
+            root.set("next", after)
+            return self._parent.step_mdp(root)
+        entries = dict(root.items())
+        entries.update(after.items())
+        entries.pop("next", None)
+        for key in self._drop:
+            entries.pop(key, None)
+        return TensorDict._new_unsafe(entries, after.batch_size, device=after.device)
+
+    def _check_worker(self, parent: EnvBase, transform: OptionTransform) -> None:
+        worker = transform.worker
+        name = type(worker).__name__
+        td = parent.fake_tensordict().exclude("next", *self.action_keys)
+        skill = torch.zeros(td.batch_size, dtype=torch.int64, device=parent.device)
+        td.set(transform.skill_key, skill)
+        for key in getattr(worker, "in_keys", ()):
+            if td.get(key, None) is None:
+                raise ValueError(
+                    f"The worker {name} reads {key!r}, which {type(parent.base_env).__name__} does "
+                    f"not have: it has {sorted(map(str, td.keys(True, True)))}. Change the worker's "
+                    f"in_keys, or add a transform that writes {key!r} before OptionTransform."
+                )
+        with torch.no_grad():
+            worker(td)
+        for key in self.action_keys:
+            action = td.get(key, None)
+            spec = parent.full_action_spec[key]
+            if action is None:
+                raise ValueError(
+                    f"The worker {name} wrote no {key!r}, the action of "
+                    f"{type(parent.base_env).__name__}. Give it out_keys=[{key!r}]."
+                )
+            if action.shape != spec.shape or action.dtype != spec.dtype or not spec.is_in(action):
+                raise ValueError(
+                    f"The worker {name} wrote {key!r} = {action.dtype} {list(action.shape)} with "
+                    f"values up to {action.max().item():g}, which does not fit the env's action spec "
+                    f"{spec}. Build the worker from env.action_spec."
+                )
+
+
+def _last(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[-1]
+
+
+def _where(mask: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:
+    return torch.where(mask, new.select(*old.keys(True, True)), old)

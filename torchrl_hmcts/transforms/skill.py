@@ -1,0 +1,217 @@
+"""Sampling of skills in mini-episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+
+class SkillTransform(Transform):
+    r"""Samples a skill at reset and, mini-episode after mini-episode, again every few steps.
+
+    .. math:: z \sim p(z) \quad \text{at reset and whenever } k \text{ steps were taken with it}
+
+    Writes two entries: the skill, int64 ``[*B]``, and ``skill_step``, int64 ``[*B, 1]``, the base
+    steps taken with it so far. Each batch element has its own mini-episodes. On the last transition
+    of one, ``("next", "skill")`` is still the old skill, so that values are bootstrapped with the
+    skill that acted; the next root holds the new one. Episodes go on: nothing is marked as done.
+
+    A reset draws new skills where it resets. To choose the skill, reset with it: a reset
+    tensordict that holds a skill and no ``"_reset"`` mask keeps its skill (and ``skill_step``).
+
+    Since a new skill is drawn between two steps, stepping must go through
+    ``env.step_and_maybe_reset`` or ``env.rollout`` (collectors do); a bare ``env.step`` followed by
+    ``step_mdp`` keeps the skill for ever. For the same reason the transform goes outside of
+    ``SerialEnv`` and ``ParallelEnv``.
+
+    Args:
+        num_skills (int): number of skills ``Z``.
+        max_skill_steps (int, optional): base steps per mini-episode. Default ``None``: one skill
+            per episode.
+        skill_key (NestedKey): entry of the skill. Default ``"skill"``.
+        skill_step_key (NestedKey): entry of the steps taken. Default ``"skill_step"``.
+        prior (sequence of float or Tensor, optional): probabilities ``[Z]`` of the skills,
+            normalised. Default ``None``: uniform. Kept as the buffer ``prior``; write to it to move
+            it during training.
+        seed (int, optional): seed of an own generator, whose state is saved in the state dict.
+            Default ``None``: torch's global generator.
+
+    Raises:
+        ValueError: if a number is not positive or the prior is no distribution over the skills.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4
+        (mini-episodes of 100 steps).
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_hmcts.transforms import SkillTransform
+        >>> env = TransformedEnv(GymEnv("CartPole-v1"), SkillTransform(4, max_skill_steps=3))
+        >>> env.rollout(7, break_when_any_done=False)["skill_step"].flatten().tolist()
+        [0, 1, 2, 0, 1, 2, 0]
+    """
+
+    prior: Tensor | None
+
+    def __init__(
+        self,
+        num_skills: int,
+        max_skill_steps: int | None = None,
+        *,
+        skill_key: NestedKey = "skill",
+        skill_step_key: NestedKey = "skill_step",
+        prior: Sequence[float] | Tensor | None = None,
+        seed: int | None = None,
+    ) -> None:
+        if num_skills < 1:
+            raise ValueError(
+                f"SkillTransform needs at least one skill to sample; got num_skills={num_skills}."
+            )
+        if max_skill_steps is not None and max_skill_steps < 1:
+            raise ValueError(
+                "SkillTransform needs mini-episodes of at least one base step; got "
+                f"max_skill_steps={max_skill_steps}. Pass None for one skill per episode."
+            )
+        self.skill_key = unravel_key(skill_key)
+        self.skill_step_key = unravel_key(skill_step_key)
+        super().__init__(in_keys=[], out_keys=[self.skill_key, self.skill_step_key])
+        self.num_skills = int(num_skills)
+        self.max_skill_steps = None if max_skill_steps is None else int(max_skill_steps)
+        self.register_buffer("prior", check_prior("SkillTransform", prior, num_skills))
+        self.generator: torch.Generator | None = None
+        if seed is not None:
+            self.set_seed(seed)
+
+    def set_seed(self, seed: int) -> None:
+        """Gives the transform its own generator, seeded with ``seed``."""
+        self.generator = torch.Generator()
+        self.generator.manual_seed(seed)
+
+    def sample(self, shape: Sequence[int], device: torch.device | None = None) -> Tensor:
+        """Returns skills drawn from p(z), int64 of the given shape."""
+        if self.prior is None:
+            skill = torch.randint(self.num_skills, tuple(shape), generator=self.generator)
+        else:
+            count = torch.Size(shape).numel()
+            prior = self.prior.to("cpu")
+            skill = torch.multinomial(prior, count, replacement=True, generator=self.generator)
+            skill = skill.view(tuple(shape))
+        return skill if device is None else skill.to(device)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        shape, device = tensordict_reset.batch_size, tensordict_reset.device
+        partial = any("_reset" in _last(key) for key in tensordict.keys(True, True))
+        skill = None if partial else tensordict.get(self.skill_key, None)
+        step = None if skill is None else tensordict.get(self.skill_step_key, None)
+        if skill is None:
+            skill = self.sample(shape, device)
+        if step is None:
+            step = torch.zeros((*shape, 1), dtype=torch.int64, device=device)
+        tensordict_reset.set(self.skill_key, skill)
+        tensordict_reset.set(self.skill_step_key, step)
+        return tensordict_reset
+
+    def _step(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> TensorDictBase:
+        skill = tensordict.get(self.skill_key, None)
+        step = tensordict.get(self.skill_step_key, None)
+        if skill is None or step is None:
+            raise KeyError(
+                f"SkillTransform carries the skill in the tensordict, but {self.skill_key!r} or "
+                f"{self.skill_step_key!r} is missing from the one to step. Start from env.reset()."
+            )
+        next_tensordict.set(self.skill_key, skill)
+        next_tensordict.set(self.skill_step_key, step + 1)
+        return next_tensordict
+
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        if self.max_skill_steps is None:
+            return tensordict, tensordict_
+        step = tensordict_.get(self.skill_step_key)
+        ended = step >= self.max_skill_steps  # [*B, 1]
+        if ended.any():
+            # New tensors: the old ones are also the ("next", ...) entries of the transition.
+            skill = tensordict_.get(self.skill_key)
+            fresh = self.sample(skill.shape, skill.device)
+            tensordict_.set(self.skill_key, torch.where(ended.squeeze(-1), fresh, skill))
+            tensordict_.set(self.skill_step_key, step.masked_fill(ended, 0))
+        return tensordict, tensordict_
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError(
+            "SkillTransform samples skills while an env runs; stored data hold the skills already. "
+            "Append it to a TransformedEnv instead of a replay buffer."
+        )
+
+    def _add_specs(self, spec: TensorSpec) -> TensorSpec:
+        shape, device = spec.shape, spec.device
+        spec[self.skill_key] = Categorical(
+            self.num_skills, shape=shape, dtype=torch.int64, device=device
+        )
+        step_shape = torch.Size([*shape, 1])
+        if self.max_skill_steps is None:
+            step = Unbounded(step_shape, dtype=torch.int64, device=device)
+        else:
+            step = Bounded(
+                0, self.max_skill_steps, shape=step_shape, dtype=torch.int64, device=device
+            )
+        spec[self.skill_step_key] = step
+        return spec
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        return self._add_specs(observation_spec)
+
+    def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
+        return self._add_specs(state_spec)
+
+    def _check_batched_worker_compat(self) -> None:
+        if self.max_skill_steps is not None:
+            raise RuntimeError(
+                "SkillTransform draws new skills between two steps, which the workers of a "
+                "SerialEnv or ParallelEnv do not do. Put it outside: "
+                "TransformedEnv(ParallelEnv(n, make_env), SkillTransform(...))."
+            )
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        return {} if self.generator is None else {"generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        if "generator" in state:
+            if self.generator is None:
+                self.generator = torch.Generator()
+            self.generator.set_state(state["generator"])
+
+
+def check_prior(
+    owner: str, prior: Sequence[float] | Tensor | None, num_skills: int
+) -> Tensor | None:
+    """Returns the prior as normalised probabilities ``[Z]``, or None for the uniform one."""
+    if prior is None:
+        return None
+    weights = torch.as_tensor(prior, dtype=torch.get_default_dtype()).detach().clone()
+    if weights.shape != (num_skills,):
+        raise ValueError(
+            f"{owner} needs one prior probability per skill, shape ({num_skills},); got shape "
+            f"{tuple(weights.shape)}."
+        )
+    if not (torch.isfinite(weights).all() and (weights > 0).all()):
+        raise ValueError(
+            f"{owner} needs positive, finite prior probabilities, since log p(z) enters the "
+            f"reward; got {weights.tolist()}."
+        )
+    return weights / weights.sum()
+
+
+def _last(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[-1]

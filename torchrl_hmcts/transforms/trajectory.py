@@ -1,0 +1,103 @@
+"""The base transitions inside an option, as a padded block.
+
+Letters: *B batch of the tensordict, T base steps an option can take at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Binary, Composite
+from torchrl.envs import EnvBase
+
+
+class OptionTrajectory:
+    """Collects chosen entries of an option's base transitions into a tensordict ``[*B, T]``.
+
+    Args:
+        keys: entries of a base transition, e.g. ``"position"``, ``"action"``, ``("next", "reward")``.
+        max_steps: T.
+    """
+
+    KEY = "trajectory"
+    MASK_KEY = "mask"
+
+    def __init__(self, keys: Sequence[NestedKey], max_steps: int) -> None:
+        self.keys = [unravel_key(key) for key in keys]
+        self.max_steps = max_steps
+        if not self.keys:
+            raise ValueError(
+                "trajectory_keys is empty, so that nothing would be recorded. Name the entries, "
+                'e.g. ["observation", "action", ("next", "reward")], or pass None.'
+            )
+
+    def make_spec(self, env: EnvBase) -> Composite:
+        """Return the spec of the block, ``[*B, T]``."""
+        root = env.full_observation_spec.clone()
+        root.update(env.full_state_spec)
+        root.update(env.full_action_spec)
+        after = env.full_observation_spec.clone()
+        after.update(env.full_reward_spec)
+        after.update(env.full_done_spec)
+        shape = (*env.batch_size, self.max_steps)
+        ndim = len(env.batch_size)
+        spec = Composite(shape=shape, device=env.device)
+        for key in self.keys:
+            is_next = isinstance(key, tuple) and key[0] == "next"
+            source, name = (after, key[1:] if len(key) > 2 else key[1]) if is_next else (root, key)
+            leaf = source[name] if name in source.keys(True, True) else None
+            if leaf is None:
+                raise ValueError(
+                    f"trajectory_keys names {key!r}, which is no entry of a base transition of "
+                    f"{type(env.base_env).__name__}. Entries: "
+                    f"{sorted(map(str, root.keys(True, True)))}, and under 'next' "
+                    f"{sorted(map(str, after.keys(True, True)))}."
+                )
+            spec[key] = leaf.unsqueeze(ndim).expand(*shape, *leaf.shape[ndim:]).clone()
+        spec[self.MASK_KEY] = Binary(shape=shape, dtype=torch.bool, device=env.device)
+        return spec
+
+    def start(self, spec: Composite, batch_size: torch.Size) -> OptionTrajectory:
+        """Return a trajectory of its own with a block of zeros for ``batch_size`` options."""
+        new = OptionTrajectory(self.keys, self.max_steps)
+        lead = batch_size if not spec.shape[:-1] else ()
+        new.data = spec.zero(lead)
+        return new
+
+    data: TensorDictBase
+
+    def write(
+        self, taken: int, rows: Tensor | None, root: TensorDictBase, after: TensorDictBase
+    ) -> None:
+        """Write the transition ``taken`` steps into the option.
+
+        Args:
+            taken: base steps taken before this one.
+            rows: where it belongs: indices, a mask over the batch (whose other rows are then left
+                out), or None for all.
+            root: entries before the step.
+            after: entries after it.
+        """
+        is_mask = rows is not None and rows.dtype == torch.bool
+        lead = self.data.batch_dims - 1
+        for key in (*self.keys, self.MASK_KEY):
+            block = self.data.get(key)
+            slot = block.select(lead, taken)
+            if key == self.MASK_KEY:
+                value = torch.ones((), dtype=torch.bool, device=block.device).expand(
+                    slot.shape if rows is None or is_mask else (rows.numel(),)
+                )
+            elif isinstance(key, tuple) and key[0] == "next":
+                value = after.get(key[1:])
+            else:
+                value = root.get(key)
+            if rows is None:
+                slot.copy_(value)
+            elif is_mask:
+                slot[rows] = value[rows]
+            else:
+                slot[rows] = value

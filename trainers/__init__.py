@@ -1,0 +1,1 @@
+"""Trainers, experiments and the command line."""
