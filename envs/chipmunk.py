@@ -1,9 +1,9 @@
 """Many copies of a disc in many mazes, advanced by one Chipmunk space.
 
-Every maze lies in the same :class:`pymunk.Space`, each in a cell of its own on a wide grid (the cell
-depends only on the maze's index, so that a maze's arithmetic is the same whatever else is simulated).
-The discs do not collide with each other. One C call therefore moves any number of copies in any
-number of mazes, and states go in and out as arrays through :mod:`pymunk.batch`.
+Every maze lies in the same :class:`pymunk.Space`, each in a cell of its own on a wide grid (the
+cell depends only on the maze's index, so that a maze's arithmetic is the same whatever else is
+simulated). The discs do not collide with each other. One C call therefore moves any number of
+copies in any number of mazes, and states go in and out as arrays through :mod:`pymunk.batch`.
 
 Letters: ``M`` mazes, ``H, W`` tiles of a maze, ``n`` discs moved by a call.
 """
@@ -23,6 +23,11 @@ Float32Array = npt.NDArray[np.float32]
 
 _SMALLEST_CAPACITY = 4
 _PARKED_CONTACT_FREE = -64.0  # tiles; where unused discs wait, far from every maze
+_SLOP = 1e-5  # tiles; how deep a disc in contact stays, so that the contact is found again
+_NO_PUSH = 1e9  # tiles; a slop with which no contact pushes
+# Added and subtracted, it rounds to 2**-32 tiles per second: contact impulses that Chipmunk caches
+# from call to call come to nothing, but for rounding errors of 1e-17.
+_ROUNDING = 2.0**20
 
 
 class WallSegment(NamedTuple):
@@ -93,9 +98,9 @@ class ChipmunkMazes:
 
     .. math:: x' = x + v\\,dt, \\qquad v' = v\\,d^{dt} + a\\,dt,
 
-    followed by Chipmunk's contact impulses with friction and elasticity 0. The depth a disc has sunk
-    into a wall is taken back within the same call (a second C step at rest), so that nothing Chipmunk
-    keeps between calls bears on the next result.
+    followed by Chipmunk's contact impulses with friction and elasticity 0. The depth a disc has
+    sunk into a wall is taken back within the same call (a second C step at rest), so that nothing
+    Chipmunk keeps between calls bears on the next result.
 
     Args:
         mazes: bool array ``[M, H, W]``, True where a tile is solid.
@@ -128,12 +133,12 @@ class ChipmunkMazes:
         cell = float(2 ** math.ceil(math.log2(max(height, width) + 2)))
         columns = max(1, math.ceil(math.sqrt(num_mazes)))
         index = np.arange(num_mazes)
-        self._origins: Float64Array = np.stack([index % columns, index // columns], -1) * cell
+        grid = np.stack([index % columns, index // columns], -1)
+        self._origins: Float64Array = grid.astype(np.float64) * cell
         self._built = np.zeros(num_mazes, dtype=bool)
 
         space = pymunk.Space()
         space.damping = damping
-        space.collision_slop = 1e-5
         space.collision_bias = 0.0  # a penetration is undone in one step
         space.collision_persistence = 1
         space.iterations = 2  # contacts of a disc in a grid are orthogonal: one pass solves them
@@ -167,7 +172,7 @@ class ChipmunkMazes:
             for segment in wall_segments(self.mazes[index]):
                 start, end, before, after = ((x + u, y + v) for u, v in segment)
                 wall = pymunk.Segment(space.static_body, start, end, 0.0)
-                # Near a convex corner a disc touches the face it is on, not the one around the corner.
+                # Near a convex corner a disc touches its own face, not the one around the corner.
                 wall.set_neighbors(before, after)
                 wall.friction = 0.0
                 wall.elasticity = 0.0
@@ -239,14 +244,17 @@ class ChipmunkMazes:
 
         batch, space, dt = self._batch, self._space, self.time_step
         batch.set_space_bodies(space, self._in_fields, self._set_in)
+        space.collision_slop = _SLOP
         space.step(dt)
         read = self._read
         read.clear()
         batch.get_space_bodies(space, batch.BodyFields.VELOCITY, read)
         velocity_out = np.frombuffer(read.float_buf(), dtype=np.float64, count=2 * n)
-        new_velocity = velocity_out.reshape(n, 2).astype(np.float32)
+        new_velocity = (velocity_out.reshape(n, 2) + _ROUNDING - _ROUNDING).astype(np.float32)
         # At rest, the second step only applies the push out of the walls that the first one found.
+        # It must not find another one itself: the disc's next state would inherit it.
         batch.set_space_bodies(space, batch.BodyFields.VELOCITY, self._set_rest)
+        space.collision_slop = _NO_PUSH
         space.step(dt)
         read.clear()
         batch.get_space_bodies(space, batch.BodyFields.POSITION, read)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -21,10 +22,11 @@ from torchrl_hmcts.envs.rendering import draw_maze
 
 _DIRECTIONS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))  # (x, y) of up, down, left, right
 _STATE_KEYS = ("position", "velocity", "target", "maze_index", "step_count")
+_OVERLAP_TOLERANCE = 1e-3  # tiles; a disc in contact is up to 2e-5 inside the wall
 
 
 class WaterworldMazeEnv(EnvBase):
-    r"""Steer a disc through a random maze, by thrust in four directions, until it touches the target.
+    r"""Steer a disc through a random maze by thrust in four directions until it meets its target.
 
     The physics is Chipmunk's (pymunk), with collisions that are inelastic and frictionless: the
     speed into a wall is lost, the speed along it is kept. Without contact, with thrust
@@ -86,8 +88,9 @@ class WaterworldMazeEnv(EnvBase):
     """Radius of the disc, tiles."""
     TARGET_RADIUS = 0.25
     """Radius of the target, tiles; the episode ends when the two touch."""
-    MAX_SPEED = 4.0
-    """Largest speed along an axis that a state may have, tiles per second; thrust reaches 2.1."""
+    MAX_SPEED = 3.0
+    """Largest speed along an axis that a state may have, tiles per second; thrust reaches 2.1. Even
+    along a diagonal it moves the disc by less than its radius per step, so none passes a wall."""
 
     batch_locked = False
     _supports_set_state = True
@@ -118,7 +121,7 @@ class WaterworldMazeEnv(EnvBase):
         self.mazes = mazes.to(self.device).clone()  # [M, H, W]
         self._wall_centers = wall_centers(self.mazes).flatten(1)  # [M, 2K]
         self._free_tiles = free_tiles(self.mazes)  # [M, F]
-        self._acceleration = torch.tensor(_DIRECTIONS) * self.THRUST  # [A, 2]
+        self._acceleration = np.array(_DIRECTIONS, np.float32) * np.float32(self.THRUST)  # [A, 2]
         self._touch = self.PLAYER_RADIUS + self.TARGET_RADIUS
         self._physics = ChipmunkMazes(
             mazes.cpu().numpy(),
@@ -180,33 +183,38 @@ class WaterworldMazeEnv(EnvBase):
             self._generator.manual_seed(seed)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        maze = tensordict.get("maze_index")
-        target = tensordict.get("target")
-        shape = target.shape
-        acceleration = torch.embedding(self._acceleration, tensordict.get("action").cpu())
+        # Small arrays: numpy does in one microsecond what torch does in three.
+        target, maze = tensordict.get("target"), tensordict.get("maze_index")
+        shape, device = target.shape, target.device
         new_position, new_velocity = self._physics.step(
-            maze.cpu().view(-1).numpy(),
-            tensordict.get("position").cpu().reshape(-1, 2).numpy(),
-            tensordict.get("velocity").cpu().reshape(-1, 2).numpy(),
-            acceleration.view(-1, 2).numpy(),
+            maze.numpy(force=True).reshape(-1),
+            tensordict.get("position").numpy(force=True).reshape(-1, 2),
+            tensordict.get("velocity").numpy(force=True).reshape(-1, 2),
+            self._acceleration[tensordict.get("action").numpy(force=True).reshape(-1)],
         )
-        position = torch.from_numpy(new_position).view(shape).to(target.device)
-        velocity = torch.from_numpy(new_velocity).view(shape).to(target.device)
-        step_count = tensordict.get("step_count") + 1
-        offset = position - target
-        terminated = (offset * offset).sum(-1, keepdim=True) < self._touch**2
+        offset = new_position - target.numpy(force=True).reshape(-1, 2)
+        offset *= offset
+        terminated = (offset[:, 0] + offset[:, 1] < self._touch**2).reshape(*shape[:-1], 1)
+        step_count = tensordict.get("step_count").numpy(force=True) + 1
         truncated = step_count >= self.max_steps
+        arrays = {
+            "reward": terminated.astype(np.float32),
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        position, velocity, steps, *rest = (
+            torch.from_numpy(array).to(device)
+            for array in (
+                new_position.reshape(shape),
+                new_velocity.reshape(shape),
+                step_count,
+                *arrays.values(),
+            )
+        )
+        entries = dict(zip(arrays, rest, strict=True))
         return self._write_state(
-            position,
-            velocity,
-            target,
-            maze,
-            step_count,
-            tensordict.batch_size,
-            reward=terminated.to(torch.float32),
-            terminated=terminated,
-            truncated=truncated,
-            done=terminated | truncated,
+            position, velocity, target, maze, steps, tensordict.batch_size, **entries
         )
 
     def _write_state(
@@ -265,9 +273,10 @@ class WaterworldMazeEnv(EnvBase):
                 f"reset(td, set_state=True) needs the whole state in td; missing: {missing}. Build "
                 f"it with env.make_state(maze_index, position, target)."
             )
-        state = [tensordict.get(key) for key in _STATE_KEYS]
-        self._check_state(*state, tensordict.batch_size)
-        return self._write_state(*state, tensordict.batch_size)
+        shape = tensordict.batch_size
+        position, velocity, target, maze, steps = (tensordict.get(key) for key in _STATE_KEYS)
+        self._check_state(position, velocity, target, maze, steps, shape)
+        return self._write_state(position, velocity, target, maze, steps, shape)
 
     def _check_state(
         self,
@@ -303,7 +312,8 @@ class WaterworldMazeEnv(EnvBase):
             bad = (value < low) | (value > high)
             if bad.any():
                 raise ValueError(
-                    f'"{key}" = {value[bad][0].item()} is out of range: {low} to {high} are allowed.'
+                    f'"{key}" = {value[bad][0].item()} is out of range: {low} to {high} are '
+                    f"allowed."
                 )
         size = torch.tensor([self.width, self.height], device=position.device)
         for key, point in (("position", position), ("target", target)):
@@ -320,6 +330,26 @@ class WaterworldMazeEnv(EnvBase):
                     f"{int(maze[in_wall][0])}. Choose a free tile, e.g. from "
                     f"free_tiles(env.mazes[{int(maze[in_wall][0])}])."
                 )
+        # A disc whose centre is close to a face may be pushed out of it on the other side.
+        gap = self._distance_to_walls(position, maze)
+        bad = gap < self.PLAYER_RADIUS - _OVERLAP_TOLERANCE
+        if bad.any():
+            raise ValueError(
+                f'"position" (x, y) = {position[bad][0].tolist()} is {gap[bad][0].item():.3g} '
+                f"tiles from a wall of maze {int(maze[bad][0])}, which the disc of radius "
+                f"{self.PLAYER_RADIUS} overlaps. Keep it {self.PLAYER_RADIUS} tiles away, e.g. "
+                f"at a tile's centre."
+            )
+
+    def _distance_to_walls(self, position: Tensor, maze: Tensor) -> Tensor:
+        """Distance of points inside the maze to the nearest of the tiles around, if solid, [*B]."""
+        solid = torch.nn.functional.pad(self.mazes, (1, 1, 1, 1), value=True)  # [M, H + 2, W + 2]
+        around = torch.cartesian_prod(*2 * [torch.arange(-1, 2, device=position.device)])  # [9, 2]
+        point = position.unsqueeze(-2)
+        tile = point.long() + around  # [*B, 9, 2] (x, y) of the low corner
+        gap = torch.maximum(tile - point, point - tile - 1).clamp_min(0).norm(dim=-1)
+        is_solid = solid[maze.unsqueeze(-1), tile[..., 1] + 1, tile[..., 0] + 1]
+        return gap.masked_fill(~is_solid, torch.inf).amin(-1)
 
     def make_state(
         self,
@@ -343,7 +373,8 @@ class WaterworldMazeEnv(EnvBase):
             TensorDict ``[*B]`` as ``env.reset()`` gives it; the arguments are broadcast to ``*B``.
 
         Raises:
-            ValueError: if a value is not finite, out of range or inside a wall.
+            ValueError: if a value is not finite, out of range or inside a wall, or the disc
+                overlaps one.
 
         Example:
             >>> env = WaterworldMazeEnv(torch.zeros(1, 3, 3, dtype=torch.bool))
@@ -361,13 +392,11 @@ class WaterworldMazeEnv(EnvBase):
                 raise ValueError(f"{name} must be (x, y) pairs [*B, 2]; got {list(point.shape)}.")
         shape = torch.broadcast_shapes(maze.shape, steps.shape, *(p.shape[:-1] for p in points))
         maze, steps = (x.to(torch.int64).expand(shape).clone() for x in (maze, steps))
-        points = [point.expand(*shape, 2).clone() for point in points]
+        at, moving, goal = (point.expand(*shape, 2).clone() for point in points)
         steps = steps.unsqueeze(-1)
-        self._check_state(*points, maze, steps, shape)
-        state = self._write_state(*points, maze, steps, shape)
-        return state.update(
-            {k: torch.zeros_like(steps, dtype=torch.bool) for k in self.done_keys}
-        )
+        self._check_state(at, moving, goal, maze, steps, shape)
+        state = self._write_state(at, moving, goal, maze, steps, shape)
+        return state.update({k: torch.zeros_like(steps, dtype=torch.bool) for k in self.done_keys})
 
     def render(self, tensordict: TensorDictBase, **options: Any) -> Any:
         """Draw one state.

@@ -71,8 +71,8 @@ class TableEnv(EnvBase):
         stuck = ~self._allowed.any(-1) & ~self._terminal
         if stuck.any():
             raise ValueError(
-                f"State {int(stuck.nonzero()[0])} has no transition and is not terminal. Add one, or "
-                f"name it in terminal={list(terminal)}."
+                f"State {int(stuck.nonzero()[0])} has no transition and is not terminal. Add one, "
+                f"or name it in terminal={list(terminal)}."
             )
         self.state_spec = Composite(state=Categorical(num_states, shape=(), device=device))
         self.observation_spec = Composite(
@@ -140,7 +140,7 @@ class ChainEnv(EnvBase):
 
     Example:
         >>> env = ChainEnv(length=3)
-        >>> td = env.rollout(5, policy=lambda td: td.set("action", torch.ones((), dtype=torch.int64)))
+        >>> td = env.rollout(5, policy=lambda td: td.set("action", torch.tensor(1)))
         >>> td["next", "reward"].flatten().tolist()
         [0.0, 1.0]
     """

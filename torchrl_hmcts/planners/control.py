@@ -62,18 +62,16 @@ class HierarchicalPolicy(TensorDictModuleBase):
             plan = plan.clone()
             length, step = (tensordict.get(k).clone() for k in ("plan_length", "plan_step"))
         needs = (step >= length).squeeze(-1)
-        for key in ("is_init", "done"):
+        for key in ("is_init", "done", "_step"):  # "_step": False where a rollout has ended
             flag = tensordict.get(key, None)
             if flag is not None:
                 flag = flag.reshape(shape)
-                needs = needs | flag if key == "is_init" else needs & ~flag
+                needs = needs | flag if key == "is_init" else needs & (flag ^ (key == "done"))
         if needs.any():
             step[needs] = 0
             plan[needs], length[needs] = self._plan(tensordict[needs])
         option = plan.gather(-1, step.clamp_max(self.max_plan_length - 1)).squeeze(-1)
-        if self.planner.simulator.one_hot:
-            option = torch.nn.functional.one_hot(option, self.planner.num_options).bool()
-        tensordict.set(self.planner.option_key, option)
+        tensordict.set(self.planner.option_key, self.planner.simulator.encode(option))
         tensordict.set("plan", plan)
         tensordict.set("plan_length", length)
         tensordict.set("plan_step", step + 1)

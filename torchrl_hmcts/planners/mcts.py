@@ -163,9 +163,7 @@ class MCTSPlanner(TensorDictModuleBase):
         search = self.search(tensordict)
         shape = tensordict.batch_size
         device = self.simulator.env.device
-        option = torch.from_numpy(self._choose(search)).view(shape)
-        if self.simulator.one_hot:
-            option = torch.nn.functional.one_hot(option, self.num_options).bool()
+        option = self.simulator.encode(torch.from_numpy(self._choose(search)).view(shape))
         tree = search.tree
 
         def column(array: np.ndarray) -> Tensor:
@@ -217,7 +215,7 @@ class MCTSPlanner(TensorDictModuleBase):
                     f"Root {bad} has no option that may be taken: its action mask is all False. "
                     f"Plan from a state that is not a dead end, or mark it as done."
                 )
-            values = self._evaluate(root, np.zeros_like(done))
+            values = self._evaluate(root, self.simulator.terminated(root))
             search.start(values, done, self._priors(root), masks, self._features(root))
             roots = np.arange(num_roots)
             search.tree.set_states(roots, np.zeros_like(roots), self.simulator.state(root))
@@ -281,8 +279,14 @@ class MCTSPlanner(TensorDictModuleBase):
     def _evaluate(self, td: TensorDictBase, terminated: np.ndarray) -> np.ndarray:
         if self.leaf_evaluator is None:
             return np.zeros(td.batch_size[0], np.float32)
-        values = _as_tensor(self.leaf_evaluator(td), "leaf_evaluator").reshape(td.batch_size[0])
-        values_np: np.ndarray = values.to(torch.float32).cpu().numpy()
+        values = _as_tensor(self.leaf_evaluator(td), "leaf_evaluator")
+        num_states = td.batch_size[0]
+        if tuple(values.shape) not in ((num_states,), (num_states, 1)):
+            raise ValueError(
+                f"The leaf evaluator returned shape {list(values.shape)}; it must give one value per "
+                f"state, [{num_states}] or [{num_states}, 1]."
+            )
+        values_np: np.ndarray = values.reshape(-1).to(torch.float32).cpu().numpy()
         if not np.isfinite(values_np).all():
             raise ValueError(
                 f"The leaf evaluator returned {values_np[~np.isfinite(values_np)][0]}. Values must be "
@@ -299,6 +303,12 @@ class MCTSPlanner(TensorDictModuleBase):
             raise ValueError(
                 f"The option prior returned shape {list(priors.shape)}; it must give one probability "
                 f"per node and option, {list(shape)}."
+            )
+        if not (torch.isfinite(priors) & (priors >= 0)).all():
+            bad = priors[~(torch.isfinite(priors) & (priors >= 0))][0].item()
+            raise ValueError(
+                f"The option prior returned {bad}. Probabilities must be finite and not negative; "
+                f"apply a softmax to logits."
             )
         return priors.to(torch.float32).cpu().contiguous().numpy()
 

@@ -41,9 +41,11 @@ def extract_plans(search: Search) -> Plan:
         np.array(tree.path(b, node)) if node >= 0 else np.zeros(1, np.int64)
         for b, node in enumerate(best)
     ]
-    lengths = np.array([len(path) - 1 for path in paths])
+    lengths = np.array([len(path) - 1 for path in paths], np.int64)
     width = int(lengths.max(initial=0))
-    nodes = np.stack([np.pad(path, (0, width + 1 - len(path)), "edge") for path in paths])
+    nodes = np.zeros((search.num_roots, width + 1), np.int64)
+    for row, path in zip(nodes, paths, strict=True):
+        row[:] = np.pad(path, (0, width + 1 - len(path)), "edge")
     rows = np.arange(search.num_roots)[:, None]
     options = tree.nodes[rows, nodes[:, 1:]]["option"].astype(np.int64)
     options[np.arange(width) >= lengths[:, None]] = -1

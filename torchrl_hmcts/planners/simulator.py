@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 
@@ -55,13 +56,17 @@ class Simulator:
         self.env = env
         self.option_key = env.action_keys[0]
         spec = env.full_action_spec[self.option_key]
-        self.one_hot = isinstance(spec, OneHot)
-        if not isinstance(spec, (Categorical, OneHot)):
+        self._one_hot = isinstance(spec, OneHot)
+        self._option_dtype = spec.dtype
+        boxes = getattr(spec.space, "boxes", [spec.space])  # the Multi specs have one per entry
+        if not isinstance(spec, (Categorical, OneHot)) or len(boxes) != 1:
             raise ValueError(
-                f"MCTSPlanner searches a discrete action; {name} has {spec}. Put the env under an "
+                f"MCTSPlanner searches one discrete action; {name} has {spec}. Put the env under an "
                 f"OptionTransform, or discretise its action with torchrl's ActionDiscretizer."
             )
-        self.num_options = int(spec.space.n)
+        self.num_options = int(boxes[0].n)
+        # [] for most envs, [1] under an ActionDiscretizer
+        self._option_shape = () if self._one_hot else tuple(spec.shape[env.batch_dims :])
         self.state_keys = [unravel_key(k) for k in env.full_state_spec.keys(True, True)]
         if not self.state_keys:
             raise ValueError(
@@ -83,6 +88,7 @@ class Simulator:
         if self.mask_key is not None:
             self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))
         self._reward_key = env.reward_keys[0]
+        self._done_spec = env.full_done_spec_unbatched  # a call has m states, not env.batch_size
         leaves = [unravel_key(k) for k in env.done_keys]
         self._done_key = next(k for k in leaves if _last(k) == "done")
         self._terminated_key = next((k for k in leaves if _last(k) == "terminated"), self._done_key)
@@ -115,12 +121,16 @@ class Simulator:
         option = torch.from_numpy(options)
         if self.env.device is not None:
             option = option.to(self.env.device)
-        if self.one_hot:
-            option = torch.nn.functional.one_hot(option, self.num_options).bool()
-        states.set(self.option_key, option)
+        states.set(self.option_key, self.encode(option))
         after = self.env._step(states)
-        self.env._complete_done(self.env.full_done_spec, after)
+        self.env._complete_done(self._done_spec, after)
         return after
+
+    def encode(self, options: Tensor) -> Tensor:
+        """Return option indices ``[*B]`` in the form of the env's action spec."""
+        if self._one_hot:
+            return torch.nn.functional.one_hot(options, self.num_options).to(self._option_dtype)
+        return options.reshape((*options.shape, *self._option_shape))
 
     def rewards(self, after: TensorDictBase) -> np.ndarray:
         """Return the rewards, float32 ``[m]``."""
@@ -133,8 +143,14 @@ class Simulator:
         return rewards
 
     def done(self, td: TensorDictBase) -> np.ndarray:
-        """Return which states end the episode, bool ``[m]``; False where a root does not say."""
-        return self._flag(td, self._done_key)
+        """Return which states end the episode, bool ``[m]``; False where a root does not say.
+
+        A rollout marks the elements it no longer steps with ``"_step"`` False and fills them with
+        zeros, which are no state to plan from: they have ended too.
+        """
+        done = self._flag(td, self._done_key)
+        stepped = td.get("_step", None)
+        return done if stepped is None else done | ~stepped.cpu().reshape(-1).numpy()
 
     def terminated(self, td: TensorDictBase) -> np.ndarray:
         """Return which states are terminal, bool ``[m]``."""

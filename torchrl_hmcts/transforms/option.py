@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
@@ -45,9 +45,9 @@ class OptionTransform(Transform):
         num_options (int): number of options.
         max_steps (int): base steps after which an option ends at the latest.
         gamma (float): discount per base step, in ``(0, 1]``.
-        termination (callable, optional): ``termination(td) -> bool`` tensor ``[*B]`` or ``[*B, 1]``,
-            True where the option ends. ``td`` holds the entries after a base step, ``skill_key`` and
-            the base steps taken so far under ``duration_key``. Default: none.
+        termination (callable, optional): ``termination(td) -> bool`` tensor ``[*B]`` or
+            ``[*B, 1]``, True where the option ends. ``td`` holds the entries after a base step,
+            ``skill_key`` and the base steps taken so far under ``duration_key``. Default: none.
         option_key (NestedKey): the macro action, int64 ``[*B]`` (one-hot bool ``[*B, num_options]``
             with ``one_hot=True``). Default ``"option"``.
         skill_key (NestedKey): the entry by which the worker is told the option, int64 ``[*B]``.
@@ -127,7 +127,7 @@ class OptionTransform(Transform):
     # ---------------------------------------------------------------- stepping
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Choose the first base action; the env then takes the first base step as it always does."""
+        """Choose the first base action; the env then takes that step as it always does."""
         option = tensordict.get(self.option_key, None)
         if option is None:
             raise KeyError(
@@ -144,9 +144,7 @@ class OptionTransform(Transform):
             tensordict.set(key, inner.get(key))
         return tensordict
 
-    def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         fit = self._fitted()
         batch_size = next_tensordict.batch_size
         skipped = tensordict.get("_step", None)
@@ -167,43 +165,45 @@ class OptionTransform(Transform):
         """Go on in a stateless env, with fewer rows whenever some have ended."""
         n = after.batch_size[0]
         reward = after.get(fit.reward_key).clone()  # [n, 1], of all rows
-        duration = torch.ones((n, 1), dtype=torch.int64, device=reward.device)
+        duration: Tensor | None = None  # [n, 1], of the rows that have ended
         trajectory = self._begin_trajectory(fit, root, after)
+        carried = fit.carried(root, after)
         out: TensorDictBase | None = None
         rows: Tensor | None = None  # the rows that still run; None: all of them
         discount = 1.0
-        for taken in range(1, self.max_steps + 1):
-            if taken == self.max_steps:
-                break
+        taken = 1
+        while taken < self.max_steps:
             ended = self._ended(fit, root, after, taken)
             if ended.any():
-                if out is None:
+                if out is None or duration is None:
                     out = after.clone()
-                if rows is None:
+                    duration = torch.full((n, 1), taken, device=reward.device)
                     rows = torch.arange(n, device=reward.device)
                 else:
                     out[rows[ended]] = after[ended]
-                rows = rows[~ended]
+                    duration[rows[ended]] = taken
+                running = ~ended
+                rows = rows[running]
                 if not rows.numel():
                     break
-                running = ~ended
                 root, after = root[running], after[running]
             discount *= self.gamma
-            root = self._advance(fit, root, after)
+            root = self._advance(fit, root, after, carried)
             after = fit.step(root)
             gained = after.get(fit.reward_key) * discount
             if rows is None:
                 reward += gained
-                duration += 1
             else:
                 reward.index_add_(0, rows, gained)
-                duration.index_add_(0, rows, torch.ones_like(duration[: rows.numel()]))
             if trajectory is not None:
                 trajectory.write(taken, rows, root, after)
-        if out is None:
+            taken += 1
+        if out is None or duration is None:
             out = after
+            duration = torch.full((n, 1), taken, device=reward.device)
         elif rows is not None and rows.numel():
             out[rows] = after
+            duration[rows] = taken
         return self._finish(fit, out, reward, duration, trajectory)
 
     def _run_locked(
@@ -223,13 +223,14 @@ class OptionTransform(Transform):
             running &= ~skipped
             duration[skipped] = 0
         trajectory = self._begin_trajectory(fit, root, after, running)
+        carried = fit.carried(root, after)
         discount = 1.0
         for taken in range(1, self.max_steps):
             running = running & ~self._ended(fit, root, out, taken)
             if not running.any():
                 break
             discount *= self.gamma
-            root = self._advance(fit, root, out)
+            root = self._advance(fit, root, out, carried)
             if batch_size and not running.all():
                 root.set("_step", running)
             after = fit.step(root)
@@ -242,15 +243,15 @@ class OptionTransform(Transform):
                 trajectory.write(taken, running, root, after)
         return self._finish(fit, out, reward, duration, trajectory)
 
-    def _advance(self, fit: _Fit, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+    def _advance(
+        self, fit: _Fit, root: TensorDictBase, after: TensorDictBase, carried: list[NestedKey]
+    ) -> TensorDictBase:
         """The next root: what the env wrote becomes its input, and the worker acts on it."""
-        root = fit.step_mdp(root, after)
+        root = fit.step_mdp(root, after, carried)
         self.worker(root)
         return root
 
-    def _ended(
-        self, fit: _Fit, root: TensorDictBase, after: TensorDictBase, taken: int
-    ) -> Tensor:
+    def _ended(self, fit: _Fit, root: TensorDictBase, after: TensorDictBase, taken: int) -> Tensor:
         shape = after.batch_size
         ended = after.get(fit.done_keys[0]).reshape(shape)
         for key in fit.done_keys[1:]:
@@ -365,7 +366,8 @@ class OptionTransform(Transform):
             if parent is None:
                 raise RuntimeError(
                     "OptionTransform runs its worker in an env and has none. Use it as "
-                    "TransformedEnv(env, OptionTransform(...)); it has no meaning in a replay buffer."
+                    "TransformedEnv(env, OptionTransform(...)); it has no meaning in a replay "
+                    "buffer."
                 )
             self._fit = _Fit(parent, self)
         return self._fit
@@ -404,7 +406,10 @@ class _Fit:
         self._flat = all(isinstance(k, str) for k in (*keys, *parent.done_keys, self.reward_key))
         self._done_spec = parent.full_done_spec
         self._complete = set(map(unravel_key, parent.done_keys))
-        self._drop = {self.reward_key, *self._complete} - set(keys)
+        self._writes_all_done: bool | None = None  # known after the first step
+        in_keys = getattr(transform.worker, "in_keys", None)
+        # A worker that does not say what it reads may read everything.
+        self._read = None if in_keys is None else {*keys, *in_keys, transform.skill_key}
         self._check_worker(parent, transform)
         if transform.trajectory is not None:
             self.trajectory_spec = transform.trajectory.make_spec(parent)
@@ -414,21 +419,35 @@ class _Fit:
         if self.batch_locked:
             return self._parent.step(root).get("next")
         after = self._env._step(root)
-        if not self._complete.issubset(after.keys(True, True)):
+        if self._writes_all_done is None:
+            self._writes_all_done = self._complete.issubset(after.keys(True, True))
+        if not self._writes_all_done:
             self._env._complete_done(self._done_spec, after)
         return after
 
-    def step_mdp(self, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+    def step_mdp(
+        self, root: TensorDictBase, after: TensorDictBase, carried: list[NestedKey]
+    ) -> TensorDictBase:
         if not self._flat:
             root = root.copy()
             root.set("next", after)
             return self._parent.step_mdp(root)
-        entries = dict(root.items())
-        entries.update(after.items())
-        entries.pop("next", None)
-        for key in self._drop:
-            entries.pop(key, None)
-        return TensorDict._new_unsafe(entries, after.batch_size, device=after.device)
+        # What the env wrote is the next root as it stands: nobody reads the reward in it.
+        following = after.copy() if self.batch_locked else after
+        for key in carried:
+            following.set(key, root.get(key))
+        return following
+
+    def carried(self, root: TensorDictBase, after: TensorDictBase) -> list[NestedKey]:
+        """Entries that are read in every base step and written by none, e.g. the skill."""
+        if not self._flat:
+            return []
+        written = set(after.keys()) | set(self.action_keys) | {"next"}
+        return [
+            key
+            for key in root.keys()
+            if key not in written and (self._read is None or key in self._read)
+        ]
 
     def _check_worker(self, parent: EnvBase, transform: OptionTransform) -> None:
         worker = transform.worker
@@ -440,8 +459,9 @@ class _Fit:
             if td.get(key, None) is None:
                 raise ValueError(
                     f"The worker {name} reads {key!r}, which {type(parent.base_env).__name__} does "
-                    f"not have: it has {sorted(map(str, td.keys(True, True)))}. Change the worker's "
-                    f"in_keys, or add a transform that writes {key!r} before OptionTransform."
+                    f"not have: it has {sorted(map(str, td.keys(True, True)))}. Change the "
+                    f"worker's in_keys, or add a transform that writes {key!r} before "
+                    f"OptionTransform."
                 )
         with torch.no_grad():
             worker(td)
@@ -456,8 +476,8 @@ class _Fit:
             if action.shape != spec.shape or action.dtype != spec.dtype or not spec.is_in(action):
                 raise ValueError(
                     f"The worker {name} wrote {key!r} = {action.dtype} {list(action.shape)} with "
-                    f"values up to {action.max().item():g}, which does not fit the env's action spec "
-                    f"{spec}. Build the worker from env.action_spec."
+                    f"values up to {action.max().item():g}, which does not fit the env's action "
+                    f"spec {spec}. Build the worker from env.action_spec."
                 )
 
 

@@ -19,7 +19,8 @@ class OptionTrajectory:
     """Collects chosen entries of an option's base transitions into a tensordict ``[*B, T]``.
 
     Args:
-        keys: entries of a base transition, e.g. ``"position"``, ``"action"``, ``("next", "reward")``.
+        keys: entries of a base transition, e.g. ``"position"``, ``"action"`` or
+            ``("next", "reward")``.
         max_steps: T.
     """
 

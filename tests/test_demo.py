@@ -1,0 +1,88 @@
+"""The command line and the demo, at toy size."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.config import DemoConfig, parse_overrides
+from torchrl_hmcts.trainers.report import write_page
+
+TIMES = ("seconds", "config", "versions")
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> tuple[Path, dict]:
+    out = tmp_path_factory.mktemp("demo")
+    assert main(["demo", "seed=3", f"out={out}", "toy=true"]) == 0
+    return out, json.loads((out / "metrics.json").read_text())
+
+
+def without_times(metrics: dict) -> dict:
+    return {k: v for k, v in metrics.items() if not any(t in k for t in TIMES)}
+
+
+def test_the_demo_writes_its_metrics_and_pictures(demo):
+    out, metrics = demo
+    names = (
+        "seed mazes solved train_base_steps train_seconds plan_seconds_median plan_seconds_p95 "
+        "plan_base_steps_median expansions_median episode_base_steps_median "
+        "episode_base_steps_over_shortest"
+    ).split()
+    assert set(names) <= set(metrics)
+    assert metrics["seed"] == 3
+    assert metrics["mazes"] == 3
+    for name in ("index.html", "losses.png", "skills.png", "search.png", "episode.gif"):
+        assert (out / name).stat().st_size > 1000, name
+
+
+def test_the_page_shows_every_picture_of_the_run(demo):
+    out, _ = demo
+    page = (out / "index.html").read_text()
+    for name in ("losses.png", "skills.png", "search.png", "episode.gif"):
+        assert f'src="{name}"' in page
+
+
+def test_the_same_seed_gives_the_same_figures(demo, tmp_path):
+    _, first = demo
+    assert main(["demo", "seed=3", f"out={tmp_path}", "toy=true"]) == 0
+    second = json.loads((tmp_path / "metrics.json").read_text())
+    np.testing.assert_equal(without_times(second), without_times(first))
+
+
+def test_an_unknown_key_is_refused_with_the_nearest_ones(capsys):
+    assert main(["demo", "mazse=3"]) == 2
+    assert "Did you mean: mazes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["seed"], "no key=value"),
+        (["mazes=many"], "many"),
+        (["mazes=0"], "mazes must be at least 1; got 0"),
+        (["option_steps=-5"], "option_steps must be at least 1; got -5"),
+    ],
+)
+def test_a_bad_value_is_refused_by_name(words, message):
+    with pytest.raises(ValueError, match=message):
+        parse_overrides(DemoConfig, words)
+
+
+def test_more_mazes_than_the_test_split_has_are_refused(tmp_path, capsys):
+    assert main(["demo", "mazes=343", f"out={tmp_path}"]) == 2
+    assert "342" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_page_escapes_what_it_shows(tmp_path):
+    path = tmp_path / "index.html"
+    write_page(path, title="<b>", metrics={"a<script>": {"x": "<i>"}}, pictures={"p.png": '"<u>'})
+    page = path.read_text()
+    for raw in ("<b>", "<script>", "<i>", '"<u>'):
+        assert raw not in page
+    assert "a&lt;script&gt;.x" in page

@@ -1,0 +1,816 @@
+"""What the planner does as a policy: batches, budgets, choices, evaluators, bad input, control."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Composite
+from torchrl.envs import ActionDiscretizer, Compose, PendulumEnv, StepCounter, TransformedEnv
+
+from torchrl_hmcts.planners import (
+    PUCT,
+    UCT,
+    BestPlan,
+    HierarchicalPolicy,
+    HighestValue,
+    MaxBackup,
+    MCTSPlanner,
+    MostVisited,
+    RadiusNovelty,
+    Search,
+    SearchBudget,
+    SearchProgress,
+    SearchTree,
+)
+from torchrl_hmcts.testing import ChainEnv, TableEnv
+
+FOREVER = SearchBudget(expansions=10_000, until_plan=False)
+
+# A binary tree of depth 3 in which every (state, option) is reached in one way only: states 0 to
+# 14, the children of s are 2 s + 1 and 2 s + 2, the leaves 7 to 14 are terminal and pay s - 10.
+BINARY_TREE = {
+    (s, a): (2 * s + 1 + a, 2 * s + 1 + a - 10.0 if s >= 3 else 0.0, 1)
+    for s in range(7)
+    for a in range(2)
+}
+LEAVES = list(range(7, 15))
+
+
+class CountingEnv(TableEnv):
+    """A table that records what it is asked to simulate."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.calls: list[list[tuple[int, int]]] = []
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        pairs = zip(tensordict["state"].tolist(), tensordict["action"].tolist(), strict=True)
+        self.calls.append(list(pairs))
+        return super()._step(tensordict)
+
+
+class TruncatingEnv(TableEnv):
+    """A table whose last states truncate the episode instead of terminating it."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        flags = ("done", "terminated", "truncated")
+        self.done_spec = Composite({k: Binary(1, dtype=torch.bool) for k in flags})
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        after = super()._step(tensordict)
+        truncated = after.get("terminated")
+        return after.set("truncated", truncated).set("terminated", torch.zeros_like(truncated))
+
+
+def at(env: TableEnv, states: Any) -> TensorDictBase:
+    """The state of an env at the given table states, any shape."""
+    state = torch.as_tensor(states)
+    return env.reset(TensorDict({"state": state}, state.shape), set_state=True)
+
+
+def trees(search: Search) -> list[tuple[bytes, bytes, list[int]]]:
+    """All that a search knows of its nodes, byte for byte."""
+    tree = search.tree
+    assert tree.states is not None
+    return [
+        (
+            tree.nodes[b, :n].tobytes(),
+            tree.edges[b, :n].tobytes(),
+            tree.states["state"][b, :n].tolist(),
+        )
+        for b, n in enumerate(tree.num_nodes)
+    ]
+
+
+# ---------------------------------------------------------------------- batches
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 2), (1, 2, 3)])
+def test_any_batch_shape_is_planned_for_and_written_with_its_shape(shape: tuple[int, ...]) -> None:
+    env = ChainEnv(5)
+    planner = MCTSPlanner(env, gamma=0.9)
+    states = torch.randint(0, 4, shape)
+    td = env.reset(TensorDict({"state": states}, shape), set_state=True)
+    out = planner(td)
+    assert out is td
+    assert out["action"].shape == shape
+    assert out["action"].dtype == torch.int64
+    assert (out["action"] == 1).all()
+    for key, dtype in (
+        ("plan_found", torch.bool),
+        ("root_value", torch.float32),
+        ("num_expansions", torch.int64),
+        ("num_simulated_steps", torch.int64),
+    ):
+        assert out[key].shape == (*shape, 1)
+        assert out[key].dtype == dtype
+    assert out["root_visits"].shape == (*shape, 2)
+    plan = planner.plan(td)
+    assert plan.batch_size == torch.Size(shape)
+    assert torch.equal(plan.lengths, 4 - states)
+    torch.testing.assert_close(plan.returns, 0.9 ** (3.0 - states))
+    assert set(planner.out_keys) <= set(out.keys())
+
+
+def test_the_plan_is_padded_behind_its_end() -> None:
+    env = ChainEnv(5)
+    plan = MCTSPlanner(env).plan(at(env, [3, 1]))
+    assert plan.options.tolist() == [[1, -1, -1], [1, 1, 1]]
+    assert plan.lengths.tolist() == [1, 3]
+    assert plan.durations.tolist() == [1, 3]
+    assert plan.states["state"].tolist() == [[3, 4, 4, 4], [1, 2, 3, 4]]
+
+
+def test_no_roots_are_a_valid_batch() -> None:
+    env = ChainEnv(5)
+    td = TensorDict({"state": torch.zeros(0, dtype=torch.int64)}, [0])
+    planner = MCTSPlanner(env)
+    assert planner(td)["action"].shape == (0,)
+    assert planner.plan(td).lengths.shape == (0,)
+    assert planner.plan(td).lengths.dtype == torch.int64
+
+
+def test_planning_leaves_its_tensordict_alone() -> None:
+    env = ChainEnv(4)
+    td = env.reset()
+    before = set(td.keys())
+    assert MCTSPlanner(env).planning(td).item() == 1
+    assert set(td.keys()) == before
+
+
+def test_an_env_with_a_batch_size_of_its_own_serves_as_simulator() -> None:
+    env = ChainEnv(5, batch_size=[3])
+    assert MCTSPlanner(env)(env.reset())["action"].tolist() == [1, 1, 1]
+
+
+def test_the_same_call_gives_the_same_tree() -> None:
+    env = TableEnv(BINARY_TREE, terminal=LEAVES)
+    planner = MCTSPlanner(env, budget=SearchBudget(expansions=4, until_plan=False))
+    first, second = planner.search(env.reset()), planner.search(env.reset())
+    assert first is not second
+    assert trees(first) == trees(second)
+
+
+# ---------------------------------------------------------------------- closing and masks
+
+
+@pytest.mark.parametrize("expand", ["one", "all"])
+@pytest.mark.parametrize("leaves_per_wave", [1, 4])
+def test_nothing_is_simulated_twice_and_an_exhausted_search_stops(
+    expand: Any, leaves_per_wave: int
+) -> None:
+    env = CountingEnv(BINARY_TREE, terminal=LEAVES)
+    planner = MCTSPlanner(env, expand=expand, leaves_per_wave=leaves_per_wave, budget=FOREVER)
+    td = planner(env.reset())
+    pairs = [pair for call in env.calls for pair in call]
+    assert sorted(pairs) == sorted(BINARY_TREE)
+    assert td["num_expansions"].item() == (14 if expand == "one" else 7)
+    assert td["num_simulated_steps"].item() == 14
+    assert td["plan_found"].item()
+
+
+def test_an_exhausted_search_without_a_reward_says_that_it_found_no_plan() -> None:
+    env = TableEnv({(0, 0): (1, 0.0, 1), (0, 1): (1, -1.0, 1)}, terminal=[1])
+    planner = MCTSPlanner(env)
+    td = planner(env.reset())
+    assert not td["plan_found"].item()
+    assert td["num_expansions"].item() == 1
+    plan = planner.plan(env.reset())
+    assert (plan.found.item(), plan.lengths.item(), plan.returns.item()) == (False, 0, 0.0)
+    assert plan.options.shape == (0,)
+
+
+def test_roots_that_are_finished_cost_no_more_simulation() -> None:
+    table = {(s, 0): (s + 1, float(s == 5), 1) for s in range(6)}
+    env = CountingEnv(table, terminal=[6])
+    planner = MCTSPlanner(env)
+    td = planner(at(env, [0, 4, 5]))
+    assert [len(call) for call in env.calls] == [3, 2, 1, 1, 1, 1]
+    assert td["num_expansions"].flatten().tolist() == [6, 2, 1]
+
+
+def test_all_roots_of_a_wave_share_one_simulator_call() -> None:
+    env = CountingEnv(BINARY_TREE, terminal=LEAVES)
+    planner = MCTSPlanner(env, budget=SearchBudget(expansions=1, until_plan=False))
+    planner(at(env, [0, 0, 1, 2]))
+    assert [len(call) for call in env.calls] == [8]
+
+
+def test_a_terminal_root_is_not_searched_and_is_worth_nothing() -> None:
+    env = CountingEnv(BINARY_TREE, terminal=LEAVES)
+    ones = lambda td: torch.ones(len(td))  # noqa: E731
+    planner = MCTSPlanner(env, leaf_evaluator=ones)
+    td = at(env, [7, 0])
+    ends = torch.tensor([[True], [False]])
+    td = planner(td.set("terminated", ends).set("done", ends))
+    assert td["num_expansions"][0].item() == 0
+    assert td["root_visits"][0].tolist() == [0, 0]
+    assert td["root_value"][0].item() == 0.0
+    assert not td["plan_found"][0].item()
+    assert all(state != 7 for call in env.calls for state, _ in call)
+    assert td["num_expansions"][1].item() > 0
+
+
+def test_a_truncated_root_is_not_searched_and_is_worth_its_evaluation() -> None:
+    env = TruncatingEnv(BINARY_TREE, terminal=LEAVES)
+    planner = MCTSPlanner(env, leaf_evaluator=lambda td: torch.full((len(td),), 0.5))
+    td = at(env, [7])
+    td = planner(
+        td.set("truncated", torch.ones(1, 1, dtype=torch.bool)).set("done", td["truncated"])
+    )
+    assert td["num_expansions"].item() == 0
+    assert td["root_value"].item() == 0.5
+
+
+def test_truncation_bootstraps_and_termination_does_not() -> None:
+    # Two base steps that earn 1, then the end of the episode; the evaluator says 8 everywhere.
+    table = {(0, 0): (1, 1.0, 2)}
+    roots = {}
+    for env_class in (TableEnv, TruncatingEnv):
+        env = env_class(table, terminal=[1])
+        planner = MCTSPlanner(
+            env,
+            gamma=0.5,
+            backup=MaxBackup(),
+            leaf_evaluator=lambda td: torch.full((len(td), 1), 8.0),
+            budget=FOREVER,
+        )
+        td = planner(env.reset())
+        roots[env_class] = td["root_value"].item()
+        assert td["num_expansions"].item() == 1
+    assert roots == {TableEnv: 1.0, TruncatingEnv: 1.0 + 0.25 * 8.0}
+
+
+def test_options_that_the_mask_forbids_are_never_simulated() -> None:
+    table = {(0, 0): (1, 0.0, 1), (0, 2): (2, 0.0, 1), (1, 1): (3, 1.0, 1), (2, 2): (3, 2.0, 1)}
+    for expand in ("one", "all"):
+        env = CountingEnv(table, terminal=[3])
+        td = MCTSPlanner(env, expand=expand, gamma=1.0, budget=FOREVER)(env.reset())
+        assert sorted(pair for call in env.calls for pair in call) == sorted(table)
+        assert td["root_visits"][1].item() == 0
+        assert td["action"].item() == 2
+
+
+def test_the_mask_may_have_another_name() -> None:
+    class RenamedMask(TableEnv):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            self.observation_spec["legal"] = self.observation_spec["action_mask"].clone()
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            after = super()._step(tensordict)
+            legal = after["action_mask"].clone()
+            return after.set("legal", legal).set("action_mask", torch.ones_like(legal))
+
+        def _reset(self, tensordict: TensorDictBase | None = None, **kw: Any) -> TensorDictBase:
+            td = super()._reset(tensordict, **kw)
+            return td.set("legal", td["action_mask"].clone())
+
+    env = RenamedMask({(0, 1): (1, 0.0, 1), (1, 1): (2, 1.0, 1)}, terminal=[2])
+    plan = MCTSPlanner(env, mask_key="legal").plan(env.reset())
+    assert plan.options.tolist() == [1, 1]
+
+
+def test_a_dead_end_below_the_root_is_closed() -> None:
+    class DeadEnd(TableEnv):
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            after = super()._step(tensordict)
+            after["action_mask"][after["state"] == 1] = False
+            return after
+
+    table = {(0, 0): (1, 0.5, 1), (0, 1): (2, 0.0, 1), (1, 0): (1, 9.0, 1), (2, 0): (3, 1.0, 1)}
+    env = DeadEnd(table, terminal=[3])
+    planner = MCTSPlanner(env, gamma=1.0, budget=FOREVER)
+    td = planner(env.reset())
+    assert td["num_expansions"].item() == 2
+    assert planner.plan(env.reset()).returns.item() == 1.0
+
+
+def test_a_root_without_an_option_is_refused() -> None:
+    env = TableEnv(BINARY_TREE, terminal=LEAVES)
+    td = at(env, [0, 1])
+    td["action_mask"][1] = False
+    with pytest.raises(ValueError, match=r"Root 1 has no option that may be taken.*all False"):
+        MCTSPlanner(env)(td)
+    assert "action" not in td.keys()
+
+
+# ---------------------------------------------------------------------- waves and memory
+
+
+@pytest.mark.parametrize("expand", ["one", "all"])
+def test_several_leaves_per_wave_find_the_same_exhausted_tree(expand: Any) -> None:
+    env = TableEnv(BINARY_TREE, terminal=LEAVES)
+    kwargs = {"expand": expand, "backup": MaxBackup(), "budget": FOREVER}
+    one = MCTSPlanner(env, **kwargs).search(env.reset()).tree
+    many = MCTSPlanner(env, leaves_per_wave=5, **kwargs).search(env.reset()).tree
+    for tree in (one, many):
+        assert not tree.nodes["in_flight"].any()
+        assert not tree.edges["in_flight"].any()
+        assert tree.states is not None
+        assert sorted(tree.states["state"][0, :15].tolist()) == list(range(15))
+    assert one.nodes["value"][0, 0] == many.nodes["value"][0, 0]
+    assert one.nodes["visits"][0, 0] == many.nodes["visits"][0, 0] == 15
+
+
+def test_several_leaves_per_wave_need_fewer_simulator_calls() -> None:
+    calls = {}
+    for leaves in (1, 4):
+        env = CountingEnv(BINARY_TREE, terminal=LEAVES)
+        MCTSPlanner(env, leaves_per_wave=leaves, budget=FOREVER)(env.reset())
+        calls[leaves] = len(env.calls)
+    # With 4: the root; both its children; their four children.
+    assert calls == {1: 7, 4: 3}
+
+
+@pytest.mark.parametrize("expand", ["one", "all"])
+def test_growing_by_doubling_loses_nothing(expand: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = ChainEnv(400)
+    planner = MCTSPlanner(
+        env,
+        expand=expand,
+        novelty=RadiusNovelty("state", 0.5),
+        leaves_per_wave=3,
+        budget=SearchBudget(expansions=150, until_plan=False),
+    )
+    td = at(env, [100, 200, 7])
+    grown = planner.search(td)
+    assert grown.tree.capacity > 64
+    with monkeypatch.context() as patch:
+        roomy = functools.partial(SearchTree, capacity=4096)
+        patch.setattr("torchrl_hmcts.planners.search.SearchTree", roomy)
+        large = planner.search(td)
+    assert large.tree.capacity == 4096
+    assert int(grown.tree.num_nodes.min()) > 64
+    assert trees(grown) == trees(large)
+    used = int(grown.tree.num_nodes.min())
+    assert np.array_equal(grown.tree.features[:, :used], large.tree.features[:, :used])
+
+
+def test_a_view_shares_the_memory_of_the_tree() -> None:
+    env = ChainEnv(4)
+    tree = MCTSPlanner(env).search(at(env, [0, 1])).tree
+    view = tree.view()
+    assert view.batch_size == torch.Size([2])
+    tree.nodes["value"][1, 0] = 123.0
+    assert view.node_values[1, 0].item() == 123.0
+    assert view.states.batch_size == torch.Size([2, tree.capacity])
+
+
+def test_a_simulator_that_raises_in_the_middle_leaves_the_planner_usable() -> None:
+    class Failing(TableEnv):
+        steps_left = 3
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            if self.steps_left == 0:
+                raise RuntimeError("the physics exploded")
+            self.steps_left -= 1
+            return super()._step(tensordict)
+
+    env = Failing(BINARY_TREE, terminal=LEAVES)
+    novelty = RadiusNovelty("state", 0.5)
+    planner = MCTSPlanner(env, novelty=novelty, leaves_per_wave=2, expand="one", budget=FOREVER)
+    td = env.reset()
+    with pytest.raises(RuntimeError, match="the physics exploded"):
+        planner(td)
+    assert "action" not in td.keys()
+    assert planner.last_search is None
+    env.steps_left = 10_000
+    healthy = MCTSPlanner(
+        TableEnv(BINARY_TREE, terminal=LEAVES),
+        novelty=RadiusNovelty("state", 0.5),
+        leaves_per_wave=2,
+        expand="one",
+        budget=FOREVER,
+    )
+    assert trees(planner.search(env.reset())) == trees(healthy.search(td))
+
+
+# ---------------------------------------------------------------------- budgets
+
+
+def test_the_search_stops_at_its_number_of_expansions() -> None:
+    env = ChainEnv(100)
+    for expand in ("one", "all"):
+        planner = MCTSPlanner(env, expand=expand, budget=SearchBudget(expansions=17))
+        td = planner(at(env, [0, 50]))
+        assert td["num_expansions"].flatten().tolist() == [17, 17]
+        assert not td["plan_found"].any()
+
+
+def test_the_search_stops_when_its_base_steps_are_spent() -> None:
+    env = TableEnv({(0, 0): (0, 0.0, 7), (0, 1): (0, 0.0, 3)})
+    planner = MCTSPlanner(env, budget=SearchBudget(base_steps=35))
+    td = planner(env.reset())
+    assert td["num_simulated_steps"].item() == 40  # 10 per expansion: the wave that crosses 35
+    assert td["num_expansions"].item() == 4
+
+
+def test_the_search_stops_when_its_time_is_up() -> None:
+    env = ChainEnv(100_000)
+    budget = SearchBudget(expansions=10**9, seconds=0.2, until_plan=False)
+    planner = MCTSPlanner(env, budget=budget)
+    planner(env.reset())
+    begin = time.perf_counter()
+    planner(env.reset())
+    assert 0.15 < time.perf_counter() - begin < 2.0
+
+
+def test_the_search_stops_at_its_first_plan_or_improves_it_for_a_while() -> None:
+    env = ChainEnv(4)
+    first = MCTSPlanner(env).search(env.reset())
+    found_at = int(first.expansions_to_plan[0])
+    assert found_at == first.num_expansions[0]
+    assert first.base_steps_to_plan[0] == first.num_base_steps[0]
+    budget = SearchBudget(improve_expansions=5)
+    search = MCTSPlanner(env, budget=budget).search(env.reset())
+    assert search.expansions_to_plan[0] == found_at
+    assert search.num_expansions[0] == found_at + 5
+    endless = SearchBudget(expansions=60, until_plan=False)
+    assert MCTSPlanner(env, budget=endless).search(env.reset()).num_expansions[0] == 60
+
+
+def test_improving_finds_the_better_plan() -> None:
+    # The first plan pays 1 at once; three steps on there are 5.
+    table = {(0, 0): (4, 1.0, 1), (0, 1): (1, 0.0, 1), (1, 0): (2, 0.0, 1), (2, 0): (4, 5.0, 1)}
+    table[3, 0] = (4, 0.0, 1)
+    env = TableEnv(table, terminal=[4])
+    kwargs = {"gamma": 0.9}
+    assert MCTSPlanner(env, **kwargs).plan(env.reset()).options.tolist() == [0]
+    better = MCTSPlanner(env, budget=SearchBudget(improve_expansions=10), **kwargs)
+    plan = better.plan(env.reset())
+    assert plan.options.tolist() == [1, 0, 0]
+    assert plan.returns.item() == pytest.approx(0.81 * 5.0)
+
+
+@pytest.mark.parametrize("name", ["expansions", "base_steps", "seconds"])
+@pytest.mark.parametrize("value", [0, -1])
+def test_a_budget_of_nothing_is_refused_with_its_value(name: str, value: int) -> None:
+    with pytest.raises(ValueError, match=f"{name} > 0.*no plan; got {value}"):
+        SearchBudget(**{name: value})
+
+
+def test_negative_improvement_is_refused() -> None:
+    with pytest.raises(ValueError, match="improve_expansions >= 0; got -3"):
+        SearchBudget(improve_expansions=-3)
+
+
+def test_a_progress_display_is_told_of_every_wave() -> None:
+    env = CountingEnv(BINARY_TREE, terminal=LEAVES)
+    seen: list[SearchProgress] = []
+    MCTSPlanner(env, budget=FOREVER, progress=seen.append)(at(env, [0, 3]))
+    assert len(seen) == len(env.calls)
+    assert [p.num_roots for p in seen] == [2] * len(seen)
+    assert seen[0].num_active == 2
+    assert seen[-1].num_active == 1
+    assert seen[-1].expansions == 8
+    assert seen[-1].base_steps == 16
+    seconds = [p.seconds for p in seen]
+    assert seconds == sorted(seconds)
+
+
+# ---------------------------------------------------------------------- final choices
+
+
+def test_the_final_choices_read_the_root_in_their_own_way() -> None:
+    # Option 0: 0.6 and the end. Option 1: a loop of 0.2 per step with gamma 1/2, worth up to 0.4,
+    # never closed and so most visited. Option 2: -0.2 now, then 2 and the end: the best plan.
+    table = {
+        (0, 0): (2, 0.6, 1),
+        (0, 1): (1, 0.2, 1),
+        (0, 2): (3, -0.2, 1),
+        (1, 0): (1, 0.2, 1),
+        (3, 0): (2, 2.0, 1),
+    }
+    env = TableEnv(table, terminal=[2])
+    budget = SearchBudget(expansions=50, until_plan=False)
+    chosen = {}
+    for choice in (BestPlan(), MostVisited(), HighestValue()):
+        planner = MCTSPlanner(
+            env, gamma=0.5, expand="one", final_choice=choice, budget=budget, tree_policy=UCT(0.5)
+        )
+        td = planner(env.reset())
+        chosen[type(choice)] = td["action"].item()
+    # Values with mean backup: 0.6, at most 0.4, and -0.2 + (0 + 2)/2 / 2 = 0.3.
+    assert chosen == {BestPlan: 2, MostVisited: 1, HighestValue: 0}
+
+
+def test_the_most_visited_option_breaks_ties_by_value_then_by_index() -> None:
+    table = {(0, 0): (1, 0.1, 1), (0, 1): (1, 0.3, 1), (0, 2): (1, 0.3, 1)}
+    env = TableEnv(table, terminal=[1])
+    planner = MCTSPlanner(env, final_choice=MostVisited(), budget=FOREVER)
+    td = planner(env.reset())
+    assert td["root_visits"].tolist() == [1, 1, 1]
+    assert td["action"].item() == 1
+
+
+def test_without_a_plan_the_best_plan_falls_back_to_the_most_visited_option() -> None:
+    table = {(0, 0): (1, -1.0, 1), (0, 1): (2, -0.1, 1), (1, 0): (1, 0.0, 1), (2, 0): (2, 0.0, 1)}
+    env = TableEnv(table)
+    td = MCTSPlanner(env, budget=SearchBudget(expansions=20))(env.reset())
+    assert not td["plan_found"].item()
+    assert td["root_visits"].argmax().item() == td["action"].item() == 1
+
+
+# ---------------------------------------------------------------------- evaluators and priors
+
+
+def test_a_leaf_evaluator_leads_the_search_where_there_is_no_reward_yet() -> None:
+    # Two corridors without reward; the evaluator likes the second.
+    env = ChainEnv(50)
+    middle = at(env, 25)
+    budget = SearchBudget(expansions=12)
+    for sign in (1.0, -1.0):
+        planner = MCTSPlanner(
+            env,
+            leaf_evaluator=lambda td, sign=sign: sign * td["state"].to(torch.float32),
+            tree_policy=UCT(c=0.1),
+            final_choice=HighestValue(),
+            budget=budget,
+        )
+        assert planner(middle.clone())["action"].item() == int(sign > 0)
+
+
+def test_an_evaluator_may_be_a_module_call_with_a_trailing_dimension() -> None:
+    net = torch.nn.Linear(1, 1)
+    env = ChainEnv(5)
+    planner = MCTSPlanner(env, leaf_evaluator=lambda td: net(td["state"].float().unsqueeze(-1)))
+    td = planner(env.reset())
+    assert not td["root_value"].requires_grad
+    assert len(list(planner.parameters())) == 0
+
+
+@pytest.mark.parametrize("expand", ["one", "all"])
+def test_an_option_prior_decides_among_options_without_visits(expand: Any) -> None:
+    table = {(0, a): (a + 1, 0.0, 1) for a in range(3)}
+    table |= {(s, 0): (4, 0.0, 1) for s in (1, 2, 3)}
+    env = CountingEnv(table, terminal=[4])
+    prior = lambda td: torch.tensor([0.2, 0.3, 0.5]).expand(len(td), 3)  # noqa: E731
+    planner = MCTSPlanner(
+        env, tree_policy=PUCT(c=1.0), option_prior=prior, expand=expand, budget=FOREVER
+    )
+    search = planner.search(env.reset())
+    np.testing.assert_allclose(search.tree.edges[0, 0]["prior"], [0.2, 0.3, 0.5])
+    if expand == "one":  # 0.5 first; then 0.3 > 0.5 / 2
+        assert env.calls[:2] == [[(0, 2)], [(0, 1)]]
+    else:
+        assert env.calls[:2] == [[(0, 0), (0, 1), (0, 2)], [(3, 0)]]
+
+
+def constant(shape: tuple[int, ...], value: float) -> Any:
+    return lambda td: torch.full(shape, value)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"leaf_evaluator": constant((1,), float("nan"))}, ValueError, "evaluator returned nan"),
+        (
+            {"leaf_evaluator": constant((1, 3), 0.0)},
+            ValueError,
+            r"shape \[1, 3\].*\[1\] or \[1, 1\]",
+        ),
+        ({"leaf_evaluator": lambda td: td}, TypeError, "must return a tensor; got TensorDict"),
+        ({"option_prior": constant((1, 5), 0.2)}, ValueError, r"shape \[1, 5\].*\[1, 2\]"),
+        ({"option_prior": constant((2,), 0.5)}, ValueError, r"shape \[2\].*\[1, 2\]"),
+        ({"option_prior": constant((1, 2), float("nan"))}, ValueError, "prior returned nan"),
+        ({"option_prior": constant((1, 2), -0.5)}, ValueError, "prior returned -0.5.*softmax"),
+        ({"option_prior": lambda td: [0.5]}, TypeError, "option_prior must return a tensor"),
+    ],
+)
+def test_an_evaluator_that_returns_nonsense_is_named(
+    kwargs: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    env = ChainEnv(4)
+    td = env.reset()
+    with pytest.raises(error, match=message):
+        MCTSPlanner(env, **kwargs)(td)
+    assert "action" not in td.keys()
+
+
+# ---------------------------------------------------------------------- bad input
+
+
+def test_an_env_that_cannot_be_set_to_a_state_is_refused() -> None:
+    gym_env = pytest.importorskip("torchrl.envs").GymEnv("CartPole-v1")
+    with pytest.raises(
+        ValueError, match=r"set to any state; GymEnv cannot .*WaterworldMazeEnv\(\)"
+    ):
+        MCTSPlanner(gym_env)
+
+
+def test_something_that_is_no_torchrl_env_is_refused() -> None:
+    with pytest.raises(TypeError, match="plans in a TorchRL env; got dict"):
+        MCTSPlanner({})  # type: ignore[arg-type]
+
+
+def test_a_continuous_action_is_refused_with_two_ways_out() -> None:
+    with pytest.raises(ValueError, match="(?s)discrete action; PendulumEnv .*ActionDiscretizer"):
+        MCTSPlanner(PendulumEnv())
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"gamma": 0.0}, r"gamma in \(0, 1\]; got 0.0"),
+        ({"gamma": 1.01}, r"gamma in \(0, 1\]; got 1.01"),
+        ({"gamma": float("nan")}, r"gamma in \(0, 1\]; got nan"),
+        ({"leaves_per_wave": 0}, "leaves_per_wave >= 1; got 0"),
+        ({"expand": "some"}, "'all' or 'one'; got 'some'"),
+    ],
+)
+def test_a_number_out_of_range_is_refused_at_construction(
+    kwargs: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        MCTSPlanner(ChainEnv(3), **kwargs)
+
+
+@pytest.mark.parametrize("policy", [UCT, PUCT])
+@pytest.mark.parametrize("c", [-1.0, float("nan"), float("inf")])
+def test_a_negative_or_infinite_exploration_constant_is_refused(policy: Any, c: float) -> None:
+    with pytest.raises(ValueError, match=f"c >= 0 that is finite; got {c}"):
+        policy(c=c)
+
+
+def test_missing_entries_of_the_state_are_named() -> None:
+    env = TableEnv(BINARY_TREE, terminal=LEAVES)
+    with pytest.raises(ValueError, match=r"lacks \['action_mask'\].*this one has.*state"):
+        MCTSPlanner(env)(env.reset().exclude("action_mask"))
+    with pytest.raises(ValueError, match=r"lacks \['state'\]"):
+        MCTSPlanner(env)(env.reset().exclude("state"))
+
+
+@pytest.mark.parametrize("key", ["th", ("params", "g")])
+def test_a_state_that_is_not_finite_is_refused(key: Any) -> None:
+    env = TransformedEnv(PendulumEnv(), ActionDiscretizer(num_intervals=3))
+    td = env.reset()
+    td.set(key, torch.full_like(td.get(key), float("nan")))
+    with pytest.raises(ValueError, match="(?s)state to plan from has .* = nan.*not finite"):
+        MCTSPlanner(env)(td)
+    assert "plan_found" not in td.keys()
+
+
+def test_a_reward_that_is_not_finite_is_refused() -> None:
+    env = TableEnv({(0, 0): (1, float("nan"), 1)}, terminal=[1])
+    with pytest.raises(ValueError, match="reward of nan"):
+        MCTSPlanner(env)(env.reset())
+
+
+# ---------------------------------------------------------------------- other people's envs
+
+
+@pytest.mark.parametrize("categorical", [True, False])
+def test_a_discretised_pendulum_with_a_time_limit_is_planned_in(categorical: bool) -> None:
+    discretizer = ActionDiscretizer(num_intervals=3, categorical=categorical)
+    env = TransformedEnv(PendulumEnv(), Compose(discretizer, StepCounter(max_steps=4)))
+    env.set_seed(0)
+    planner = MCTSPlanner(
+        env, backup=MaxBackup(), budget=SearchBudget(expansions=200, until_plan=False)
+    )
+    assert planner.num_options == 3
+    search = planner.search(env.reset())
+    # 1 + 3 + 9 + 27 states are expanded, the 81 of the fourth step are truncated.
+    assert search.num_expansions.tolist() == [40]
+    assert search.tree.num_nodes.tolist() == [121]
+    assert search.exhausted(np.array([0])).all()
+    rollout = env.rollout(10, policy=planner)
+    assert rollout.shape == (4,)
+    # Once exhausted, max backup is the best of the 81 sequences, so each step keeps the promise.
+    rewards, promised = rollout["next", "reward"].flatten(), rollout["root_value"].flatten()
+    for i in range(3):
+        assert promised[i].item() == pytest.approx(
+            rewards[i].item() + 0.99 * promised[i + 1].item(), rel=1e-4
+        )
+
+
+# ---------------------------------------------------------------------- as a policy
+
+
+def test_the_planner_is_a_policy_for_a_rollout() -> None:
+    env = ChainEnv(6)
+    rollout = env.rollout(20, policy=MCTSPlanner(env))
+    assert rollout["action"].tolist() == [1] * 5
+    assert rollout["next", "reward"].sum().item() == 1.0
+    assert rollout["plan_found"].all()
+
+
+def test_the_planner_is_a_policy_for_a_batched_rollout() -> None:
+    env = ChainEnv(6, batch_size=[2])
+    rollout = env.rollout(20, policy=MCTSPlanner(env), break_when_all_done=True)
+    assert rollout["next", "done"][:, -1].all()
+    assert rollout.shape == (2, 5)
+
+
+class CountingPlanner(MCTSPlanner):
+    """A planner that records the states it is asked to search from."""
+
+    def search(self, td: TensorDictBase) -> Search:
+        self.__dict__.setdefault("asked", []).append(td["state"].flatten().tolist())
+        return super().search(td)
+
+
+def test_the_hierarchical_policy_plans_once_and_follows_its_plan() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    rollout = env.rollout(20, policy=HierarchicalPolicy(planner))
+    assert planner.asked == [[0]]
+    assert rollout["action"].tolist() == [1] * 5
+    assert rollout["plan_step"].flatten().tolist() == [1, 2, 3, 4, 5]
+    assert rollout["plan_length"].flatten().tolist() == [5] * 5
+
+
+def test_the_hierarchical_policy_plans_again_at_the_end_of_its_plan() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    rollout = env.rollout(20, policy=HierarchicalPolicy(planner, max_plan_length=2))
+    assert planner.asked == [[0], [2], [4]]
+    assert rollout["next", "reward"].sum().item() == 1.0
+
+
+def test_the_hierarchical_policy_takes_the_planners_choice_where_it_finds_no_plan() -> None:
+    env = ChainEnv(30)
+    planner = CountingPlanner(env, budget=SearchBudget(expansions=2))
+    rollout = env.rollout(4, policy=HierarchicalPolicy(planner))
+    assert len(planner.asked) == 4
+    assert rollout["plan_length"].flatten().tolist() == [1] * 4
+
+
+def test_each_element_of_a_batch_plans_at_its_own_time() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    td = env.reset(TensorDict({"state": torch.tensor([0, 3, 4])}, [3]), set_state=True)
+    rollout = env.rollout(
+        20,
+        policy=HierarchicalPolicy(planner, max_plan_length=2),
+        tensordict=td,
+        auto_reset=False,
+        break_when_all_done=True,
+    )
+    # Plans of 5, 2 and 1 options, cut to 2: only the first element ever plans again.
+    assert planner.asked == [[0, 3, 4], [2], [4]]
+    assert rollout["next", "reward"].sum(-2).flatten().tolist() == [1.0, 1.0, 1.0]
+
+
+def test_a_new_episode_is_planned_for_although_the_old_plan_is_not_at_its_end() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    policy = HierarchicalPolicy(planner)
+    td = policy(at(env, 1))
+    assert td["plan_step"].item() == 1
+    td.update(at(env, 0)).set("is_init", torch.ones(1, dtype=torch.bool))
+    td = policy(td)
+    assert planner.asked == [[1], [0]]
+    assert (td["plan_length"].item(), td["plan_step"].item()) == (5, 1)
+
+
+def test_a_plan_needs_room_for_one_option() -> None:
+    with pytest.raises(ValueError, match="max_plan_length >= 1; got 0"):
+        HierarchicalPolicy(MCTSPlanner(ChainEnv(3)), max_plan_length=0)
+
+
+# ---------------------------------------------------------------------- without the compiler
+
+WITHOUT_NUMBA = """
+import sys
+import numpy as np
+from torchrl_hmcts.planners import PUCT, UCT, MaxBackup, MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.testing import ChainEnv
+
+env = ChainEnv(6)
+out = {}
+for i, policy in enumerate((UCT(), PUCT())):
+    for j, expand in enumerate(("one", "all")):
+        planner = MCTSPlanner(
+            env, tree_policy=policy, expand=expand, leaves_per_wave=2, backup=MaxBackup(),
+            novelty=RadiusNovelty("state", 1.5), budget=SearchBudget(expansions=30),
+        )
+        tree = planner.search(env.reset()).tree
+        for name in ("parent", "option", "visits", "flags", "value", "path_return"):
+            out[f"{name}{i}{j}"] = tree.nodes[name][0, : tree.num_nodes[0]]
+np.savez(sys.argv[1], **out)
+"""
+
+
+def test_the_kernels_run_as_plain_python_too(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-W", "error", "-c", WITHOUT_NUMBA, str(tmp_path / "python.npz")]
+    subprocess.run(command, check=True, env=environment, cwd=tmp_path, timeout=120)
+    monkeypatch.setattr(sys, "argv", ["", str(tmp_path / "numba.npz")])
+    exec(compile(WITHOUT_NUMBA, "<search>", "exec"), {})
+    python, numba = np.load(tmp_path / "python.npz"), np.load(tmp_path / "numba.npz")
+    assert python.files == numba.files
+    for name in numba.files:
+        np.testing.assert_allclose(python[name], numba[name], rtol=1e-5, err_msg=name)

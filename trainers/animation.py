@@ -1,0 +1,56 @@
+"""GIFs of episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import imageio.v3 as iio
+import numpy as np
+from tensordict import TensorDictBase
+
+from torchrl_hmcts.envs import WaterworldMazeEnv
+from torchrl_hmcts.trainers.plots import option_rgb
+
+if TYPE_CHECKING:
+    from torchrl_hmcts.trainers.demo import Episode
+
+
+def write_episode_gif(
+    env: WaterworldMazeEnv,
+    start: TensorDictBase,
+    episode: Episode,
+    path: Path,
+    *,
+    steps_per_frame: int = 2,
+) -> None:
+    """Write an episode as a GIF, the plan drawn in with one colour per option.
+
+    Args:
+        env: draws the frames.
+        start: first state, without batch dimensions.
+        episode: plan and positions.
+        path: file to write.
+        steps_per_frame: base steps from one frame to the next.
+    """
+    plan_points = episode.plan.states["position"][: int(episode.plan.lengths) + 1].numpy()
+    plan_colors = [
+        _pale(option_rgb(int(o))) for o in episode.plan.options[: int(episode.plan.lengths)]
+    ]
+    plan = [(plan_points, np.array(plan_colors))] if plan_colors else []
+    frames = []
+    last = len(episode.positions) - 1
+    for step in [*range(0, last, steps_per_frame), last]:
+        trail = episode.positions[: step + 1]
+        colors = np.array([option_rgb(int(o)) for o in episode.options[:step]])
+        state = start.clone().set("position", start["position"].new_tensor(trail[-1]))
+        paths = [*plan, (trail, colors)] if step else plan
+        frames.append(env.render(state, paths=paths))
+    rate = 1.0 / (env.TIME_STEP * steps_per_frame)
+    durations = [1000.0 / (2.0 * rate)] * (len(frames) - 1) + [1500.0]  # twice real time
+    iio.imwrite(path, np.stack(frames), extension=".gif", duration=durations, loop=0)
+
+
+def _pale(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 - 0.35 * (255 - channel)) for channel in color)
+    return red, green, blue

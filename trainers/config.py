@@ -1,0 +1,103 @@
+"""Configuration of the command line's experiments, as dataclasses."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TypeVar
+
+C = TypeVar("C")
+
+NUM_TEST_MAZES = 342
+TRAINING_COPIES = 64
+
+
+@dataclass
+class DemoConfig:
+    """What ``hmcts demo`` does; every value can be given as ``key=value`` on the command line.
+
+    Example:
+        >>> DemoConfig(seed=3).train_base_steps
+        40000
+    """
+
+    seed: int = 0
+    """Seed of networks, training, and the starts and targets in the test mazes."""
+    out: str = "runs/demo"
+    """Folder that receives metrics, pictures and the page; made if absent."""
+    mazes: int = 100
+    """Test mazes to solve, at most the 342 of the test split."""
+    num_skills: int = 4
+    """Skills of the worker, the options of the manager (the source's N_policies)."""
+    option_steps: int = 20
+    """Base steps of an option (the source's N_worker_samples)."""
+    train_base_steps: int = 40_000
+    """Base steps of worker training in the training mazes."""
+    leaves_per_wave: int = 4
+    """Leaves of the tree whose options are simulated together; more are faster, less selective."""
+    novelty_radius: float = 0.6
+    """Tiles within which a place counts as visited; about half of what an option covers."""
+    expansions: int = 1_000
+    """Nodes that a search may expand before it gives up."""
+    gamma: float = 0.99
+    """Discount per base step."""
+    toy: bool = False
+    """Two minutes less: 1,920 base steps of training and 3 mazes, to see that everything works."""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "mazes",
+            "num_skills",
+            "option_steps",
+            "train_base_steps",
+            "expansions",
+            "leaves_per_wave",
+        ):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        if self.train_base_steps % TRAINING_COPIES:
+            raise ValueError(
+                f"train_base_steps={self.train_base_steps} does not divide among the "
+                f"{TRAINING_COPIES} mazes played at once; use a multiple of {TRAINING_COPIES}."
+            )
+        if self.mazes > NUM_TEST_MAZES:
+            raise ValueError(f"mazes={self.mazes}, but the test split has {NUM_TEST_MAZES} mazes.")
+
+
+def parse_overrides(config_class: type[C], overrides: Sequence[str]) -> C:
+    """Build a configuration from ``key=value`` words, types checked.
+
+    Args:
+        config_class: a dataclass whose fields all have defaults.
+        overrides: words of the command line.
+
+    Returns:
+        The configuration.
+
+    Raises:
+        ValueError: if a word is no ``key=value``, a key is unknown (the nearest ones are named) or
+            a value has the wrong type.
+
+    Example:
+        >>> parse_overrides(DemoConfig, ["seed=1", "out=runs/one"]).out
+        'runs/one'
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    names = [field.name for field in fields(config_class)]  # type: ignore[arg-type]
+    for word in overrides:
+        key, separator, _ = word.partition("=")
+        if not separator:
+            raise ValueError(f"{word!r} is no key=value, e.g. {names[0]}=1.")
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=3, cutoff=0.4) or names
+            raise ValueError(f"Unknown key {key!r}. Did you mean: {', '.join(near)}?")
+    try:
+        merged = OmegaConf.merge(
+            OmegaConf.structured(config_class), OmegaConf.from_dotlist(list(overrides))
+        )
+        return config_class(**{name: merged[name] for name in names})
+    except OmegaConfBaseException as error:
+        raise ValueError(str(error).splitlines()[0]) from None
