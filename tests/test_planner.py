@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torchrl.data import Binary, Composite
 from torchrl.envs import ActionDiscretizer, Compose, PendulumEnv, StepCounter, TransformedEnv
 
@@ -32,6 +33,7 @@ from torchrl_hmcts.planners import (
     SearchTree,
 )
 from torchrl_hmcts.testing import ChainEnv, TableEnv
+from torchrl_hmcts.transforms import OptionTransform
 
 FOREVER = SearchBudget(expansions=10_000, until_plan=False)
 
@@ -694,6 +696,21 @@ def test_a_discretised_pendulum_with_a_time_limit_is_planned_in(categorical: boo
         )
 
 
+def test_options_of_a_worker_are_planned_with_the_discount_they_were_made_with() -> None:
+    worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+    env = TransformedEnv(ChainEnv(9), OptionTransform(worker, 2, 3, gamma=0.5))
+    planner = MCTSPlanner(env)
+    assert planner.gamma == 0.5
+    plan = planner.plan(env.reset())
+    # Options of 3, 3 and 2 base steps to the right: 8 in all, the last one pays 1.
+    assert plan.options.tolist() == [1, 1, 1]
+    assert plan.durations.item() == 8
+    assert plan.returns.item() == pytest.approx(0.5**7)
+    rollout = env.rollout(10, policy=HierarchicalPolicy(planner))
+    assert rollout["option"].tolist() == [1, 1, 1]
+    assert rollout["next", "state"].tolist() == [3, 6, 8]
+
+
 # ---------------------------------------------------------------------- as a policy
 
 
@@ -710,6 +727,22 @@ def test_the_planner_is_a_policy_for_a_batched_rollout() -> None:
     rollout = env.rollout(20, policy=MCTSPlanner(env), break_when_all_done=True)
     assert rollout["next", "done"][:, -1].all()
     assert rollout.shape == (2, 5)
+
+
+def test_elements_that_a_rollout_no_longer_steps_are_not_planned_for() -> None:
+    # TorchRL fills them with zeros, whose action mask would forbid everything.
+    env = CountingEnv({(s, 0): (s + 1, float(s == 5), 1) for s in range(6)}, terminal=[6])
+    planner = MCTSPlanner(env, budget=SearchBudget(expansions=1))
+    rollout = env.rollout(
+        20,
+        policy=planner,
+        tensordict=at(env, [0, 4, 5]),
+        auto_reset=False,
+        break_when_all_done=True,
+    )
+    assert rollout["next", "done"][:, -1].all()
+    # Calls alternate: one of the search, one of the rollout itself.
+    assert [len(call) for call in env.calls] == [3, 3, 2, 2] + [1, 1] * 4
 
 
 class CountingPlanner(MCTSPlanner):
@@ -759,7 +792,7 @@ def test_each_element_of_a_batch_plans_at_its_own_time() -> None:
     )
     # Plans of 5, 2 and 1 options, cut to 2: only the first element ever plans again.
     assert planner.asked == [[0, 3, 4], [2], [4]]
-    assert rollout["next", "reward"].sum(-2).flatten().tolist() == [1.0, 1.0, 1.0]
+    assert rollout["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 4, 5]
 
 
 def test_a_new_episode_is_planned_for_although_the_old_plan_is_not_at_its_end() -> None:

@@ -98,6 +98,6 @@ def parse_overrides(config_class: type[C], overrides: Sequence[str]) -> C:
         merged = OmegaConf.merge(
             OmegaConf.structured(config_class), OmegaConf.from_dotlist(list(overrides))
         )
-        return config_class(**{name: merged[name] for name in names})
+        return config_class(**{name: getattr(merged, name) for name in names})
     except OmegaConfBaseException as error:
         raise ValueError(str(error).splitlines()[0]) from None

@@ -53,7 +53,7 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     policy = SkillPolicy(loss.actor_network, deterministic=True)
 
     print(f"Solving {config.mazes} test mazes that the worker has never seen ...")
-    options = {
+    options: dict[str, Any] = {
         "num_skills": config.num_skills,
         "option_steps": config.option_steps,
         "gamma": config.gamma,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -200,6 +201,8 @@ class DIAYNLoss(DiscreteSACLoss):
         keys = SkillDiscriminatorLoss._AcceptedKeys.__dataclass_fields__
         self.discriminator_objective.set_keys(**{k: getattr(self.tensor_keys, k) for k in keys})
         super()._forward_value_estimator_keys(**kwargs)
+
+    _in_keys: Any  # list of keys, or None until it is known
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()

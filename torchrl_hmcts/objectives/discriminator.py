@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -68,6 +69,8 @@ class SkillDiscriminatorLoss(LossModule):
         check_reduction(type(self).__name__, reduction)
         self.convert_to_functional(discriminator, "discriminator", create_target_params=False)
         self.reduction = reduction
+
+    _in_keys: Any  # list of keys, or None until it is known
 
     def _set_in_keys(self) -> None:
         features = [unravel_key(("next", key)) for key in self.discriminator.in_keys]

@@ -62,11 +62,13 @@ class HierarchicalPolicy(TensorDictModuleBase):
             plan = plan.clone()
             length, step = (tensordict.get(k).clone() for k in ("plan_length", "plan_step"))
         needs = (step >= length).squeeze(-1)
-        for key in ("is_init", "done", "_step"):  # "_step": False where a rollout has ended
-            flag = tensordict.get(key, None)
-            if flag is not None:
-                flag = flag.reshape(shape)
-                needs = needs | flag if key == "is_init" else needs & (flag ^ (key == "done"))
+        is_init, done, stepped = (tensordict.get(k, None) for k in ("is_init", "done", "_step"))
+        if is_init is not None:
+            needs = needs | is_init.reshape(shape)
+        if done is not None:
+            needs = needs & ~done.reshape(shape)
+        if stepped is not None:  # False where a rollout goes on without the element
+            needs = needs & stepped.reshape(shape)
         if needs.any():
             step[needs] = 0
             plan[needs], length[needs] = self._plan(tensordict[needs])

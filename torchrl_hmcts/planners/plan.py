@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase, tensorclass
+from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
 from torchrl_hmcts.planners.search import Search
 
 
-@tensorclass
-class Plan:
+class Plan(TensorClass):
     """The best plan of each root: options that earn a reward when carried out one after the other.
 
     Example:
@@ -38,8 +37,8 @@ def extract_plans(search: Search) -> Plan:
     """Read the best plan of each root out of a search, batch ``[B]``."""
     tree, best = search.tree, search.best_node
     paths = [
-        np.array(tree.path(b, node)) if node >= 0 else np.zeros(1, np.int64)
-        for b, node in enumerate(best)
+        np.array(tree.path(b, node) if node >= 0 else [0], np.int64)
+        for b, node in enumerate(best.tolist())
     ]
     lengths = np.array([len(path) - 1 for path in paths], np.int64)
     width = int(lengths.max(initial=0))

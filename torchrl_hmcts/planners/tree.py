@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase, tensorclass
+from tensordict import TensorClass, TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -55,8 +55,7 @@ CLOSED = 16  # no simulation below it can add anything
 REWARDED = 32  # the option that led here earned a positive reward
 
 
-@tensorclass
-class TreeView:
+class TreeView(TensorClass):
     """A search tree as tensors that share the memory of the kernels' records.
 
     Only the first ``num_nodes[b]`` nodes of root ``b`` have a meaning. Node 0 is the root.

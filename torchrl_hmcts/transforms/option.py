@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -175,7 +175,7 @@ class OptionTransform(Transform):
         while taken < self.max_steps:
             ended = self._ended(fit, root, after, taken)
             if ended.any():
-                if out is None or duration is None:
+                if out is None or duration is None or rows is None:
                     out = after.clone()
                     duration = torch.full((n, 1), taken, device=reward.device)
                     rows = torch.arange(n, device=reward.device)
@@ -198,10 +198,10 @@ class OptionTransform(Transform):
             if trajectory is not None:
                 trajectory.write(taken, rows, root, after)
             taken += 1
-        if out is None or duration is None:
+        if out is None or duration is None or rows is None:
             out = after
             duration = torch.full((n, 1), taken, device=reward.device)
-        elif rows is not None and rows.numel():
+        elif rows.numel():
             out[rows] = after
             duration[rows] = taken
         return self._finish(fit, out, reward, duration, trajectory)

@@ -1,0 +1,942 @@
+"""OptionTransform against a loop written here by hand, in every kind of env, and bad input."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import InteractionType, TensorDictModule, set_interaction_type
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    LazyTensorStorage,
+    ReplayBuffer,
+    Unbounded,
+)
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    GymEnv,
+    ParallelEnv,
+    PendulumEnv,
+    RewardScaling,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.modules import ProbabilisticActor
+
+from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_from_text, maze_pool
+from torchrl_hmcts.testing import ChainEnv, TableEnv
+from torchrl_hmcts.transforms import OptionTransform
+
+GAMMA = 0.9
+BATCHES = [[], [3], [2, 3]]
+LEFT, RIGHT = 0, 1
+
+
+class NestedChainEnv(EnvBase):
+    """A chain whose action, observation and reward are nested; ``(agent, reward)`` is the state."""
+
+    batch_locked = False
+    _supports_set_state = True
+
+    def __init__(self, length=6):
+        super().__init__(batch_size=[])
+        self.length = length
+        state = Bounded(0, length, shape=(), dtype=torch.int64)
+        self.state_spec = Composite(agent=Composite(state=state))
+        self.observation_spec = Composite(
+            agent=Composite(state=state.clone(), seen=Composite(double=Unbounded((1,))))
+        )
+        self.full_action_spec = Composite(agent=Composite(action=Categorical(2, shape=())))
+        self.full_reward_spec = Composite(agent=Composite(reward=Unbounded((1,))))
+        self.full_done_spec = Composite(
+            {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        )
+
+    def _observe(self, state):
+        return {"state": state, "seen": {"double": 2.0 * state.unsqueeze(-1)}}
+
+    def _step(self, tensordict):
+        state = tensordict["agent", "state"] + 2 * tensordict["agent", "action"] - 1
+        state = state.clamp(0, self.length)
+        done = (state == self.length).unsqueeze(-1)
+        agent = {**self._observe(state), "reward": state.unsqueeze(-1).float()}
+        return TensorDict(
+            {"agent": agent, "done": done, "terminated": done, "truncated": torch.zeros_like(done)},
+            batch_size=tensordict.shape,
+        )
+
+    def _reset(self, tensordict=None, **kwargs):
+        shape = [] if tensordict is None else tensordict.shape
+        state = torch.zeros(shape, dtype=torch.int64)
+        if kwargs.get("set_state"):
+            state = tensordict["agent", "state"].clone()
+        return TensorDict({"agent": self._observe(state)}, batch_size=shape)
+
+    def _set_seed(self, seed):
+        """Nothing is random."""
+
+
+class Hidden(nn.Module):
+    """A worker's network with something that train and eval mode change."""
+
+    def __init__(self):
+        super().__init__()
+        self.norm = nn.BatchNorm1d(1)
+        self.dropout = nn.Dropout(0.5)
+
+    def forward(self, skill):
+        return skill
+
+
+def skill_is_action(action_key="action", skill_key="skill"):
+    return TensorDictModule(lambda skill: skill.clone(), [skill_key], [action_key])
+
+
+def constant(action):
+    """A worker that always takes one action, whatever it sees."""
+    return TensorDictModule(
+        lambda skill: action.expand(*skill.shape, *action.shape).clone(), ["skill"], ["action"]
+    )
+
+
+def towards_corner():
+    """A Waterworld worker that looks at the state: skill 0 to the left or up, 1 right or down."""
+
+    def choose(position, velocity, skill):
+        along = (position.sum(-1) + velocity.sum(-1)).mul(3).long() % 2
+        return 2 * along + skill
+
+    return TensorDictModule(choose, ["position", "velocity", "skill"], ["action"])
+
+
+def waterworld(**kwargs):
+    """A small room, so that episodes end inside options, at different steps."""
+    return WaterworldMazeEnv(maze_from_text("...\n.#.\n...")[0][None], seed=0, **kwargs)
+
+
+def chain(*, start=None, batch=(), **kwargs):
+    env = ChainEnv(6, reward_per_step=-0.25, **kwargs)
+    td = env.reset(TensorDict(batch_size=batch))
+    return env, td if start is None else td.set("state", torch.tensor(start))
+
+
+def macro(env, worker=None, num_options=2, max_steps=4, gamma=GAMMA, **kwargs):
+    return TransformedEnv(
+        env, OptionTransform(worker or skill_is_action(), num_options, max_steps, gamma, **kwargs)
+    )
+
+
+def option_by_hand(env, td, worker, max_steps, termination=None, reward_key="reward"):
+    """The macro-step of one element: the last base step's entries, reward, duration, base steps."""
+    rewards, steps = [], []
+    td = td.exclude("next").clone()
+    option = td["option"]
+    while True:
+        td = env.step(worker(td.set("skill", option)))
+        steps.append(td.clone())
+        after = td["next"]
+        rewards.append(after[reward_key])
+        seen = after.clone().set("skill", option).set("duration", torch.tensor([len(steps)]))
+        ends = termination is not None and bool(termination(seen))
+        if ends or after["done"] or len(steps) == max_steps:
+            break
+        td = step_mdp(td)
+    after = after.clone()
+    after.set(reward_key, sum(GAMMA**i * reward for i, reward in enumerate(rewards)))
+    after.set("duration", torch.tensor([len(rewards)]))
+    return after, steps
+
+
+def by_hand(env, td, worker, max_steps=4, termination=None, reward_key="reward"):
+    """The macro-steps of a batch, element by element."""
+    flat = td.reshape(-1)
+    rows = [
+        option_by_hand(env, flat[i], worker, max_steps, termination, reward_key)[0]
+        for i in range(flat.shape[0])
+    ]
+    return torch.stack(rows).reshape(td.shape)
+
+
+def assert_close(actual, expected):
+    keys = set(expected.keys(True, True))
+    assert keys <= set(actual.keys(True, True))
+    for key in keys:
+        left, right = actual[key], expected[key]
+        assert left.shape == right.shape, key
+        assert left.dtype == right.dtype, key
+        torch.testing.assert_close(
+            left, right, atol=1e-5, rtol=1e-5, msg=lambda m, k=key: f"{k}: {m}"
+        )
+
+
+def step_next(env, td, option):
+    td = td.copy().set("option", torch.as_tensor(option))
+    return env.step(td)["next"]
+
+
+class TestAgainstALoop:
+    def test_a_chain_by_numbers(self):
+        env, td = chain()
+        after = step_next(macro(env, max_steps=3), td, RIGHT)
+        assert after["state"] == 3
+        assert after["duration"].tolist() == [3]
+        assert after["reward"].item() == pytest.approx(-0.25 * (1 + 0.9 + 0.81))
+        assert not after["done"]
+
+    def test_done_in_the_middle_of_an_option_ends_it(self):
+        env, td = chain(start=3)
+        after = step_next(macro(env, max_steps=10), td, RIGHT)
+        assert after["state"] == 5
+        assert after["duration"].tolist() == [2]
+        assert after["reward"].item() == pytest.approx(-0.25 + 0.9 * 0.75)
+        assert after["terminated"]
+        assert after["done"]
+
+    def test_elements_end_at_different_steps(self):
+        env, td = chain(start=[0, 4, 2, 3, 0], batch=[5])
+        after = step_next(macro(env), td, [RIGHT, RIGHT, RIGHT, LEFT, LEFT])
+        assert after["state"].tolist() == [4, 5, 5, 0, 0]
+        assert after["duration"].flatten().tolist() == [4, 1, 3, 4, 4]
+        assert after["done"].flatten().tolist() == [False, True, True, False, False]
+        discounts = torch.tensor([1, 0.9, 0.81, 0.729])
+        expected = [
+            -0.25 * discounts.sum(),
+            0.75,
+            -0.25 * 1.9 + 0.75 * 0.81,
+            -0.25 * discounts.sum(),
+            -0.25 * discounts.sum(),
+        ]
+        torch.testing.assert_close(after["reward"].flatten(), torch.tensor(expected))
+
+    @pytest.mark.parametrize("max_steps", [1, 2, 7, 30])
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_chains_of_any_batch_shape(self, batch, max_steps):
+        env, td = chain(batch=batch)
+        td["state"] = torch.randint(5, batch)
+        td["option"] = torch.randint(2, batch)
+        after = macro(env, max_steps=max_steps).step(td.clone())["next"]
+        assert after.shape == td.shape
+        assert_close(after, by_hand(env, td, skill_is_action(), max_steps))
+
+    @pytest.mark.parametrize("batch", [[], [20], [4, 5]])
+    def test_waterworld_with_a_worker_that_looks_at_the_state(self, batch):
+        env, worker = waterworld(max_steps=40), towards_corner()
+        td = env.reset(TensorDict(batch_size=batch))
+        ends = 0
+        for _ in range(3):
+            td["option"] = torch.randint(2, batch)
+            after = macro(env, worker, max_steps=15).step(td.clone())["next"]
+            assert_close(after, by_hand(env, td, worker, 15))
+            ends += after["done"].sum()
+            td = after.exclude("reward", "duration")
+        assert not batch or ends > 0
+
+    @pytest.mark.parametrize("batch", BATCHES)
+    @pytest.mark.parametrize("shape", [(), (1,)])
+    def test_a_termination_ends_an_option(self, batch, shape):
+        """By the state, the option and the base steps taken, each for some elements."""
+
+        def termination(td):
+            at_two = (td["state"] == 2) & (td["skill"] == RIGHT)
+            late = (td["duration"].squeeze(-1) >= 3) & (td["skill"] == LEFT)
+            return (at_two | late).reshape(*td.shape, *shape)
+
+        env, td = chain(batch=batch)
+        td["state"] = torch.randint(5, batch)
+        td["option"] = torch.randint(2, batch)
+        after = macro(env, max_steps=6, termination=termination).step(td.clone())["next"]
+        assert_close(after, by_hand(env, td, skill_is_action(), 6, termination))
+
+    def test_a_termination_at_once_still_takes_one_base_step(self):
+        env, td = chain(start=[1, 2], batch=[2])
+        always = lambda td: torch.ones(td.shape, dtype=torch.bool)  # noqa: E731
+        after = step_next(macro(env, termination=always), td, [RIGHT, LEFT])
+        assert after["state"].tolist() == [2, 1]
+        assert after["duration"].tolist() == [[1], [1]]
+
+    def test_one_base_step_per_option_is_the_base_env(self):
+        env, td = chain(start=[0, 4], batch=[2])
+        after = step_next(macro(env, max_steps=1), td, [RIGHT, RIGHT])
+        plain = env.step(td.copy().set("action", torch.tensor([RIGHT, RIGHT])))["next"]
+        assert_close(after, plain)
+        assert after["duration"].tolist() == [[1], [1]]
+
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_nested_keys(self, batch):
+        env = NestedChainEnv()
+        worker = skill_is_action(("agent", "action"))
+        td = env.reset(TensorDict(batch_size=batch))
+        td["agent", "state"] = torch.randint(6, batch)
+        td["option"] = torch.randint(2, batch)
+        check_env_specs(macro(env, worker))
+        after = macro(env, worker).step(td.clone())["next"]
+        assert_close(after, by_hand(env, td, worker, reward_key=("agent", "reward")))
+
+    def test_the_keys_of_option_skill_and_duration_can_be_nested(self):
+        env, td = chain(start=3)
+        env = macro(
+            env,
+            skill_is_action(skill_key=("manager", "skill")),
+            option_key=("manager", "option"),
+            skill_key=("manager", "skill"),
+            duration_key=("manager", "duration"),
+        )
+        check_env_specs(env)
+        assert env.action_key == ("manager", "option")
+        td.set(("manager", "option"), torch.tensor(RIGHT))
+        assert env.step(td)["next", "manager", "duration"].tolist() == [2]
+
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_one_hot_options(self, batch):
+        env, td = chain(batch=batch)
+        td["state"] = torch.randint(5, batch)
+        option = torch.randint(2, batch)
+        one_hot = macro(env, one_hot=True)
+        check_env_specs(one_hot)
+        td["option"] = nn.functional.one_hot(option, 2).bool()
+        after = one_hot.step(td.clone())["next"]
+        assert_close(after, by_hand(env, td.set("option", option), skill_is_action()))
+
+    def test_gamma_one_adds_up_the_rewards(self):
+        env, td = chain(start=1)
+        assert step_next(macro(env, gamma=1.0), td, RIGHT)["reward"].item() == pytest.approx(0)
+
+    def test_a_root_can_be_stepped_again_with_another_option(self):
+        """What the first step left under "next" is of no consequence for the second."""
+        base, td = chain(start=[1, 3, 4], batch=[3])
+        env = TransformedEnv(
+            base,
+            Compose(
+                OptionTransform(skill_is_action(), 2, 4, GAMMA, trajectory_keys=["state"]),
+                StepCounter(),
+            ),
+        )
+        td = env.reset(td, set_state=True)
+        env.step(td.set("option", torch.full((3,), LEFT)))
+        after = env.step(td.set("option", torch.full((3,), RIGHT)))["next"]
+        assert_close(after, by_hand(base, td.exclude("step_count"), skill_is_action()))
+        assert after["trajectory", "mask"].sum(-1).tolist() == [4, 2, 1]
+
+
+class TestStochasticWorker:
+    def actor(self):
+        return ProbabilisticActor(
+            TensorDictModule(
+                lambda state, skill: torch.stack([state - 1.0, 2.0 * skill - state], -1),
+                ["state", "skill"],
+                ["logits"],
+            ),
+            in_keys=["logits"],
+            distribution_class=torch.distributions.Categorical,
+            default_interaction_type=InteractionType.RANDOM,
+        )
+
+    def test_it_samples_as_a_loop_with_the_same_seed_does(self):
+        base, td = chain(start=1)
+        env = macro(base, self.actor(), max_steps=20)
+        check_env_specs(env)
+        durations = set()
+        for seed in range(8):
+            torch.manual_seed(seed)
+            after = step_next(env, td, RIGHT)
+            torch.manual_seed(seed)
+            expected = by_hand(base, td.set("option", torch.tensor(RIGHT)), self.actor(), 20)
+            assert_close(after, expected)
+            durations.add(after["duration"].item())
+        assert len(durations) > 2
+
+    def test_elements_sample_independently(self):
+        base, td = chain(start=[1] * 50, batch=[50])
+        after = step_next(macro(base, self.actor(), max_steps=3), td, [RIGHT] * 50)
+        assert len(after["state"].unique()) > 2
+
+    def test_it_follows_the_interaction_type(self):
+        base, td = chain(start=[1] * 50, batch=[50])
+        with set_interaction_type(InteractionType.DETERMINISTIC):
+            after = step_next(macro(base, self.actor(), max_steps=3), td, [RIGHT] * 50)
+            expected = by_hand(base, td.set("option", torch.ones(50).long()), self.actor(), 3)
+        assert_close(after, expected)
+
+
+class TestBatchedEnvs:
+    """Two chains; the element at state 3 ends its option (and episode) after two base steps."""
+
+    STARTS = (0, 3)
+
+    @pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
+    def test_as_base_env_inside_the_transform(self, batched):
+        envs = macro(batched(2, partial(ChainEnv, 6, reward_per_step=-0.25)))
+        try:
+            check_env_specs(envs)
+            self.check_steps(envs)
+            self.check_rollouts(envs)
+        finally:
+            envs.close()
+
+    @pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
+    def test_with_the_transform_inside_the_workers(self, batched):
+        envs = batched(2, lambda: macro(ChainEnv(6, reward_per_step=-0.25)))
+        try:
+            check_env_specs(envs)
+            self.check_steps(envs)
+            self.check_rollouts(envs)
+        finally:
+            envs.close()
+
+    def check_steps(self, envs):
+        base, start = chain(start=self.STARTS, batch=[2])
+        for options in ([RIGHT, RIGHT], [RIGHT, LEFT]):
+            td = envs.reset()
+            td["state"] = start["state"].clone()
+            td["option"] = torch.tensor(options)
+            expected = by_hand(base, td.select("state", "option"), skill_is_action())
+            assert_close(envs.step(td.clone())["next"], expected)
+
+    def check_rollouts(self, envs):
+        base, _ = chain()
+        for kwargs in ({"break_when_any_done": False}, {"break_when_all_done": True}):
+            envs.set_seed(0)
+            td = envs.rollout(15, **{"break_when_any_done": False, **kwargs})
+            check_macro_rollout(base, td, skill_is_action(), **kwargs)
+
+    @pytest.mark.parametrize("skill", [0, 1])
+    def test_two_cart_poles_fall_at_different_steps(self, skill):
+        envs = SerialEnv(2, partial(GymEnv, "CartPole-v1"))
+        envs.set_seed(0)
+        env = macro(envs, balancing(), max_steps=60)
+        td = env.reset()
+        after = step_next(env, td, [skill, skill])
+        seed = 0
+        for i in range(2):
+            single = GymEnv("CartPole-v1")
+            seed = single.set_seed(seed)
+            root = single.reset()
+            assert torch.equal(root["observation"], td["observation"][i])
+            root["option"] = torch.tensor(skill)
+            assert_close(after[i], option_by_hand(single, root, balancing(), 60)[0])
+        if skill == 0:  # always to the left
+            assert after["done"].all()
+            assert after["duration"][0] != after["duration"][1]
+
+
+def balancing():
+    """A CartPole worker: skill 0 pushes left, skill 1 pushes towards where the pole falls."""
+
+    def push(observation, skill):
+        right = (observation[..., 2] + observation[..., 3] > 0) & (skill == 1)
+        return torch.stack([~right, right], -1).to(torch.int64)
+
+    return TensorDictModule(push, ["observation", "skill"], ["action"])
+
+
+class TestGymEnv:
+    """CartPole cannot be batched or set to a state: the transform follows it as it goes."""
+
+    def test_specs_hold(self):
+        check_env_specs(macro(GymEnv("CartPole-v1"), balancing(), max_steps=5))
+
+    @pytest.mark.parametrize("max_steps", [1, 5, 500])
+    def test_macro_steps_are_those_of_a_loop(self, max_steps):
+        env, base = macro(GymEnv("CartPole-v1"), balancing(), max_steps=max_steps), None
+        base = GymEnv("CartPole-v1")
+        for e in (env, base):
+            e.set_seed(3)
+        td, root = env.reset(), base.reset()
+        for option in (1, 1, 0, 1, 0, 0):
+            after = step_next(env, td, option)
+            expected, _ = option_by_hand(
+                base, root.set("option", torch.tensor(option)), balancing(), max_steps
+            )
+            assert_close(after, expected)
+            if after["done"]:
+                break
+            td, root = after, expected
+        assert max_steps == 1 or after["done"]
+
+    def test_rollouts_go_on_into_the_next_episode(self):
+        env = macro(GymEnv("CartPole-v1"), balancing(), max_steps=4)
+        td = env.rollout(30, break_when_any_done=False)
+        done = td["next", "done"].squeeze(-1)
+        assert done.sum() >= 2
+        assert (td["next", "duration"].squeeze(-1)[~done] == 4).all()
+
+
+def check_macro_rollout(base, td, worker, max_steps=4, break_when_all_done=False, **_):
+    """Every macro-step of a rollout is that of a loop from its root; roots follow each other."""
+    finished = torch.zeros(td.shape[:-1], dtype=torch.bool)
+    assert td["next", "done"].any()
+    for t in range(td.shape[-1]):
+        now = td[..., t]
+        expected = by_hand(base, now.select("state", "option"), worker, max_steps)
+        assert_close(now["next"][~finished], expected[~finished])
+        done = now["next", "done"].squeeze(-1)
+        if break_when_all_done:
+            finished |= done
+            assert finished.all() == (t == td.shape[-1] - 1)
+        if t + 1 < td.shape[-1]:
+            state = torch.where(done, 0, now["next", "state"])
+            assert torch.equal(td[..., t + 1]["state"][~finished], state[~finished])
+
+
+class TestRollouts:
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_episodes_are_reset_and_go_on(self, batch):
+        base, td = chain(batch=batch)
+        env = macro(base)
+        td = env.rollout(20, tensordict=env.reset(td), auto_reset=False, break_when_any_done=False)
+        assert td.shape == (*batch, 20)
+        check_macro_rollout(base, td, skill_is_action())
+
+    @pytest.mark.parametrize("batch", [[3], [2, 3]])
+    def test_until_all_are_done(self, batch):
+        base, _ = chain()
+        env = macro(base)
+        td = env.reset(TensorDict({"state": torch.randint(5, batch)}, batch), set_state=True)
+        td = env.rollout(
+            100,
+            tensordict=td,
+            auto_reset=False,
+            break_when_any_done=False,
+            break_when_all_done=True,
+        )
+        check_macro_rollout(base, td, skill_is_action(), break_when_all_done=True)
+
+    def test_a_reset_has_no_duration_yet(self):
+        base, _ = chain()
+        td = macro(base).reset(TensorDict(batch_size=[3]))
+        assert td["duration"].tolist() == [[0]] * 3
+        assert td["duration"].dtype == torch.int64
+
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_it_can_be_set_to_a_state(self, batch):
+        base, _ = chain()
+        env = macro(base)
+        assert env._supports_set_state
+        state = torch.randint(1, 5, batch)
+        td = env.reset(TensorDict({"state": state}, batch_size=batch), set_state=True)
+        assert torch.equal(td["state"], state)
+        td["option"] = torch.full(batch, LEFT)
+        after = env.step(td)["next"]
+        assert torch.equal(after["state"], (state - 4).clamp_min(0))
+
+    def test_a_collector_gathers_macro_steps(self):
+        base, _ = chain()
+        collector = Collector(
+            macro(base), frames_per_batch=20, total_frames=40, policy=None, trust_policy=True
+        )
+        batches = list(collector)
+        assert len(batches) == 2
+        for td in batches:
+            check_macro_rollout(base, td.select("state", "option", "next"), skill_is_action())
+        collector.shutdown()
+
+
+class TestOtherTransforms:
+    def test_those_before_it_see_base_steps(self):
+        base = TransformedEnv(
+            ChainEnv(6, reward_per_step=-0.25),
+            Compose(StepCounter(max_steps=7), RewardScaling(0.5, 2.0)),
+        )
+        env = TransformedEnv(
+            ChainEnv(6, reward_per_step=-0.25),
+            Compose(
+                StepCounter(max_steps=7),
+                RewardScaling(0.5, 2.0),
+                OptionTransform(skill_is_action(), 2, 3, GAMMA),
+            ),
+        )
+        check_env_specs(env)
+        td = env.reset(TensorDict(batch_size=[2]))
+        counts, truncated = [], []
+        for _ in range(3):
+            td["option"] = torch.tensor([LEFT, RIGHT])
+            after = env.step(td.clone())["next"]
+            assert_close(after[0], by_hand(base, td[0], skill_is_action(), 3))
+            counts.append(after["step_count"][0].item())
+            truncated.append(after["truncated"][0].item())
+            td = after.exclude("reward")
+        assert counts == [3, 6, 7]
+        assert truncated == [False, False, True]
+        assert after["duration"][0] == 1
+
+    def test_those_after_it_see_macro_steps(self):
+        env = TransformedEnv(
+            ChainEnv(6, reward_per_step=-0.25),
+            Compose(OptionTransform(skill_is_action(), 2, 3, GAMMA), StepCounter(), RewardSum()),
+        )
+        check_env_specs(env)
+        right = lambda td: td.set("option", torch.full(td.shape, RIGHT))  # noqa: E731
+        td = env.rollout(10, right)
+        assert td["next", "step_count"].flatten().tolist() == [1, 2]
+        assert td["next", "duration"].flatten().tolist() == [3, 2]
+        reward = td["next", "reward"]
+        torch.testing.assert_close(td["next", "episode_reward"], reward.cumsum(0))
+
+    def test_a_transform_put_in_front_later_is_seen_too(self):
+        env = macro(ChainEnv(6), max_steps=3)
+        env.rollout(2)
+        env.insert_transform(0, RewardScaling(0.0, 10.0))
+        td = env.reset().set("state", torch.tensor(3))
+        assert step_next(env, td, RIGHT)["reward"].item() == pytest.approx(9)
+
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_a_macro_env_under_another_option_transform(self, batch):
+        """Manager of managers: two options of two base steps each, discounted per option."""
+        inner, td = chain(batch=batch)
+        upper = OptionTransform(
+            TensorDictModule(lambda goal: goal, ["goal"], ["option"]),
+            2,
+            2,
+            0.5,
+            option_key="goal_option",
+            skill_key="goal",
+            duration_key="options_taken",
+        )
+        env = TransformedEnv(inner, Compose(OptionTransform(skill_is_action(), 2, 2, GAMMA), upper))
+        check_env_specs(env)
+        after = env.step(td.set("goal_option", torch.full(batch, RIGHT)))["next"]
+        assert (after["state"] == 4).all()
+        assert (after["options_taken"] == 2).all()
+        expected = torch.full((*batch, 1), -0.25 * 1.9 * 1.5)
+        torch.testing.assert_close(after["reward"], expected)
+
+
+KEYS = ["state", "action", ("next", "state"), ("next", "reward"), ("next", "done")]
+
+
+def check_trajectories(base, td, after, worker, max_steps, keys=KEYS):
+    """The blocks of a macro-step hold the base steps of a loop, and zeros after them."""
+    trajectory = after["trajectory"].reshape(-1, max_steps)
+    roots = td.reshape(-1)
+    for i in range(roots.shape[0]):
+        _, steps = option_by_hand(base, roots[i], worker, max_steps)
+        assert trajectory["mask"][i].tolist() == [t < len(steps) for t in range(max_steps)]
+        for key in keys:
+            values = torch.stack([step[key] for step in steps])
+            torch.testing.assert_close(trajectory[key][i, : len(steps)], values)
+            assert not trajectory[key][i, len(steps) :].any()
+
+
+class TestTrajectories:
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_they_hold_the_base_steps(self, batch):
+        base, td = chain(batch=batch)
+        env = macro(base, trajectory_keys=KEYS)
+        check_env_specs(env)
+        td["state"] = torch.randint(5, batch)
+        td["option"] = torch.randint(2, batch)
+        after = env.step(td.clone())["next"]
+        assert after["trajectory"].shape == (*batch, 4)
+        check_trajectories(base, td, after, skill_is_action(), 4)
+
+    @pytest.mark.parametrize("batch", [[4], [2, 3]])
+    def test_in_an_env_with_a_batch_size(self, batch):
+        base = ChainEnv(6, batch_size=batch)
+        env = macro(base, trajectory_keys=KEYS)
+        check_env_specs(env)
+        td = env.reset()
+        assert not td["trajectory", "mask"].any()
+        td["state"] = torch.randint(5, batch)
+        td["option"] = torch.randint(2, batch)
+        after = env.step(td.clone())["next"]
+        roots = td.select("state", "option")
+        check_trajectories(ChainEnv(6), roots, after, skill_is_action(), 4)
+
+    def test_in_batched_envs(self):
+        env = macro(SerialEnv(2, partial(ChainEnv, 6)), trajectory_keys=KEYS)
+        check_env_specs(env)
+        td = env.reset()
+        td["state"] = torch.tensor([0, 3])
+        td["option"] = torch.tensor([RIGHT, RIGHT])
+        after = env.step(td.clone())["next"]
+        check_trajectories(ChainEnv(6), td.select("state", "option"), after, skill_is_action(), 4)
+
+    def test_in_a_gym_env(self):
+        keys = ["observation", "action", ("next", "observation")]
+        env = macro(GymEnv("CartPole-v1"), balancing(), max_steps=30, trajectory_keys=keys)
+        check_env_specs(env)
+        base = GymEnv("CartPole-v1")
+        for e in (env, base):
+            e.set_seed(1)
+        root = base.reset().set("option", torch.tensor(0))
+        after = step_next(env, env.reset(), 0)
+        check_trajectories(base, root, after, balancing(), 30, keys)
+
+    def test_of_nested_keys(self):
+        keys = [("agent", "action"), ("agent", "seen", "double"), ("next", "agent", "reward")]
+        worker = skill_is_action(("agent", "action"))
+        base = NestedChainEnv()
+        env = macro(base, worker, trajectory_keys=keys)
+        check_env_specs(env)
+        td = base.reset(TensorDict(batch_size=[3]))
+        td["agent", "state"] = torch.tensor([0, 3, 5])
+        td["option"] = torch.tensor([RIGHT, RIGHT, LEFT])
+        trajectory = env.step(td)["next", "trajectory"]
+        assert trajectory["next", "agent", "reward"].squeeze(-1).tolist() == [
+            [1, 2, 3, 4],
+            [4, 5, 6, 0],
+            [4, 3, 2, 1],
+        ]
+        assert trajectory["agent", "seen", "double"][1].flatten().tolist() == [6, 8, 10, 0]
+        assert trajectory["agent", "action"].tolist() == [[1] * 4, [1, 1, 1, 0], [0] * 4]
+
+    def test_they_are_there_in_every_step_of_a_rollout(self):
+        base, _ = chain()
+        env = macro(base, trajectory_keys=["state"])
+        td = env.rollout(10, break_when_any_done=False)
+        assert td["next", "trajectory", "mask"].sum(-1).tolist() == [
+            int(k) for k in td["next", "duration"]
+        ]
+
+    def test_an_unknown_key_is_refused(self):
+        env, _ = chain()
+        with pytest.raises(ValueError, match=r"trajectory_keys names 'speed'.*'state'"):
+            check_env_specs(macro(env, trajectory_keys=["speed"]))
+
+    def test_no_keys_at_all_are_refused(self):
+        with pytest.raises(ValueError, match=r"trajectory_keys is empty.*None"):
+            OptionTransform(skill_is_action(), 2, 4, trajectory_keys=[])
+
+
+def pendulum():
+    return macro(PendulumEnv(), constant(torch.tensor([0.5])), num_options=3, max_steps=6)
+
+
+class TestEveryEnv:
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda: macro(ChainEnv(6)),
+            lambda: macro(ChainEnv(6, batch_size=[4])),
+            lambda: macro(ChainEnv(6, batch_size=[2, 3])),
+            lambda: macro(
+                TableEnv(
+                    {(0, 0): (1, 2.0, 3), (0, 1): (2, 1.0, 1), (1, 1): (2, 0, 2)}, terminal=[2]
+                )
+            ),
+            lambda: macro(waterworld(), towards_corner()),
+            lambda: macro(WaterworldMazeEnv(maze_pool("test"), batch_size=[4]), towards_corner()),
+            lambda: macro(GridworldMazeEnv(maze_pool("test")), skill_is_action(), num_options=5),
+            pendulum,
+            lambda: macro(NestedChainEnv(), skill_is_action(("agent", "action"))),
+        ],
+    )
+    def test_specs_hold(self, make):
+        check_env_specs(make(), return_contiguous=True)
+
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_pendulum_steps_are_those_of_a_loop(self, batch):
+        env, base = pendulum(), PendulumEnv()
+        td = base.reset(base.gen_params(batch_size=batch))
+        td["option"] = torch.zeros(batch, dtype=torch.int64)
+        after = env.step(td.clone())["next"]
+        assert_close(after, by_hand(base, td, constant(torch.tensor([0.5])), 6))
+
+
+class TestOwnership:
+    def test_the_workers_mode_parameters_and_gradients_are_its_owners(self):
+        worker = TensorDictModule(Hidden(), ["skill"], ["action"])
+        transform = OptionTransform(worker, 2, 3)
+        env = TransformedEnv(ChainEnv(6), transform)
+        env.rollout(2)
+        assert all(module.training for module in worker.modules())
+        worker.eval()
+        env.train()
+        assert not any(module.training for module in worker.modules())
+        assert not list(env.parameters())
+        assert not env.state_dict()
+        assert transform.worker is worker
+
+    def test_no_gradient_flows_through_the_worker(self):
+        net = nn.Linear(1, 1)
+        worker = TensorDictModule(
+            lambda state, skill: (net(state.unsqueeze(-1).float()).squeeze(-1) > 0).long(),
+            ["state", "skill"],
+            ["action"],
+        )
+        td = macro(ChainEnv(6), worker).rollout(3)
+        assert not td["next", "reward"].requires_grad
+
+    @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
+    def test_a_copy_of_the_env_steps_as_the_original(self, duplicate):
+        worker = TensorDictModule(Hidden(), ["skill"], ["action"])
+        env = TransformedEnv(
+            ChainEnv(6), Compose(StepCounter(7), OptionTransform(worker, 2, 4, GAMMA))
+        )
+        td = env.reset(TensorDict(batch_size=[3]))
+        td["option"] = torch.tensor([LEFT, RIGHT, RIGHT])
+        expected = env.step(td.clone())["next"]
+        twin = duplicate(env)
+        assert_close(twin.step(td.clone())["next"], expected)
+        assert_close(duplicate(twin).step(td.clone())["next"], expected)
+        check_env_specs(twin)
+
+    def test_a_clone_serves_a_second_env_with_the_same_worker(self):
+        transform = OptionTransform(skill_is_action(), 2, 4, GAMMA)
+        first = TransformedEnv(ChainEnv(6), transform)
+        first.rollout(2)
+        second = TransformedEnv(ChainEnv(4), transform.clone())
+        assert second.transform.worker is transform.worker
+        for env, end in ((first, 5), (second, 3)):
+            td = env.rollout(5, lambda td: td.set("option", torch.tensor(RIGHT)))
+            assert td["next", "state"][-1] == end
+
+    def test_the_callers_tensordict_gains_next_only(self):
+        env = macro(ChainEnv(6))
+        td = env.reset().set("option", torch.tensor(RIGHT))
+        before = set(td.keys())
+        env.step(td)
+        assert set(td.keys()) == before | {"next"}
+        assert "skill" not in td["next"].keys()
+
+
+def broken(env_or_td, message, error=ValueError, *, call=None):
+    """Assert that the call raises, and leaves the tensordict as it was."""
+    env, td = env_or_td
+    before = td.clone()
+    with pytest.raises(error, match=message):
+        (call or env.step)(td)
+    assert set(td.keys(True, True)) == set(before.keys(True, True))
+    assert (td == before).all()
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("kwargs", "message"),
+        [
+            ({"max_steps": 0}, "max_steps to be an int >= 1; got 0"),
+            ({"max_steps": 2.5}, "max_steps to be an int >= 1; got 2.5"),
+            ({"max_steps": True}, "max_steps to be an int >= 1; got True"),
+            ({"num_options": 0}, "num_options to be an int >= 1; got 0"),
+            ({"num_options": -3}, "num_options to be an int >= 1; got -3"),
+            ({"gamma": 0.0}, r"gamma in \(0, 1\] per base step; got 0.0"),
+            ({"gamma": 1.1}, r"gamma in \(0, 1\] per base step; got 1.1"),
+            ({"gamma": float("nan")}, r"gamma in \(0, 1\] per base step; got nan"),
+            ({"worker": "walk"}, "needs a worker that it can call .* got 'walk'"),
+        ],
+    )
+    def test_arguments_out_of_range_are_refused_at_construction(self, kwargs, message):
+        with pytest.raises(ValueError, match=message):
+            OptionTransform(
+                **{"worker": skill_is_action(), "num_options": 2, "max_steps": 4, **kwargs}
+            )
+
+    @pytest.mark.parametrize("option", [2, -1, 99])
+    @pytest.mark.parametrize("batch", BATCHES)
+    def test_an_option_out_of_range_is_refused(self, batch, option):
+        base, td = chain(batch=batch)
+        options = torch.zeros(batch, dtype=torch.int64)
+        options.view(-1)[-1] = option
+        message = f"Option {option} does not exist: options are 0 to 1.*larger num_options"
+        broken((macro(base), td.set("option", options)), message)
+
+    @pytest.mark.parametrize(
+        ("option", "message"),
+        [
+            (torch.tensor([0.0, 1.0]), r"int64 \[2\]; got torch.float32 \[2\]"),
+            (torch.tensor([[0], [1]]), r"int64 \[2\]; got torch.int64 \[2, 1\].*rand_action"),
+        ],
+    )
+    def test_an_option_of_the_wrong_form_is_refused(self, option, message):
+        base, td = chain(batch=[2])
+        broken((macro(base), td.set("option", option)), message)
+
+    @pytest.mark.parametrize(
+        ("option", "message"),
+        [
+            ([[1, 0, 0], [0, 0, 1]], r"one-hot \[2, 2\]; got torch.bool \[2, 3\]"),
+            ([[1, 0], [0, 0]], r"one-hot.*\[False, False\]"),
+            ([[1, 1], [0, 1]], r"one-hot.*\[True, True\]"),
+        ],
+    )
+    def test_what_is_not_one_hot_is_refused(self, option, message):
+        base, td = chain(batch=[2])
+        env = macro(base, one_hot=True)
+        broken((env, td.set("option", torch.tensor(option).bool())), message)
+
+    def test_a_missing_option_is_refused(self):
+        base, td = chain()
+        broken((macro(base), td), "no option under 'option'.*rand_action", KeyError)
+
+    @pytest.mark.parametrize(
+        ("worker", "message"),
+        [
+            (
+                TensorDictModule(lambda x, z: z, ["speed", "skill"], ["action"]),
+                "reads 'speed', which ChainEnv does not have: it has .*'state'.*Change the worker",
+            ),
+            (
+                TensorDictModule(lambda z: z, ["skill"], ["steering"]),
+                r"wrote no 'action', the action of ChainEnv. Give it out_keys=\['action'\]",
+            ),
+            (
+                TensorDictModule(lambda z: z.float(), ["skill"], ["action"]),
+                r"wrote 'action' = torch.float32 \[\].*does not fit .*Build the worker from",
+            ),
+            (
+                TensorDictModule(lambda z: z.unsqueeze(-1), ["skill"], ["action"]),
+                r"wrote 'action' = torch.int64 \[1\].*does not fit",
+            ),
+            (
+                TensorDictModule(lambda z: z + 2, ["skill"], ["action"]),
+                r"torch.int64 \[\] with values up to 2, which does not fit",
+            ),
+        ],
+    )
+    def test_a_worker_that_does_not_fit_is_refused_when_attached(self, worker, message):
+        with pytest.raises(ValueError, match=message):
+            macro(ChainEnv(6), worker).specs  # noqa: B018
+        base, td = chain()
+        broken((macro(base, worker), td.set("option", torch.tensor(0))), message)
+
+    def test_an_action_that_does_not_fit_a_continuous_env_is_refused(self):
+        message = r"wrote 'action' = torch.float32 \[1\] with values up to 7, which does not fit"
+        with pytest.raises(ValueError, match=message):
+            macro(PendulumEnv(), constant(torch.tensor([7.0]))).specs  # noqa: B018
+
+    def test_a_worker_that_fails_midway_leaves_nothing_behind(self):
+        def fail_later(state, skill):
+            if (state == 3).any():
+                raise RuntimeError("the worker is lost")
+            return skill
+
+        base, td = chain(batch=[2])
+        env = macro(base, TensorDictModule(fail_later, ["state", "skill"], ["action"]))
+        broken((env, td.set("option", torch.tensor([RIGHT, LEFT]))), "lost", RuntimeError)
+
+    def test_several_rewards_are_refused(self):
+        env = ChainEnv(6)
+        env.reward_spec = Composite(reward=Unbounded((1,)), cost=Unbounded((1,)))
+        with pytest.raises(ValueError, match="sums one reward; ChainEnv has the rewards .*cost"):
+            macro(env).specs  # noqa: B018
+
+    def test_a_replay_buffer_is_no_place_for_it(self):
+        buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=2)
+        buffer.extend(macro(ChainEnv(6)).rollout(3))
+        buffer.append_transform(OptionTransform(skill_is_action(), 2, 4))
+        with pytest.raises(RuntimeError, match="cannot be applied to data.*TransformedEnv"):
+            buffer.sample()
+        for td in (ChainEnv(6).rollout(3), macro(ChainEnv(6)).rollout(3)):
+            with pytest.raises(RuntimeError, match="no meaning in a replay buffer"):
+                buffer.extend(td)
+
+    def test_one_transform_cannot_serve_two_envs(self):
+        transform = OptionTransform(skill_is_action(), 2, 4)
+        TransformedEnv(ChainEnv(6), transform).rollout(1)
+        kept = TransformedEnv(ChainEnv(6), Compose(StepCounter()))
+        env = TransformedEnv(ChainEnv(6), OptionTransform(skill_is_action(), 2, 4))
+        with pytest.raises(AttributeError, match=r"already set.*clone\(\)"):
+            kept.append_transform(env.transform)
