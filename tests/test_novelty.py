@@ -194,6 +194,19 @@ def test_reopened_nodes_are_searched_and_keep_their_values() -> None:
     assert search.exhausted(np.array([0])).all()
 
 
+def test_siblings_reopened_together_are_both_searched() -> None:
+    # Features (state, duration): root (0, 0), its outcomes (1, 8) and (9, 1), all within 16 of each
+    # other and further apart than 8.
+    table = {(s, 0): (10, 0.0, 1) for s in range(1, 10)}
+    table |= {(0, 0): (1, 0.0, 8), (0, 1): (9, 0.0, 1)}
+    env = TableEnv(table, terminal=[10])
+    planner = MCTSPlanner(env, novelty=RadiusNovelty(["state", "duration"], 16.0))
+    search = planner.search(env.reset())
+    assert search.tree.states is not None
+    assert search.tree.states["state"][0, :5].tolist() == [0, 1, 9, 10, 10]
+    assert search.tree.num_nodes.tolist() == [5]
+
+
 # ---------------------------------------------------------------------- mazes
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictModuleBase
+
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.trainers.demo import make_starts

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MeanBackup:
-    r"""The value of a node is the mean of all returns backed up through it, its evaluation included.
+    r"""The value of a node is the mean of its own evaluation and all returns backed up through it.
 
     .. math:: V(s) \leftarrow V(s) + \frac{R + D\,V(s') - V(s)}{N(s)}
 

@@ -17,9 +17,12 @@ class HierarchicalPolicy(TensorDictModuleBase):
     """Follows a planner's plan option by option, and plans again when it has come to its end.
 
     The plan lives in the tensordict, as a recurrent policy's state does: ``"plan"`` (int64
-    ``[*B, L]``), ``"plan_length"`` and ``"plan_step"`` (int64 ``[*B, 1]``). An element without a plan,
-    or at the end of it, is planned for; where no plan is found, the planner's choice is taken and
-    planning starts anew after it.
+    ``[*B, L]``), ``"plan_length"`` and ``"plan_step"`` (int64 ``[*B, 1]``). An element without a
+    plan, or at the end of it, is planned for; where no plan is found, the planner's choice is
+    taken and planning starts anew after it.
+
+    Where episodes follow each other in one rollout (auto-reset, collectors), append TorchRL's
+    ``InitTracker`` to the env: by its ``"is_init"`` the policy knows that a plan is out of date.
 
     Args:
         planner (MCTSPlanner): the manager.

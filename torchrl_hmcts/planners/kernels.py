@@ -1,9 +1,9 @@
 """The inner loops of the search, compiled by numba: select, insert, back up, close and reopen.
 
 All of them work in place on the records of :mod:`torchrl_hmcts.planners.tree` and cost O(depth) per
-simulation. This module is imported when the first search starts, since numba takes a second to load.
-Fields are read as ``record["field"]``, not ``record.field``, so that the kernels also run as plain
-Python under ``NUMBA_DISABLE_JIT=1``, for a debugger.
+simulation. This module is imported when the first search starts, since numba takes a second to
+load. Fields are read as ``record["field"]``, not ``record.field``, so that the kernels also run as
+plain Python under ``NUMBA_DISABLE_JIT=1``, for a debugger.
 """
 
 # numba compiles these functions; it does not read annotations as strings.
@@ -267,7 +267,7 @@ def reopen(nodes, edges, b, n):
 
 @numba.njit(cache=True)
 def accept_distant(seen, num_seen, radius, roots, features, accepted):
-    """Accept, in order, the features that no accepted one of their root lies within the radius of."""
+    """Accept, in order, the features that lie outside the radius of every accepted one."""
     for i in range(roots.shape[0]):
         b = roots[i]
         limit = radius[b] * radius[b]

@@ -53,32 +53,33 @@ class MCTSPlanner(TensorDictModuleBase):
 
     Each wave selects leaves in all trees, simulates their options in **one** step of the macro
     environment, and backs the outcomes up. A terminal state is worth nothing beyond its reward; a
-    truncated one is worth what the leaf evaluator says. Subtrees in which nothing is left to find are
-    closed and never simulated again.
+    truncated one is worth what the leaf evaluator says. Subtrees in which nothing is left to find
+    are closed and never simulated again.
 
     Args:
-        env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or any
-            env with a discrete action, that is stateless (``batch_locked=False``, its state in the
-            tensordict). It is not stepped through ``env.step``; its own state, if any, is not touched.
+        env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or
+            any env with a discrete action, that is stateless (``batch_locked=False``, its state in
+            the tensordict). It is not stepped through ``env.step``; its own state, if any, is not
+            touched.
         gamma (float, optional): discount per base step. Default: that of the env's
             ``OptionTransform``, else 0.99.
         tree_policy: :class:`UCT` (default, ``c=1``) or :class:`PUCT`.
         novelty (NoveltyTest, optional): which new nodes are worth searching, e.g.
             ``RadiusNovelty("position", 0.35)``. Default: all.
-        leaf_evaluator (callable, optional): ``leaf_evaluator(td) -> values [m]`` or ``[m, 1]`` of new
-            nodes, from their state and observation. Default: 0.
+        leaf_evaluator (callable, optional): ``leaf_evaluator(td) -> values [m]`` or ``[m, 1]`` of
+            new nodes, from their state and observation. Default: 0.
         option_prior (callable, optional): ``option_prior(td) -> probabilities [m, A]``. Default:
             uniform.
         backup: :class:`MeanBackup` (default) or :class:`MaxBackup`.
         final_choice: :class:`BestPlan` (default), :class:`MostVisited` or :class:`HighestValue`.
         budget (SearchBudget): limits per root. Default: 1,000 expansions, until a plan is found.
-        expand: ``"all"`` simulates every option of a leaf at once (default), ``"one"`` only the option
-            that the tree policy chooses, as in the textbook.
-        leaves_per_wave (int): leaves of each root that share a simulator call. More are faster for few
-            roots and search less selectively. Default 1.
+        expand: ``"all"`` simulates every option of a leaf at once (default), ``"one"`` only the
+            option that the tree policy chooses, as in the textbook.
+        leaves_per_wave (int): leaves of each root that share a simulator call. More are faster for
+            few roots and search less selectively. Default 1.
         duration_key, mask_key (NestedKey): entries of the env with the base steps of a step, int64
-            ``[*B, 1]`` (1 if the env has none), and the options that may be taken, bool ``[*B, A]`` (all
-            if it has none).
+            ``[*B, 1]`` (1 if the env has none), and the options that may be taken, bool ``[*B,
+            A]`` (all if it has none).
         progress (callable, optional): called with a :class:`SearchProgress` after every wave.
 
     Writes: the env's action (the option), and ``"plan_found"`` (bool ``[*B, 1]``), ``"root_value"``
@@ -86,8 +87,9 @@ class MCTSPlanner(TensorDictModuleBase):
     ``"num_simulated_steps"`` (int64 ``[*B, 1]``).
 
     Raises:
-        ValueError: at construction if the env cannot be set to a state or its action is not discrete;
-            at the call if an entry of the state is missing or not finite, or no option may be taken.
+        ValueError: at construction if the env cannot be set to a state or its action is not
+            discrete; at the call if an entry of the state is missing or not finite, or no option
+            may be taken.
 
     Reference:
         Dissertation, sections 2.4.2, 3.2.1 and 4.2; Kocsis and Szepesvari 2006.
@@ -173,9 +175,9 @@ class MCTSPlanner(TensorDictModuleBase):
             self.option_key: option,
             "plan_found": column(search.best_node >= 0),
             "root_value": column(tree.nodes["value"][:, 0]),
-            "root_visits": torch.from_numpy(
-                tree.edges["visits"][:, 0].astype(np.int64)
-            ).view(*shape, self.num_options),
+            "root_visits": torch.from_numpy(tree.edges["visits"][:, 0].astype(np.int64)).view(
+                *shape, self.num_options
+            ),
             "num_expansions": column(search.num_expansions),
             "num_simulated_steps": column(search.num_base_steps),
         }
@@ -184,7 +186,7 @@ class MCTSPlanner(TensorDictModuleBase):
         return tensordict
 
     def planning(self, td: TensorDictBase) -> Tensor:
-        """Return the options to take, int64 (or one-hot) ``[*B]``; the form of TorchRL's planners."""
+        """Return the options to take ``[*B]``; the form of TorchRL's planners."""
         return self.forward(td.copy()).get(self.option_key)
 
     def plan(self, td: TensorDictBase) -> Plan:
@@ -283,14 +285,14 @@ class MCTSPlanner(TensorDictModuleBase):
         num_states = td.batch_size[0]
         if tuple(values.shape) not in ((num_states,), (num_states, 1)):
             raise ValueError(
-                f"The leaf evaluator returned shape {list(values.shape)}; it must give one value per "
-                f"state, [{num_states}] or [{num_states}, 1]."
+                f"The leaf evaluator returned shape {list(values.shape)}; it must give one value "
+                f"per state, [{num_states}] or [{num_states}, 1]."
             )
         values_np: np.ndarray = values.reshape(-1).to(torch.float32).cpu().numpy()
         if not np.isfinite(values_np).all():
             raise ValueError(
-                f"The leaf evaluator returned {values_np[~np.isfinite(values_np)][0]}. Values must be "
-                f"finite; check the network's input and weights."
+                f"The leaf evaluator returned {values_np[~np.isfinite(values_np)][0]}. Values must "
+                f"be finite; check the network's input and weights."
             )
         return np.where(terminated, np.float32(0.0), values_np)
 
@@ -301,8 +303,8 @@ class MCTSPlanner(TensorDictModuleBase):
         shape = (td.batch_size[0], self.num_options)
         if tuple(priors.shape) != shape:
             raise ValueError(
-                f"The option prior returned shape {list(priors.shape)}; it must give one probability "
-                f"per node and option, {list(shape)}."
+                f"The option prior returned shape {list(priors.shape)}; it must give one "
+                f"probability per node and option, {list(shape)}."
             )
         if not (torch.isfinite(priors) & (priors >= 0)).all():
             bad = priors[~(torch.isfinite(priors) & (priors >= 0))][0].item()

@@ -36,13 +36,13 @@ class NoveltyTest(Protocol):
 class RadiusNovelty:
     r"""Refuses a state that lies within a radius of one already in its tree.
 
-    .. math:: \text{novel}(s) \iff \min_{s' \in \text{accepted}} \lVert \phi(s) - \phi(s') \rVert \ge r
+    .. math:: \text{novel}(s) \iff \min_{s' \in A} \lVert \phi(s) - \phi(s') \rVert \ge r
 
-    with :math:`\phi` the entries ``key`` side by side, each times its scale. Options that lead back to
-    places the tree holds are simulated once and not searched further, which is what makes a
-    search over options in a continuous space finite. The radius must be smaller than the distance an
-    option covers, or every outcome is refused; an exhausted search halves it and reopens what it had
-    refused.
+    with :math:`A` the accepted states and :math:`\phi` the entries ``key`` side by side, each
+    times its scale. Options that lead back to places the tree holds are simulated once and not
+    searched further, which is what makes a search over options in a continuous space finite. The
+    radius must be smaller than the distance an option covers, or every outcome is refused; an
+    exhausted search halves it and reopens what it had refused.
 
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``.
@@ -116,9 +116,7 @@ class RadiusNovelty:
                 room[:, : self._seen.shape[1]] = self._seen
             self._seen = room
         accepted = np.empty(len(roots), np.bool_)
-        kernels.accept_distant(
-            self._seen, self._num_seen, self._radius, roots, features, accepted
-        )
+        kernels.accept_distant(self._seen, self._num_seen, self._radius, roots, features, accepted)
         self.num_tested += len(roots)
         self.num_refused += int(len(roots) - accepted.sum())
         return accepted

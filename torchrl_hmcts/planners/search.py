@@ -1,7 +1,7 @@
 """The search itself, on arrays: it asks for outcomes of options and grows the trees with them.
 
-A wave is :meth:`Search.select`, the simulation of the triples it returns by whoever runs the search, and
-:meth:`Search.insert`. Nothing here knows tensordicts or environments.
+A wave is :meth:`Search.select`, the simulation of the triples it returns by whoever runs the
+search, and :meth:`Search.insert`. Nothing here knows tensordicts or environments.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Search:
         tree_policy: see :mod:`~torchrl_hmcts.planners.tree_policies`.
         backup: see :mod:`~torchrl_hmcts.planners.backups`.
         novelty: see :mod:`~torchrl_hmcts.planners.novelty`, or None.
-        expand: ``"all"`` simulates every option of a leaf, ``"one"`` the option the tree policy chooses.
+        expand: ``"all"`` simulates every option of a leaf, ``"one"`` the option the tree policy
+            chooses.
         leaves_per_wave: leaves each root contributes to a wave.
     """
 
@@ -71,10 +72,10 @@ class Search:
         self.leaves_per_wave = leaves_per_wave
         is_puct = isinstance(tree_policy, PUCT)
         self._score = kernels.PUCT_SCORE if is_puct else kernels.UCT_SCORE
-        self._unvisited_value = tree_policy.unvisited_value if isinstance(tree_policy, PUCT) else 0.0
-        self._backup = (
-            kernels.MAX_BACKUP if isinstance(backup, MaxBackup) else kernels.MEAN_BACKUP
+        self._unvisited_value = (
+            tree_policy.unvisited_value if isinstance(tree_policy, PUCT) else 0.0
         )
+        self._backup = kernels.MAX_BACKUP if isinstance(backup, MaxBackup) else kernels.MEAN_BACKUP
         self.tree = SearchTree(num_roots, num_options)
         self.num_expansions = np.zeros(num_roots, np.int64)
         self.num_base_steps = np.zeros(num_roots, np.int64)
@@ -91,7 +92,7 @@ class Search:
         masks: np.ndarray,
         features: np.ndarray | None,
     ) -> None:
-        """Plant the roots: values ``[B]``, done ``[B]``, priors and masks as in :class:`Outcomes`."""
+        """Plant the roots: values and done ``[B]``, priors and masks as in :class:`Outcomes`."""
         tree = self.tree
         if features is not None:
             assert self.novelty is not None
@@ -182,7 +183,7 @@ class Search:
         return (self.tree.nodes[roots, 0]["flags"] & CLOSED) != 0
 
     def relax(self, root: int) -> bool:
-        """Let the novelty test be less strict for an exhausted root; return whether that opened it."""
+        """Make the novelty test less strict for an exhausted root; return whether it opened."""
         if self.novelty is None:
             return False
         tree = self.tree

@@ -40,18 +40,20 @@ class Simulator:
         name = type(getattr(env, "base_env", env)).__name__
         if not isinstance(env, EnvBase):
             raise TypeError(
-                f"MCTSPlanner plans in a TorchRL env; got {type(env).__name__}. Wrap a Gymnasium env "
-                f"as described in TorchRL's GymWrapper, with a state that can be set."
+                f"MCTSPlanner plans in a TorchRL env; got {type(env).__name__}. Wrap a Gymnasium "
+                f"env as described in TorchRL's GymWrapper, with a state that can be set."
             )
         if not env._supports_set_state or env.batch_locked:
             raise ValueError(
                 f"MCTSPlanner needs an env it can set to any state; {name} cannot "
-                f"(_supports_set_state={env._supports_set_state}, batch_locked={env.batch_locked}). Use "
+                f"(_supports_set_state={env._supports_set_state}, "
+                f"batch_locked={env.batch_locked}). Use "
                 f"one that is stateless, e.g. WaterworldMazeEnv() or GridworldMazeEnv()."
             )
         if len(env.action_keys) != 1:
             raise ValueError(
-                f"MCTSPlanner chooses one option per step; {name} has the actions {env.action_keys}."
+                f"MCTSPlanner chooses one option per step; {name} has the actions "
+                f"{env.action_keys}."
             )
         self.env = env
         self.option_key = env.action_keys[0]
@@ -61,8 +63,8 @@ class Simulator:
         boxes = getattr(spec.space, "boxes", [spec.space])  # the Multi specs have one per entry
         if not isinstance(spec, (Categorical, OneHot)) or len(boxes) != 1:
             raise ValueError(
-                f"MCTSPlanner searches one discrete action; {name} has {spec}. Put the env under an "
-                f"OptionTransform, or discretise its action with torchrl's ActionDiscretizer."
+                f"MCTSPlanner searches one discrete action; {name} has {spec}. Put the env under "
+                f"an OptionTransform, or discretise its action with torchrl's ActionDiscretizer."
             )
         self.num_options = int(boxes[0].n)
         # [] for most envs, [1] under an ActionDiscretizer
@@ -79,8 +81,8 @@ class Simulator:
         for key in extra:
             if key not in available:
                 raise ValueError(
-                    f"The novelty test or an evaluator reads {key!r}, which {name} does not have. Its "
-                    f"entries: {sorted(map(str, available))}."
+                    f"The novelty test or an evaluator reads {key!r}, which {name} does not have. "
+                    f"Its entries: {sorted(map(str, available))}."
                 )
         self.duration_key = unravel_key(duration_key) if duration_key in available else None
         self.mask_key = unravel_key(mask_key) if mask_key in available else None
@@ -99,14 +101,16 @@ class Simulator:
         if missing:
             raise ValueError(
                 f"The state to plan from lacks {missing}. Pass a tensordict as env.reset() or "
-                f'env.step(td)["next"] gives it; this one has {sorted(map(str, td.keys(True, True)))}.'
+                f'env.step(td)["next"] gives it; this one has '
+                f"{sorted(map(str, td.keys(True, True)))}."
             )
         for key in self.root_keys:
             value = td.get(key)
             if value.is_floating_point() and not torch.isfinite(value).all():
                 bad = value[~torch.isfinite(value)][0].item()
                 raise ValueError(
-                    f'The state to plan from has "{key}" = {bad}. A state that is not finite cannot be '
+                    f'The state to plan from has "{key}" = {bad}. A state that is not finite '
+                    f"cannot be "
                     f"simulated; find the step that wrote it."
                 )
         flat: TensorDictBase = td.reshape(-1) if len(td.batch_size) != 1 else td
@@ -117,7 +121,7 @@ class Simulator:
         return td.select(*self.state_keys)
 
     def step(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
-        """Take option ``options[i]`` in state ``i``; return what the env writes under ``"next"``."""
+        """Take option ``options[i]`` in state ``i``; return what the env writes as next."""
         option = torch.from_numpy(options)
         if self.env.device is not None:
             option = option.to(self.env.device)
@@ -134,11 +138,13 @@ class Simulator:
 
     def rewards(self, after: TensorDictBase) -> np.ndarray:
         """Return the rewards, float32 ``[m]``."""
-        rewards: np.ndarray = after.get(self._reward_key).to(torch.float32).cpu().reshape(-1).numpy()
+        rewards: np.ndarray = (
+            after.get(self._reward_key).to(torch.float32).cpu().reshape(-1).numpy()
+        )
         if not np.isfinite(rewards).all():
             raise ValueError(
-                f"The simulator returned a reward of {rewards[~np.isfinite(rewards)][0]}. Rewards must "
-                f"be finite; find the state from which the env wrote it."
+                f"The simulator returned a reward of {rewards[~np.isfinite(rewards)][0]}. Rewards "
+                f"must be finite; find the state from which the env wrote it."
             )
         return rewards
 

@@ -12,8 +12,8 @@ class UCT:
 
     .. math:: \arg\max_j\; X_j + c \sqrt{\ln n / n_j}
 
-    :math:`X_j = R_j + D_j V_j` is the value of option :math:`j`, :math:`n_j` its visits, :math:`n` the
-    visits of the node (its own evaluation included). An option without visits comes first.
+    :math:`X_j = R_j + D_j V_j` is the value of option :math:`j`, :math:`n_j` its visits, :math:`n`
+    the visits of the node (its own evaluation included). An option without visits comes first.
 
     Args:
         c: exploration constant, in units of the return. Default ``1.0``.

@@ -128,16 +128,15 @@ class OptionTransform(Transform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Choose the first base action; the env then takes that step as it always does."""
+        fit = self._fitted()
         option = tensordict.get(self.option_key, None)
         if option is None:
             raise KeyError(
                 f"OptionTransform found no option under {self.option_key!r}. Write it with a "
                 f"planner or policy, or with env.rand_action(td)."
             )
-        skill = self._skill(option)
-        fit = self._fitted()
         inner = tensordict.copy()
-        inner.set(self.skill_key, skill)
+        inner.set(self.skill_key, self._skill(option, tensordict.batch_size))
         with torch.no_grad():
             self.worker(inner)
         for key in (self.skill_key, *fit.action_keys):
@@ -150,7 +149,9 @@ class OptionTransform(Transform):
         skipped = tensordict.get("_step", None)
         if skipped is not None:
             skipped = ~skipped.reshape(batch_size)
-        root = tensordict.exclude("_step", self.option_key)
+        root = tensordict.exclude("_step", "next", self.option_key)
+        if "next" in tensordict.keys():  # of an earlier step from this root: TorchRL copies it over
+            next_tensordict = next_tensordict.select(*fit.written)
         flatten = not fit.batch_locked and len(batch_size) != 1
         if flatten:  # one batch dimension is all the loop has to know
             root, next_tensordict = root.reshape(-1), next_tensordict.reshape(-1)
@@ -301,8 +302,21 @@ class OptionTransform(Transform):
             tensordict_reset.set(OptionTrajectory.KEY, empty.data)
         return tensordict_reset
 
-    def _skill(self, option: Tensor) -> Tensor:
+    def _skill(self, option: Tensor, batch_size: torch.Size) -> Tensor:
+        shape = (*batch_size, self.num_options) if self.one_hot else batch_size
+        if option.shape != torch.Size(shape) or not (self.one_hot or option.dtype == torch.int64):
+            raise ValueError(
+                f"The option under {self.option_key!r} must be "
+                f"{'one-hot' if self.one_hot else 'int64'} {list(shape)}; got {option.dtype} "
+                f"{list(option.shape)}. env.rand_action(td) writes one of the right form."
+            )
         if self.one_hot:
+            wrong = option.sum(-1) != 1
+            if wrong.any():
+                raise ValueError(
+                    f"The option under {self.option_key!r} must be one-hot {list(shape)}; got "
+                    f"{option[wrong][0].tolist()}. Set exactly one entry."
+                )
             return option.to(torch.int64).argmax(-1)
         if option.numel():
             low, high = torch.aminmax(option)
@@ -352,10 +366,16 @@ class OptionTransform(Transform):
     def set_container(self, container: Transform | EnvBase) -> None:
         self._fit = None
         super().set_container(container)
+        if self.parent is not None:  # None in a Compose that has no env yet
+            self._fitted()
 
     def reset_parent(self) -> None:
         self._fit = None
         super().reset_parent()
+
+    def empty_cache(self) -> None:
+        self._fit = None  # e.g. a transform was put in front, and the parent is another
+        super().empty_cache()
 
     def __getstate__(self) -> dict[str, object]:
         return {**super().__getstate__(), "_fit": None}
@@ -409,7 +429,11 @@ class _Fit:
         self._writes_all_done: bool | None = None  # known after the first step
         in_keys = getattr(transform.worker, "in_keys", None)
         # A worker that does not say what it reads may read everything.
-        self._read = None if in_keys is None else {*keys, *in_keys, transform.skill_key}
+        self._read = (
+            None if in_keys is None else {_first(k) for k in (*keys, *in_keys, transform.skill_key)}
+        )
+        # What the env writes under "next" in a base step.
+        self.written = {_first(k) for k in (*keys, *parent.done_keys, self.reward_key)}
         self._check_worker(parent, transform)
         if transform.trajectory is not None:
             self.trajectory_spec = transform.trajectory.make_spec(parent)
@@ -479,6 +503,10 @@ class _Fit:
                     f"values up to {action.max().item():g}, which does not fit the env's action "
                     f"spec {spec}. Build the worker from env.action_spec."
                 )
+
+
+def _first(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[0]
 
 
 def _last(key: NestedKey) -> str:

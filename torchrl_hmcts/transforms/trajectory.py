@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Binary, Composite
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 
@@ -58,15 +58,28 @@ class OptionTrajectory:
                     f"{sorted(map(str, root.keys(True, True)))}, and under 'next' "
                     f"{sorted(map(str, after.keys(True, True)))}."
                 )
-            spec[key] = leaf.unsqueeze(ndim).expand(*shape, *leaf.shape[ndim:]).clone()
+            # Not the entry's own bounds: the zeros after an option's end need not lie in them.
+            kind = Binary if leaf.dtype == torch.bool else Unbounded
+            spec[key] = kind(
+                shape=(*shape, *leaf.shape[ndim:]), dtype=leaf.dtype, device=env.device
+            )
         spec[self.MASK_KEY] = Binary(shape=shape, dtype=torch.bool, device=env.device)
         return spec
 
     def start(self, spec: Composite, batch_size: torch.Size) -> OptionTrajectory:
         """Return a trajectory of its own with a block of zeros for ``batch_size`` options."""
         new = OptionTrajectory(self.keys, self.max_steps)
-        lead = batch_size if not spec.shape[:-1] else ()
-        new.data = spec.zero(lead)
+        ndim = len(spec.shape) - 1  # the options need not have the batch size of the env
+        new.data = TensorDict(
+            {
+                key: torch.zeros(
+                    (*batch_size, *leaf.shape[ndim:]), dtype=leaf.dtype, device=leaf.device
+                )
+                for key, leaf in spec.items(True, True)
+            },
+            batch_size=(*batch_size, self.max_steps),
+            device=spec.device,
+        )
         return new
 
     data: TensorDictBase
