@@ -10,7 +10,7 @@ from typing import TypeVar
 C = TypeVar("C")
 
 NUM_TEST_MAZES = 342
-TRAINING_COPIES = 64
+FRAMES_PER_BATCH = 64
 
 
 @dataclass
@@ -30,13 +30,15 @@ class DemoConfig:
     """Test mazes to solve, at most the 342 of the test split."""
     num_skills: int = 4
     """Skills of the worker, the options of the manager (the source's N_policies)."""
-    option_steps: int = 20
+    option_steps: int = 25
     """Base steps of an option (the source's N_worker_samples)."""
+    skill_steps: int = 50
+    """Base steps of a mini-episode in training: long enough for the skills to part."""
     train_base_steps: int = 40_000
     """Base steps of worker training in the training mazes."""
     leaves_per_wave: int = 4
     """Leaves of the tree whose options are simulated together; more are faster, less selective."""
-    novelty_radius: float = 0.6
+    novelty_radius: float = 0.7
     """Tiles within which a place counts as visited; about half of what an option covers."""
     expansions: int = 1_000
     """Nodes that a search may expand before it gives up."""
@@ -50,16 +52,17 @@ class DemoConfig:
             "mazes",
             "num_skills",
             "option_steps",
+            "skill_steps",
             "train_base_steps",
             "expansions",
             "leaves_per_wave",
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
-        if self.train_base_steps % TRAINING_COPIES:
+        if self.train_base_steps % FRAMES_PER_BATCH:
             raise ValueError(
-                f"train_base_steps={self.train_base_steps} does not divide among the "
-                f"{TRAINING_COPIES} mazes played at once; use a multiple of {TRAINING_COPIES}."
+                f"train_base_steps={self.train_base_steps} is no whole number of batches of "
+                f"{FRAMES_PER_BATCH} base steps; use a multiple of {FRAMES_PER_BATCH}."
             )
         if self.mazes > NUM_TEST_MAZES:
             raise ValueError(f"mazes={self.mazes}, but the test split has {NUM_TEST_MAZES} mazes.")

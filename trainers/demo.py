@@ -20,7 +20,7 @@ from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortes
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.animation import write_episode_gif
-from torchrl_hmcts.trainers.config import DemoConfig
+from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.plots import plot_losses, plot_search, plot_skill_fan
 from torchrl_hmcts.trainers.report import write_page
@@ -151,12 +151,13 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
 
 
 def _train(config: DemoConfig) -> tuple[DIAYNTrainer, Any]:
-    env = make_training_env(num_skills=config.num_skills, skill_steps=config.option_steps)
+    env = make_training_env(num_skills=config.num_skills, skill_steps=config.skill_steps)
     loss = DIAYNTrainer.make_loss(env, config.num_skills, seed=config.seed)
     trainer = DIAYNTrainer(
         env,
         loss,
         total_frames=config.train_base_steps,
+        frames_per_batch=FRAMES_PER_BATCH,
         seed=config.seed,
         progress=lambda total: tqdm(total=total, desc="train", unit="step", disable=None),
     )

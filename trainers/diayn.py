@@ -42,18 +42,20 @@ class DIAYNTrainer(Trainer):
 
     Args:
         env (EnvBase): env under :class:`SkillTransform` and whatever the discriminator reads (e.g.
-            :class:`DisplacementTransform`). Many copies in one batch are fastest: a stateless env
-            built with ``batch_size=[64]`` collects a batch of 64 base steps in one call.
+            :class:`DisplacementTransform`). Mini-episodes of 50 steps and 32 copies in one batch
+            (a stateless env built with ``batch_size=[32]``) go with the defaults below.
         loss_module (DIAYNLoss): the loss, e.g. from :meth:`make_loss`.
         total_frames (int): base steps in all. Default ``40_000``, the source's.
         frames_per_batch (int): base steps per batch, a multiple of the env's copies. Default
             ``64``.
-        updates_per_batch (int): updates per batch. Default ``1``.
+        updates_per_batch (int): updates per batch. Default ``3``.
         batch_size (int): transitions per update. Default ``256``.
-        buffer_size (int, optional): transitions kept. Default: ``total_frames``, that is all.
-        lr (float): Adam's learning rate. Default ``1e-3``.
+        buffer_size (int): transitions kept. Default ``20_000``.
+        actor_lr, critic_lr, discriminator_lr (float): Adam's learning rates. Defaults ``2e-3``,
+            ``3e-3`` and ``1e-2``: the actor is the slowest, so that it follows settled values.
+        alpha_lr (float): learning rate of log alpha, when it is tuned. Default ``1e-2``.
         target_tau (float): share of the critics moved into their targets per update. Default
-            ``0.02``.
+            ``0.05``.
         clip_norm (float): bound of the gradient's norm, over all parameters. Default ``10.0``.
         reward (Transform, optional): replay buffer transform that writes the reward. Default:
             ``DIAYNReward`` with the loss's discriminator.
@@ -68,6 +70,21 @@ class DIAYNTrainer(Trainer):
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4.
+
+    Examples:
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+        >>> from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+        >>> env = TransformedEnv(
+        ...     WaterworldMazeEnv(batch_size=[32], observation=False),
+        ...     Compose(SkillTransform(4, max_skill_steps=50), DisplacementTransform()),
+        ... )
+        >>> loss = DIAYNTrainer.make_loss(env, num_skills=4, seed=0)
+        >>> trainer = DIAYNTrainer(env, loss, total_frames=128, seed=0)
+        >>> trainer.train()
+        >>> len(trainer.history["loss_discriminator"])
+        2
     """
 
     def __init__(
@@ -77,12 +94,14 @@ class DIAYNTrainer(Trainer):
         *,
         total_frames: int = 40_000,
         frames_per_batch: int = 64,
-        updates_per_batch: int = 1,
+        updates_per_batch: int = 3,
         batch_size: int = 256,
-        buffer_size: int | None = None,
-        lr: float = 1e-3,
+        buffer_size: int = 20_000,
+        actor_lr: float = 2e-3,
+        critic_lr: float = 3e-3,
+        discriminator_lr: float = 1e-2,
         alpha_lr: float = 1e-2,
-        target_tau: float = 0.02,
+        target_tau: float = 0.05,
         clip_norm: float = 10.0,
         reward: torch.nn.Module | None = None,
         progress: Callable[..., Progress] | None = None,
@@ -125,15 +144,17 @@ class DIAYNTrainer(Trainer):
             auto_register_policy_transforms=False,
         )
         buffer = ReplayBuffer(
-            storage=LazyTensorStorage(buffer_size or total_frames),
+            storage=LazyTensorStorage(buffer_size),
             transform=reward,
             batch_size=batch_size,
         )
-        alpha = [loss_module.log_alpha] if loss_module.log_alpha.requires_grad else []
-        networks = [p for p in loss_module.parameters() if not any(p is a for a in alpha)]
-        groups = [{"params": networks, "lr": lr}]
-        if alpha:
-            groups.append({"params": alpha, "lr": alpha_lr})
+        groups: list[dict[str, Any]] = [
+            {"params": list(loss_module.actor_network_params.parameters()), "lr": actor_lr},
+            {"params": list(loss_module.qvalue_network_params.parameters()), "lr": critic_lr},
+            {"params": list(loss_module.discriminator_params.parameters()), "lr": discriminator_lr},
+        ]
+        if loss_module.log_alpha.requires_grad:
+            groups.append({"params": [loss_module.log_alpha], "lr": alpha_lr})
         optimizer = torch.optim.Adam(groups, fused=True)
         updater = SoftUpdate(loss_module, tau=target_tau)
         super().__init__(
@@ -173,6 +194,7 @@ class DIAYNTrainer(Trainer):
         critic_keys: Sequence[NestedKey] = ("velocity", "displacement"),
         discriminator_keys: Sequence[NestedKey] = ("displacement",),
         hidden: Sequence[int] = (64, 64),
+        discriminator_hidden: Sequence[int] = (),
         seed: int | None = None,
         **loss_kwargs: Any,
     ) -> DIAYNLoss:
@@ -188,7 +210,10 @@ class DIAYNTrainer(Trainer):
                 Critics serve only in training, so they may see what the actor does not.
             discriminator_keys (sequence of NestedKey): what the discriminator sees. Default
                 ``("displacement",)``.
-            hidden (sequence of int): widths of the hidden layers. Default ``(64, 64)``.
+            hidden (sequence of int): widths of actor's and critics' shared layers. Default
+                ``(64, 64)``.
+            discriminator_hidden (sequence of int): widths of the discriminator's hidden layers.
+                Default ``()``: see :class:`SkillDiscriminator`.
             seed (int, optional): seed of the initial weights; torch's generator is left as it was.
                 Default ``None``: torch's generator goes on.
             **loss_kwargs: passed to :class:`DIAYNLoss`.
@@ -214,7 +239,7 @@ class DIAYNTrainer(Trainer):
                 _width(env, discriminator_keys),
                 num_skills,
                 in_keys=discriminator_keys,
-                hidden=hidden,
+                hidden=discriminator_hidden,
             )
             return DIAYNLoss(actor, critic, discriminator, action_space=action_spec, **loss_kwargs)
 

@@ -16,8 +16,8 @@ def make_training_env(
     mazes: Tensor | None = None,
     *,
     num_skills: int = 4,
-    skill_steps: int = 20,
-    copies: int = 64,
+    skill_steps: int = 50,
+    copies: int = 32,
     max_steps: int = 400,
 ) -> TransformedEnv:
     """Build the env in which skills are learned in mini-episodes, with their displacement.
@@ -48,7 +48,7 @@ def make_option_env(
     mazes: Tensor | None = None,
     *,
     num_skills: int = 4,
-    option_steps: int = 20,
+    option_steps: int = 25,
     gamma: float = 0.99,
     trajectory_keys: Sequence[str] | None = None,
     seed: int | None = None,

@@ -67,9 +67,7 @@ class SkillActor(ProbabilisticActor):
         spec, one_hot = _leaf_spec(action_spec, action_key)
         num_actions = int(spec.space.n)
         action_key = unravel_key(action_key)
-        logits_key = (
-            "logits" if isinstance(action_key, str) else (*action_key[:-1], "logits")
-        )
+        logits_key = "logits" if isinstance(action_key, str) else (*action_key[:-1], "logits")
         network = SkillMLP(in_features, num_actions, num_skills, hidden, activation)
         keys = [*key_list("SkillActor", in_keys), skill_key]
         super().__init__(
@@ -138,19 +136,20 @@ class SkillPolicy(TensorDictModuleBase):
         self.out_keys = [actor.action_key]
         self.action_key = actor.action_key
         self.one_hot = actor.one_hot
+        self.action_dtype = actor.spec[actor.action_key].dtype
         self.deterministic = bool(deterministic)
         self.generator = generator
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        scores = self.network(*[tensordict.get(key) for key in self.in_keys])
+        scores = self.network.forward(*[tensordict.get(key) for key in self.in_keys])
         if not self.deterministic:
             # Gumbel-max: argmax(logits - log E) with E exponential is a draw from softmax(logits).
             noise = torch.empty_like(scores).exponential_(generator=self.generator)
             scores -= noise.log_()
         action = scores.argmax(-1)
         if self.one_hot:
-            action = nn.functional.one_hot(action, self.num_actions)
+            action = nn.functional.one_hot(action, self.num_actions).to(self.action_dtype)
         return tensordict.set(self.action_key, action)
 
 

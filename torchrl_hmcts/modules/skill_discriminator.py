@@ -27,7 +27,9 @@ class SkillDiscriminator(SkillNetwork):
         in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
             ``["displacement"]``.
         skill_logits_key (NestedKey): entry written, ``[*B, Z]``. Default ``"skill_logits"``.
-        hidden (sequence of int): widths of the hidden layers. Default ``(64, 64)``.
+        hidden (sequence of int): widths of the hidden layers. Default ``()``, a linear classifier:
+            it extrapolates to places no skill has reached yet, so two skills that go the same way
+            are pushed apart, where a deep one leaves them together.
         activation (callable): builds the activations. Default ``torch.nn.ReLU``.
 
     Reference:
@@ -50,12 +52,13 @@ class SkillDiscriminator(SkillNetwork):
         *,
         in_keys: Sequence[NestedKey] = ("displacement",),
         skill_logits_key: NestedKey = "skill_logits",
-        hidden: Sequence[int] = (64, 64),
+        hidden: Sequence[int] = (),
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
         check_positive("SkillDiscriminator", in_features=in_features, num_skills=num_skills)
-        layers = shared_layers("SkillDiscriminator", in_features, hidden, activation)
-        network = _Concat(*layers, nn.Linear(hidden[-1], num_skills))
+        hidden = tuple(hidden)
+        layers = list(shared_layers("SkillDiscriminator", in_features, hidden, activation))
+        network = _Concat(*layers, nn.Linear((in_features, *hidden)[-1], num_skills))
         super().__init__(network, key_list("SkillDiscriminator", in_keys), skill_logits_key)
         self.num_skills = num_skills
 

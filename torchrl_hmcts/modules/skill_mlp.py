@@ -66,6 +66,11 @@ class SkillMLP(nn.Module):
             out_features=out_features,
             num_skills=num_skills,
         )
+        if not hidden:
+            raise ValueError(
+                "SkillMLP needs at least one shared layer, which the heads read; got hidden=(). "
+                "Pass e.g. hidden=(64, 64)."
+            )
         self.in_features = int(in_features)
         self.out_features = int(out_features)
         self.num_skills = int(num_skills)
@@ -78,10 +83,13 @@ class SkillMLP(nn.Module):
         num_nets = self.heads.weight.shape[:-2]  # () or, stacked, (N,)
         if num_nets:
             x = x.reshape(1, -1, x.shape[-1]).expand(*num_nets, -1, -1)
-        # Layers are applied here, not as modules: their parameters may be stacked, and calling a
-        # small module costs as much as what it computes.
-        for layer in self.trunk:
-            x = _linear(layer, x) if type(layer) is nn.Linear else layer(x)
+        # Layers are applied here, not called as modules: their parameters may be stacked, and
+        # calling a small module costs as much as what it computes.
+        for layer in self.trunk._modules.values():
+            if type(layer) is nn.Linear:
+                x = _linear(layer, x)
+            else:
+                x = x.relu() if type(layer) is nn.ReLU else layer(x)
         y = _linear(self.heads, x)
         shape = (*num_nets, *skill.shape)
         y = y.view(*shape, self.num_skills, self.out_features)
@@ -149,10 +157,10 @@ def shared_layers(
 ) -> nn.Sequential:
     """Builds the hidden layers of a network, each a linear map and an activation."""
     hidden = tuple(hidden)
-    if not hidden or any(width < 1 for width in hidden):
+    if any(width < 1 for width in hidden):
         raise ValueError(
-            f"{owner} needs at least one hidden layer and positive widths, since its output reads "
-            f"the last one; got hidden={hidden}. Pass e.g. hidden=(64, 64)."
+            f"{owner} needs hidden layers of positive width; got hidden={hidden}. "
+            "Pass e.g. hidden=(64, 64)."
         )
     layers: list[nn.Module] = []
     for fan_in, fan_out in zip((in_features, *hidden), hidden, strict=False):

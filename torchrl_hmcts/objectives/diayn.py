@@ -13,7 +13,7 @@ from tensordict.nn import (
     TensorDictParams,
     dispatch,
 )
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.objectives import DiscreteSACLoss
@@ -50,9 +50,10 @@ class DIAYNLoss(DiscreteSACLoss):
         action_space (str or TensorSpec): ``"categorical"``, ``"one-hot"`` or the action spec.
         num_actions (int, optional): number of actions ``A``. Default: that of the actor; needed
             only for ``target_entropy="auto"``.
-        gamma (float): discount per base step. Default ``0.9``: a horizon of ten steps is what it
-            takes to turn round, and short horizons learn within a few hundred updates.
-        alpha_init (float): entropy coefficient at the start, in units of reward. Default ``0.1``.
+        gamma (float): discount per base step. Default ``0.95``: a horizon of twenty steps, about
+            what it takes a body with momentum to turn round.
+        alpha_init (float): entropy coefficient at the start, in units of reward. Default ``0.3``:
+            with less, skills settle before they have spread out, and two of them stay together.
         fixed_alpha (bool): keep alpha instead of tuning it to a target entropy. Default ``True``:
             in a run of a few hundred updates a tuned alpha is still far from settling.
         min_alpha, max_alpha (float, optional): bounds of a tuned alpha. Default ``None``.
@@ -133,8 +134,8 @@ class DIAYNLoss(DiscreteSACLoss):
         *,
         action_space: str | TensorSpec,
         num_actions: int | None = None,
-        gamma: float = 0.9,
-        alpha_init: float = 0.1,
+        gamma: float = 0.95,
+        alpha_init: float = 0.3,
         fixed_alpha: bool = True,
         min_alpha: float | None = None,
         max_alpha: float | None = None,
@@ -206,8 +207,10 @@ class DIAYNLoss(DiscreteSACLoss):
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
-        keys = [*self._in_keys, *self.discriminator_objective.in_keys]
-        self._in_keys = list(dict.fromkeys(keys))
+        # The parent forgets what the critics read of the next state, and nests tuples in tuples.
+        critic = [("next", key) for key in self.qvalue_network.in_keys]
+        keys = [*self._in_keys, *critic, *self.discriminator_objective.in_keys]
+        self._in_keys = sorted({unravel_key(key) for key in keys}, key=str)
 
     def _make_vmap(self) -> None:
         super()._make_vmap()

@@ -75,9 +75,7 @@ class DisplacementTransform(Transform):
         tensordict_reset.set(self.out_key, position - origin)
         return tensordict_reset
 
-    def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         origin = tensordict.get(self.origin_key, None)
         if origin is None:
             raise KeyError(

@@ -124,9 +124,7 @@ class DIAYNReward(Transform):
         self._score(tensordict.get(self.skill_key), tensordict.get("next"))
         return tensordict
 
-    def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._score(tensordict.get(self.skill_key), next_tensordict)
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
@@ -236,9 +236,9 @@ class OptionTransform(Transform):
                 root.set("_step", running)
             after = fit.step(root)
             root = root.exclude("_step")
-            mask = running.unsqueeze(-1)
-            reward = torch.where(mask, reward + discount * after.get(fit.reward_key), reward)
-            duration = duration + mask
+            gained = discount * after.get(fit.reward_key)
+            reward = torch.where(expand_as_right(running, reward), reward + gained, reward)
+            duration = duration + running.unsqueeze(-1)
             out = after.clone() if running.all() else _where(running, after, out)
             if trajectory is not None:
                 trajectory.write(taken, running, root, after)

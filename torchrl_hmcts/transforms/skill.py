@@ -119,9 +119,7 @@ class SkillTransform(Transform):
         tensordict_reset.set(self.skill_step_key, step)
         return tensordict_reset
 
-    def _step(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         skill = tensordict.get(self.skill_key, None)
         step = tensordict.get(self.skill_step_key, None)
         if skill is None or step is None:

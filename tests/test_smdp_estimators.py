@@ -1,0 +1,249 @@
+"""TorchRL's estimators and losses on a macro env: each macro-step is discounted by its duration.
+
+Letters: B batch, T macro-steps of a rollout; k the duration of a macro-step in base steps.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
+from torchrl.envs import TransformedEnv
+from torchrl.modules import ProbabilisticActor, QValueActor, ValueOperator
+from torchrl.objectives import A2CLoss, DQNLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives.value import GAE, TD0Estimator, TDLambdaEstimator
+
+from torchrl_hmcts.testing import ChainEnv
+from torchrl_hmcts.transforms import OptionTransform
+
+GAMMA, LMBDA = 0.9, 0.8
+STATES, OPTIONS = 7, 2
+
+
+def macro_env():
+    """Options of one to three base steps: they end in states 1 and 4 too."""
+    worker = TensorDictModule(lambda skill: skill.clone(), ["skill"], ["action"])
+    ends_at = torch.tensor([False, True, False, False, True, False, False])
+    env = ChainEnv(STATES, reward_per_step=-0.1)
+    return TransformedEnv(
+        env, OptionTransform(worker, OPTIONS, 3, GAMMA, lambda td: ends_at[td["state"]])
+    )
+
+
+@pytest.fixture
+def rollout():
+    """Macro-steps [B=4, T=25] with durations 1 to 3 and with ends of episodes among them."""
+    env = macro_env()
+
+    def policy(td):
+        return td.set("option", (torch.rand(td.shape) < 0.7).long())
+
+    td = env.reset(TensorDict(batch_size=[4]))
+    td = env.rollout(25, policy, tensordict=td, auto_reset=False, break_when_any_done=False)
+    assert set(td["next", "duration"].unique().tolist()) == {1, 2, 3}
+    assert td["next", "terminated"].any()
+    return td
+
+
+class Table(nn.Module):
+    """A value per state (and option), as a network whose output is known."""
+
+    def __init__(self, *columns):
+        super().__init__()
+        self.entries = nn.Parameter(torch.randn(STATES, *columns))
+
+    def forward(self, state):
+        return self.entries[state]
+
+
+@pytest.fixture
+def critic():
+    return ValueOperator(Table(1), in_keys=["state"])
+
+
+def smdp_targets(td, next_value, power=None):
+    """R + gamma**k V(s'), [B, T, 1]; V of a terminal state is 0."""
+    power = td["next", "duration"] if power is None else power
+    return td["next", "reward"] + GAMMA**power * next_value * ~td["next", "terminated"]
+
+
+def values(td, critic):
+    table = critic.module.entries.detach()
+    return table[td["state"]], table[td["next", "state"]]
+
+
+def advantages_by_loop(td, value, next_value):
+    """GAE of an SMDP, backwards over the macro-steps."""
+    delta = smdp_targets(td, next_value) - value
+    advantage, out = torch.zeros_like(value[:, 0]), []
+    for t in reversed(range(td.shape[1])):
+        goes_on = ~td["next", "done"][:, t]
+        carry = LMBDA * GAMMA ** td["next", "duration"][:, t] * goes_on
+        advantage = delta[:, t] + carry * advantage
+        out.insert(0, advantage)
+    return torch.stack(out, 1)
+
+
+def use_durations(estimator):
+    estimator.set_keys(steps_to_next_obs=("next", "duration"))
+    return estimator
+
+
+class TestEstimators:
+    def test_macro_rewards_are_the_closed_form(self, rollout):
+        """-0.1 per base step, 1 on arrival: (1 - gamma**k) / (1 - gamma) of the former."""
+        k = rollout["next", "duration"].float()
+        expected = -0.1 * (1 - GAMMA**k) / (1 - GAMMA)
+        expected += GAMMA ** (k - 1) * rollout["next", "terminated"]
+        torch.testing.assert_close(rollout["next", "reward"], expected)
+
+    def test_td0_is_the_reward_plus_the_value_discounted_by_the_duration(self, rollout, critic):
+        estimator = use_durations(TD0Estimator(gamma=GAMMA, value_network=critic))
+        value, next_value = values(rollout, critic)
+        expected = smdp_targets(rollout, next_value)
+        out = estimator(rollout.clone())
+        torch.testing.assert_close(out["value_target"], expected)
+        torch.testing.assert_close(out["advantage"], expected - value)
+
+    @pytest.mark.parametrize("vectorized", [True, False])
+    def test_gae_discounts_by_the_duration(self, rollout, critic, vectorized):
+        estimator = use_durations(
+            GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=vectorized)
+        )
+        value, next_value = values(rollout, critic)
+        expected = advantages_by_loop(rollout, value, next_value)
+        out = estimator(rollout.clone())
+        torch.testing.assert_close(out["advantage"], expected, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(out["value_target"], expected + value, atol=1e-5, rtol=1e-4)
+
+    def test_td_lambda_discounts_by_the_duration(self, rollout, critic):
+        """The lambda return is the value plus the same sum of deltas."""
+        estimator = use_durations(
+            TDLambdaEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=False)
+        )
+        value, next_value = values(rollout, critic)
+        out = estimator(rollout.clone())
+        # Next to the end of an episode V(s') is not the value of the next root but of s'.
+        target = torch.zeros_like(value)
+        following = next_value[:, -1]
+        for t in reversed(range(rollout.shape[1])):
+            done = rollout["next", "done"][:, t]
+            mixed = (1 - LMBDA) * next_value[:, t] + LMBDA * following
+            last = t == rollout.shape[1] - 1
+            ahead = torch.where(done, next_value[:, t], next_value[:, t] if last else mixed)
+            target[:, t] = smdp_targets(rollout[:, t], ahead)
+            following = target[:, t]
+        torch.testing.assert_close(out["value_target"], target, atol=1e-5, rtol=1e-4)
+
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda critic: TD0Estimator(gamma=GAMMA, value_network=critic),
+            lambda critic: GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic),
+        ],
+    )
+    def test_without_the_key_every_macro_step_counts_as_one(self, rollout, critic, make):
+        plain = make(critic)(rollout.clone())["advantage"]
+        smdp = use_durations(make(critic))(rollout.clone())["advantage"]
+        assert (plain - smdp).abs().max() > 0.1
+        ones = rollout.clone()
+        ones["next", "duration"].fill_(1)
+        torch.testing.assert_close(use_durations(make(critic))(ones)["advantage"], plain)
+
+
+class TestDQNLoss:
+    def make(self, delay_value=False):
+        network = QValueActor(
+            Table(OPTIONS), in_keys=["state"], spec=Categorical(OPTIONS), action_space="categorical"
+        )
+        loss = DQNLoss(
+            network, loss_function="l2", delay_value=delay_value, action_space="categorical"
+        )
+        loss.set_keys(action="option")
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+        return loss, network.module[0].module.entries.detach()
+
+    def by_hand(self, td, table, power=None):
+        best = table[td["next", "state"]].max(-1, keepdim=True).values
+        chosen = table[td["state"]].gather(-1, td["option"].unsqueeze(-1))
+        return (chosen - smdp_targets(td, best, power)).square().mean()
+
+    @pytest.mark.parametrize("delay_value", [False, True])
+    def test_it_equals_the_loss_by_hand(self, rollout, delay_value):
+        loss, table = self.make(delay_value)
+        use_durations(loss.value_estimator)
+        if delay_value:
+            SoftUpdate(loss, tau=0.1)  # without one TorchRL warns
+        actual = loss(rollout.clone())["loss"]
+        torch.testing.assert_close(actual, self.by_hand(rollout, table))
+
+    def test_without_the_key_it_is_another_loss(self, rollout):
+        loss, table = self.make()
+        actual = loss(rollout.clone())["loss"]
+        torch.testing.assert_close(actual, self.by_hand(rollout, table, power=1))
+        assert (actual - self.by_hand(rollout, table)).abs() > 1e-2
+
+    def test_a_new_estimator_has_to_be_told_again(self, rollout):
+        loss, table = self.make()
+        use_durations(loss.value_estimator)
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+        actual = loss(rollout.clone())["loss"]
+        torch.testing.assert_close(actual, self.by_hand(rollout, table, power=1))
+
+    def test_on_samples_of_a_replay_buffer(self, rollout):
+        buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
+        buffer.extend(rollout.reshape(-1))
+        loss, table = self.make()
+        use_durations(loss.value_estimator)
+        td = buffer.sample()
+        torch.testing.assert_close(loss(td.clone())["loss"], self.by_hand(td, table))
+
+
+class TestA2CLoss:
+    def make(self, critic, value_type, **hyperparams):
+        actor = ProbabilisticActor(
+            TensorDictModule(Table(OPTIONS), ["state"], ["logits"]),
+            in_keys=["logits"],
+            out_keys=["option"],
+            distribution_class=torch.distributions.Categorical,
+        )
+        loss = A2CLoss(actor, critic, entropy_bonus=False, critic_coeff=1.0, loss_critic_type="l2")
+        loss.set_keys(action="option")
+        loss.make_value_estimator(value_type, gamma=GAMMA, **hyperparams)
+        return loss, actor.module[0].module.entries.detach()
+
+    def by_hand(self, td, logits, advantage):
+        log_prob = logits.log_softmax(-1)[td["state"]].gather(-1, td["option"].unsqueeze(-1))
+        # The critic's error is target - value, which is the advantage in TD(0) and GAE.
+        return -(log_prob * advantage).mean(), advantage.square().mean()
+
+    def test_with_td0_it_equals_the_loss_by_hand(self, rollout, critic):
+        loss, logits = self.make(critic, ValueEstimators.TD0)
+        use_durations(loss.value_estimator)
+        value, next_value = values(rollout, critic)
+        expected = smdp_targets(rollout, next_value) - value
+        self.check(loss, rollout, self.by_hand(rollout, logits, expected))
+
+    def test_with_gae_it_equals_the_loss_by_hand(self, rollout, critic):
+        loss, logits = self.make(critic, ValueEstimators.GAE, lmbda=LMBDA)
+        use_durations(loss.value_estimator)
+        value, next_value = values(rollout, critic)
+        expected = advantages_by_loop(rollout, value, next_value)
+        self.check(loss, rollout, self.by_hand(rollout, logits, expected))
+
+    def check(self, loss, rollout, expected):
+        out = loss(rollout.clone())
+        torch.testing.assert_close(out["loss_objective"], expected[0], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(out["loss_critic"], expected[1], atol=1e-5, rtol=1e-4)
+
+    @pytest.mark.parametrize("value_type", [ValueEstimators.TD0, ValueEstimators.GAE])
+    def test_without_the_key_it_is_another_loss(self, rollout, critic, value_type):
+        loss, _ = self.make(critic, value_type)
+        plain = loss(rollout.clone())
+        use_durations(loss.value_estimator)
+        smdp = loss(rollout.clone())
+        for key in ("loss_objective", "loss_critic"):
+            assert (plain[key] - smdp[key]).abs() > 1e-3
