@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.envs.mazes import check_mazes, free_tiles, maze_pool, wall_centers
@@ -129,7 +129,7 @@ class GridworldMazeEnv(EnvBase):
         self.state_spec = Composite(state(), shape=(), device=device)
         self.observation_spec = Composite({**state(), **read_outs}, shape=(), device=device)
         self.action_spec = Categorical(len(_MOVES), shape=(), device=device)
-        self.reward_spec = Bounded(0, 1, shape=(1,), dtype=torch.float32, device=device)
+        self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32, device=device)
         self.done_spec = Composite(
             {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")},
             shape=(),

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.envs.chipmunk import ChipmunkMazes
@@ -158,7 +158,7 @@ class WaterworldMazeEnv(EnvBase):
                 device=device,
             )
         done = {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
-        reward = Bounded(0, 1, shape=(1,), dtype=torch.float32, device=device)
+        reward = Unbounded(shape=(1,), dtype=torch.float32, device=device)
         self.state_spec = Composite(state(), device=device).expand(batch_size)
         self.observation_spec = Composite({**state(), **read_outs}, device=device).expand(
             batch_size

@@ -47,6 +47,8 @@ EDGE = np.dtype(
     ]
 )  # 32 bytes
 
+# Bits of a node's flags. The compiled kernels hold their values: after changing one, delete the
+# __pycache__ of this folder, since numba looks at kernels.py only.
 EXPANDED = 1  # its options have been simulated
 PENDING = 2  # its options are being simulated in this wave
 TERMINAL = 4  # the episode ends here, by termination or truncation

@@ -16,6 +16,7 @@ from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Un
 from torchrl.envs import EnvBase, Transform
 
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
+from torchrl_hmcts.transforms.worker_env import WorkerEnv
 
 Termination = Callable[[TensorDictBase], Tensor]
 
@@ -122,7 +123,7 @@ class OptionTransform(Transform):
         self.trajectory = (
             None if trajectory_keys is None else OptionTrajectory(trajectory_keys, max_steps)
         )
-        self._fit: _Fit | None = None
+        self._fit: WorkerEnv | None = None
 
     # ---------------------------------------------------------------- stepping
 
@@ -162,7 +163,7 @@ class OptionTransform(Transform):
                 out = self._run(fit, root, next_tensordict)
         return out.reshape(batch_size) if flatten else out
 
-    def _run(self, fit: _Fit, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+    def _run(self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
         """Go on in a stateless env, with fewer rows whenever some have ended."""
         n = after.batch_size[0]
         reward = after.get(fit.reward_key).clone()  # [n, 1], of all rows
@@ -209,7 +210,7 @@ class OptionTransform(Transform):
 
     def _run_locked(
         self,
-        fit: _Fit,
+        fit: WorkerEnv,
         root: TensorDictBase,
         after: TensorDictBase,
         skipped: Tensor | None,
@@ -245,14 +246,16 @@ class OptionTransform(Transform):
         return self._finish(fit, out, reward, duration, trajectory)
 
     def _advance(
-        self, fit: _Fit, root: TensorDictBase, after: TensorDictBase, carried: list[NestedKey]
+        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, carried: list[NestedKey]
     ) -> TensorDictBase:
         """The next root: what the env wrote becomes its input, and the worker acts on it."""
         root = fit.step_mdp(root, after, carried)
         self.worker(root)
         return root
 
-    def _ended(self, fit: _Fit, root: TensorDictBase, after: TensorDictBase, taken: int) -> Tensor:
+    def _ended(
+        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, taken: int
+    ) -> Tensor:
         shape = after.batch_size
         ended = after.get(fit.done_keys[0]).reshape(shape)
         for key in fit.done_keys[1:]:
@@ -266,7 +269,7 @@ class OptionTransform(Transform):
 
     def _begin_trajectory(
         self,
-        fit: _Fit,
+        fit: WorkerEnv,
         root: TensorDictBase,
         after: TensorDictBase,
         running: Tensor | None = None,
@@ -279,7 +282,7 @@ class OptionTransform(Transform):
 
     def _finish(
         self,
-        fit: _Fit,
+        fit: WorkerEnv,
         out: TensorDictBase,
         reward: Tensor,
         duration: Tensor,
@@ -380,7 +383,7 @@ class OptionTransform(Transform):
     def __getstate__(self) -> dict[str, object]:
         return {**super().__getstate__(), "_fit": None}
 
-    def _fitted(self) -> _Fit:
+    def _fitted(self) -> WorkerEnv:
         if self._fit is None:
             parent = self.parent
             if parent is None:
@@ -389,7 +392,7 @@ class OptionTransform(Transform):
                     "TransformedEnv(env, OptionTransform(...)); it has no meaning in a replay "
                     "buffer."
                 )
-            self._fit = _Fit(parent, self)
+            self._fit = WorkerEnv(parent, self)
         return self._fit
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -404,113 +407,6 @@ class OptionTransform(Transform):
             f"{type(self).__name__}(num_options={self.num_options}, max_steps={self.max_steps}, "
             f"gamma={self.gamma})"
         )
-
-
-class _Fit:
-    """What an OptionTransform has found out about the env it is attached to."""
-
-    def __init__(self, parent: EnvBase, transform: OptionTransform) -> None:
-        base = parent.base_env
-        self.batch_locked = parent.batch_locked
-        if len(parent.reward_keys) != 1:
-            raise ValueError(
-                f"OptionTransform sums one reward; {type(base).__name__} has the rewards "
-                f"{parent.reward_keys}. Reduce them to one with a transform before it."
-            )
-        self.reward_key = parent.reward_keys[0]
-        self.action_keys = list(parent.action_keys)
-        self.done_keys = [k for k in parent.done_keys if _last(k) == "done"]
-        self._env = base if not len(parent.transform) else parent
-        self._parent = parent
-        keys = [*parent.full_observation_spec.keys(True, True), *parent.state_keys]
-        self._flat = all(isinstance(k, str) for k in (*keys, *parent.done_keys, self.reward_key))
-        self._done_spec = parent.full_done_spec
-        self._complete = set(map(unravel_key, parent.done_keys))
-        self._writes_all_done: bool | None = None  # known after the first step
-        in_keys = getattr(transform.worker, "in_keys", None)
-        # A worker that does not say what it reads may read everything.
-        self._read = (
-            None if in_keys is None else {_first(k) for k in (*keys, *in_keys, transform.skill_key)}
-        )
-        # What the env writes under "next" in a base step.
-        self.written = {_first(k) for k in (*keys, *parent.done_keys, self.reward_key)}
-        self._check_worker(parent, transform)
-        if transform.trajectory is not None:
-            self.trajectory_spec = transform.trajectory.make_spec(parent)
-
-    def step(self, root: TensorDictBase) -> TensorDictBase:
-        """Take a base step, without the bookkeeping of ``EnvBase.step`` where it can be spared."""
-        if self.batch_locked:
-            return self._parent.step(root).get("next")
-        after = self._env._step(root)
-        if self._writes_all_done is None:
-            self._writes_all_done = self._complete.issubset(after.keys(True, True))
-        if not self._writes_all_done:
-            self._env._complete_done(self._done_spec, after)
-        return after
-
-    def step_mdp(
-        self, root: TensorDictBase, after: TensorDictBase, carried: list[NestedKey]
-    ) -> TensorDictBase:
-        if not self._flat:
-            root = root.copy()
-            root.set("next", after)
-            return self._parent.step_mdp(root)
-        # What the env wrote is the next root as it stands: nobody reads the reward in it.
-        following = after.copy() if self.batch_locked else after
-        for key in carried:
-            following.set(key, root.get(key))
-        return following
-
-    def carried(self, root: TensorDictBase, after: TensorDictBase) -> list[NestedKey]:
-        """Entries that are read in every base step and written by none, e.g. the skill."""
-        if not self._flat:
-            return []
-        written = set(after.keys()) | set(self.action_keys) | {"next"}
-        return [
-            key
-            for key in root.keys()
-            if key not in written and (self._read is None or key in self._read)
-        ]
-
-    def _check_worker(self, parent: EnvBase, transform: OptionTransform) -> None:
-        worker = transform.worker
-        name = type(worker).__name__
-        td = parent.fake_tensordict().exclude("next", *self.action_keys)
-        skill = torch.zeros(td.batch_size, dtype=torch.int64, device=parent.device)
-        td.set(transform.skill_key, skill)
-        for key in getattr(worker, "in_keys", ()):
-            if td.get(key, None) is None:
-                raise ValueError(
-                    f"The worker {name} reads {key!r}, which {type(parent.base_env).__name__} does "
-                    f"not have: it has {sorted(map(str, td.keys(True, True)))}. Change the "
-                    f"worker's in_keys, or add a transform that writes {key!r} before "
-                    f"OptionTransform."
-                )
-        with torch.no_grad():
-            worker(td)
-        for key in self.action_keys:
-            action = td.get(key, None)
-            spec = parent.full_action_spec[key]
-            if action is None:
-                raise ValueError(
-                    f"The worker {name} wrote no {key!r}, the action of "
-                    f"{type(parent.base_env).__name__}. Give it out_keys=[{key!r}]."
-                )
-            if action.shape != spec.shape or action.dtype != spec.dtype or not spec.is_in(action):
-                raise ValueError(
-                    f"The worker {name} wrote {key!r} = {action.dtype} {list(action.shape)} with "
-                    f"values up to {action.max().item():g}, which does not fit the env's action "
-                    f"spec {spec}. Build the worker from env.action_spec."
-                )
-
-
-def _first(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[0]
-
-
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]
 
 
 def _where(mask: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:

@@ -1,0 +1,128 @@
+"""The base environment as an option's rollout sees it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase
+
+if TYPE_CHECKING:
+    from torchrl_hmcts.transforms.option import OptionTransform
+
+
+class WorkerEnv:
+    """The env below an OptionTransform: what it reads and writes, and how to step it fast.
+
+    Args:
+        parent: the env with all transforms below the OptionTransform.
+        transform: the OptionTransform, whose worker is checked against the env.
+
+    Raises:
+        ValueError: if the env has several rewards, or the worker does not fit it.
+    """
+
+    def __init__(self, parent: EnvBase, transform: OptionTransform) -> None:
+        base = parent.base_env
+        self.batch_locked = parent.batch_locked
+        if len(parent.reward_keys) != 1:
+            raise ValueError(
+                f"OptionTransform sums one reward; {type(base).__name__} has the rewards "
+                f"{parent.reward_keys}. Reduce them to one with a transform before it."
+            )
+        self.reward_key = parent.reward_keys[0]
+        self.action_keys = list(parent.action_keys)
+        self.done_keys = [k for k in parent.done_keys if _last(k) == "done"]
+        self._env = base if not len(parent.transform) else parent
+        self._parent = parent
+        keys = [*parent.full_observation_spec.keys(True, True), *parent.state_keys]
+        self._flat = all(isinstance(k, str) for k in (*keys, *parent.done_keys, self.reward_key))
+        self._done_spec = parent.full_done_spec
+        self._complete = set(map(unravel_key, parent.done_keys))
+        self._writes_all_done: bool | None = None  # known after the first step
+        in_keys = getattr(transform.worker, "in_keys", None)
+        # A worker that does not say what it reads may read everything.
+        self._read = (
+            None if in_keys is None else {_first(k) for k in (*keys, *in_keys, transform.skill_key)}
+        )
+        # What the env writes under "next" in a base step.
+        self.written = {_first(k) for k in (*keys, *parent.done_keys, self.reward_key)}
+        self._check_worker(parent, transform)
+        if transform.trajectory is not None:
+            self.trajectory_spec = transform.trajectory.make_spec(parent)
+
+    def step(self, root: TensorDictBase) -> TensorDictBase:
+        """Take a base step, without the bookkeeping of ``EnvBase.step`` where it can be spared."""
+        if self.batch_locked:
+            return self._parent.step(root).get("next")
+        after = self._env._step(root)
+        if self._writes_all_done is None:
+            self._writes_all_done = self._complete.issubset(after.keys(True, True))
+        if not self._writes_all_done:
+            self._env._complete_done(self._done_spec, after)
+        return after
+
+    def step_mdp(
+        self, root: TensorDictBase, after: TensorDictBase, carried: list[NestedKey]
+    ) -> TensorDictBase:
+        if not self._flat:
+            root = root.copy()
+            root.set("next", after)
+            return self._parent.step_mdp(root)
+        # What the env wrote is the next root as it stands: nobody reads the reward in it.
+        following = after.copy() if self.batch_locked else after
+        for key in carried:
+            following.set(key, root.get(key))
+        return following
+
+    def carried(self, root: TensorDictBase, after: TensorDictBase) -> list[NestedKey]:
+        """Entries that are read in every base step and written by none, e.g. the skill."""
+        if not self._flat:
+            return []
+        written = set(after.keys()) | set(self.action_keys) | {"next"}
+        return [
+            key
+            for key in root.keys()
+            if key not in written and (self._read is None or key in self._read)
+        ]
+
+    def _check_worker(self, parent: EnvBase, transform: OptionTransform) -> None:
+        worker = transform.worker
+        name = type(worker).__name__
+        td = parent.fake_tensordict().exclude("next", *self.action_keys)
+        skill = torch.zeros(td.batch_size, dtype=torch.int64, device=parent.device)
+        td.set(transform.skill_key, skill)
+        for key in getattr(worker, "in_keys", ()):
+            if td.get(key, None) is None:
+                raise ValueError(
+                    f"The worker {name} reads {key!r}, which {type(parent.base_env).__name__} does "
+                    f"not have: it has {sorted(map(str, td.keys(True, True)))}. Change the "
+                    f"worker's in_keys, or add a transform that writes {key!r} before "
+                    f"OptionTransform."
+                )
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):  # the check draws no numbers
+            worker(td)
+        for key in self.action_keys:
+            action = td.get(key, None)
+            spec = parent.full_action_spec[key]
+            if action is None:
+                raise ValueError(
+                    f"The worker {name} wrote no {key!r}, the action of "
+                    f"{type(parent.base_env).__name__}. Give it out_keys=[{key!r}]."
+                )
+            if action.shape != spec.shape or action.dtype != spec.dtype or not spec.is_in(action):
+                raise ValueError(
+                    f"The worker {name} wrote {key!r} = {action.dtype} {list(action.shape)} with "
+                    f"values up to {action.max().item():g}, which does not fit the env's action "
+                    f"spec {spec}. Build the worker from env.action_spec."
+                )
+
+
+def _first(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[0]
+
+
+def _last(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[-1]
