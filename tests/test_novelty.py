@@ -62,8 +62,8 @@ def test_a_new_search_forgets_the_last() -> None:
         novelty.relax(0)
 
 
-def test_relaxing_halves_the_radius_of_one_root_a_limited_number_of_times() -> None:
-    novelty = RadiusNovelty("x", 1.0, max_relaxations=2)
+def test_relaxing_shrinks_the_radius_of_one_root_a_limited_number_of_times() -> None:
+    novelty = RadiusNovelty("x", 1.0, relaxation=0.5, max_relaxations=2)
     novelty.start(2)
     novelty.accept(np.array([0, 1]), features(0.0, 0.0))
     assert novelty.relax(1)
@@ -129,11 +129,11 @@ def test_a_pruned_node_has_no_children_and_is_visited_once() -> None:
     assert (tree.edges[0, pruned]["child"] == -1).all()
 
 
-def test_an_exhausted_search_halves_its_radius_and_goes_on() -> None:
+def test_an_exhausted_search_shrinks_its_radius_and_goes_on() -> None:
     # A step of 1 is within the radius of 3: both outcomes at the root are refused. Halved to 1.5:
     # still. Halved to 0.75: the step to the right is accepted again, and the search goes on.
     env = ChainEnv(6)
-    planner = MCTSPlanner(env, novelty=RadiusNovelty("state", 3.0))
+    planner = MCTSPlanner(env, novelty=RadiusNovelty("state", 3.0, relaxation=0.5))
     plan = planner.plan(env.reset())
     assert plan.found.item()
     assert plan.options.tolist() == [1] * 5
@@ -162,7 +162,7 @@ def test_only_the_exhausted_root_is_relaxed() -> None:
     table = {(s, 0): (s, 0.0, 1) for s in (3, 5, 6, 7, 8)}
     table |= {(0, 0): (4, 0.0, 1), (4, 0): (9, 1.0, 1), (1, 0): (2, 0.0, 1), (2, 0): (9, 1.0, 1)}
     env = TableEnv(table, terminal=[9])
-    novelty = RadiusNovelty("state", 2.0)
+    novelty = RadiusNovelty("state", 2.0, relaxation=0.5)
     planner = MCTSPlanner(env, novelty=novelty)
     td = env.reset(TensorDict({"state": torch.tensor([0, 1])}, [2]), set_state=True)
     assert planner.plan(td).found.tolist() == [True, True]
@@ -251,3 +251,9 @@ def test_no_more_nodes_are_expanded_than_the_maze_has_free_tiles() -> None:
     td = planner(env.reset(TensorDict(batch_size=[16])))
     assert td["plan_found"].all()
     assert int(td["num_expansions"].max()) <= 50
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1.0, -0.5, float("nan")])
+def test_a_relaxation_that_does_not_shrink_the_radius_is_refused(relaxation: float) -> None:
+    with pytest.raises(ValueError, match=r"relaxation in \(0, 1\)"):
+        RadiusNovelty("x", 1.0, relaxation=relaxation)
