@@ -68,14 +68,9 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     )
     starts = make_starts(real.base_env, config.mazes, config.seed)
     compile_begin = time.perf_counter()
-    planner.plan(
-        starts[:1]
-    )  # compiles the kernels and builds the physics, so that times are of planning
+    planner.plan(starts[:1])  # compiles the kernels, so that the times below are of planning
     compile_seconds = time.perf_counter() - compile_begin
-    episodes = [
-        _plan_and_act(planner, real, starts[i])
-        for i in _progress(range(config.mazes), "plan and act", "maze")
-    ]
+    episodes = _solve(planner, real, starts)
     batch_begin = time.perf_counter()
     planner.plan(starts)
     batch_seconds = time.perf_counter() - batch_begin
@@ -165,10 +160,6 @@ def _train(config: DemoConfig) -> tuple[DIAYNTrainer, Any]:
     return trainer, loss
 
 
-def _progress(items: Any, name: str, unit: str) -> Any:
-    return tqdm(items, desc=name, unit=unit, disable=None)  # quiet when not on a terminal
-
-
 @dataclasses.dataclass
 class Episode:
     """One maze: the plan, what finding it cost, and what carrying it out gave."""
@@ -181,6 +172,20 @@ class Episode:
     options: np.ndarray  # [base steps] option that was being carried out
     base_steps: int
     solved: bool
+
+
+def _solve(planner: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> list[Episode]:
+    """Plan and act in one maze after the other."""
+    episodes: list[Episode] = []
+    bar = tqdm(starts.unbind(0), desc="plan and act", unit="maze", disable=None)
+    for start in bar:
+        episodes.append(_plan_and_act(planner, real, start))
+        bar.set_postfix(
+            solved=sum(e.solved for e in episodes),
+            plan_seconds=f"{np.median([e.plan_seconds for e in episodes]):.2f}",
+            plan_base_steps=f"{np.median([e.plan_base_steps for e in episodes]):.0f}",
+        )
+    return episodes
 
 
 def _plan_and_act(planner: MCTSPlanner, real: EnvBase, start: TensorDictBase) -> Episode:
