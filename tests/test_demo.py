@@ -65,6 +65,8 @@ def test_an_unknown_key_is_refused_with_the_nearest_ones(capsys):
         (["seed"], "no key=value"),
         (["mazes=many"], "many"),
         (["mazes=0"], "mazes must be at least 1; got 0"),
+        (["novelty_radius=0"], "novelty_radius must be above 0 tiles; got 0.0"),
+        (["gamma=1.5"], r"gamma must be in \(0, 1\]; got 1.5"),
         (["option_steps=-5"], "option_steps must be at least 1; got -5"),
     ],
 )
@@ -77,6 +79,14 @@ def test_more_mazes_than_the_test_split_has_are_refused(tmp_path, capsys):
     assert main(["demo", "mazes=343", f"out={tmp_path}"]) == 2
     assert "342" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_named_before_any_work(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["demo", f"out={tmp_path}/file/run"]) == 1
+    captured = capsys.readouterr()
+    assert "Choose another folder with out=DIR" in captured.err
+    assert "Learning" not in captured.out
 
 
 def test_the_page_escapes_what_it_shows(tmp_path):

@@ -44,6 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     try:
         run_demo(config)
+    except OSError as error:  # e.g. a folder that cannot be written
+        print(f"hmcts demo: {error}. Choose another folder with out=DIR.", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("\nhmcts demo: stopped; it starts anew, run it again.", file=sys.stderr)
         return 130

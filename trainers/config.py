@@ -45,7 +45,7 @@ class DemoConfig:
     gamma: float = 0.99
     """Discount per base step."""
     toy: bool = False
-    """Two minutes less: 1,920 base steps of training and 3 mazes, to see that everything works."""
+    """1,920 base steps of training and 3 mazes, to see in seconds that everything works."""
 
     def __post_init__(self) -> None:
         for name in (
@@ -59,6 +59,10 @@ class DemoConfig:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        if not self.novelty_radius > 0.0:
+            raise ValueError(f"novelty_radius must be above 0 tiles; got {self.novelty_radius}.")
+        if not 0.0 < self.gamma <= 1.0:
+            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")
         if self.train_base_steps % FRAMES_PER_BATCH:
             raise ValueError(
                 f"train_base_steps={self.train_base_steps} is no whole number of batches of "
