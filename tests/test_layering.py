@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,11 @@ FOLDERS = {
     "trainers": "torchrl_hmcts.trainers",
 }
 COMPONENT_DEPENDENCIES = {"torch", "tensordict", "torchrl", "numpy", "numba"}
+# What a component may import inside a function, for those who have it.
+OPTIONAL = {
+    "torchrl_hmcts.planners.drawing": "matplotlib",
+    "torchrl_hmcts.planners.export": "networkx",
+}
 
 
 def modules() -> dict[str, Path]:
@@ -37,14 +43,26 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imported_names(source: str, module: str, *, is_package: bool) -> set[str]:
+def outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
+    """Yields the nodes of a syntax tree that run when the module is imported."""
+    for node in ast.iter_child_nodes(tree):
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            yield node
+            yield from outside_functions(node)
+
+
+def imported_names(
+    source: str, module: str, *, is_package: bool, at_import: bool = False
+) -> set[str]:
     """Returns the absolute name of everything a module's source imports, at any depth.
 
-    ``from a import b`` counts as ``a`` and ``a.b``, since ``b`` may be a module.
+    ``from a import b`` counts as ``a`` and ``a.b``, since ``b`` may be a module. With
+    ``at_import``, only what is imported along with the module, not by its functions.
     """
     package = module if is_package else module.rpartition(".")[0]
     names = set()
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    for node in outside_functions(tree) if at_import else ast.walk(tree):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -80,6 +98,7 @@ def violations(source: str, module: str, *, is_package: bool = False) -> list[st
     """Returns one sentence for each import that breaks the direction of the layers."""
     found = []
     names = imported_names(source, module, is_package=is_package)
+    at_import = imported_names(source, module, is_package=is_package, at_import=True)
     own = layer(module)
     for name in sorted(names):
         other = layer(name)
@@ -93,6 +112,8 @@ def violations(source: str, module: str, *, is_package: bool = False) -> list[st
             found.append(f"environment {module} imports {name} of the {other}")
         elif own == "components" and other == "outside":
             top = name.split(".")[0]
+            if top == OPTIONAL.get(module) and name not in at_import:
+                continue
             if top not in COMPONENT_DEPENDENCIES and top not in sys.stdlib_module_names:
                 found.append(
                     f"component {module} imports {name}; components import only "
@@ -107,7 +128,11 @@ def declared_distributions(*extras: str) -> set[str]:
     requirements = list(project["dependencies"])
     for extra in extras:
         requirements += project["optional-dependencies"][extra]
-    return {normalised(re.split(r"[\s\[<>=!~;]", line)[0]) for line in requirements}
+    return {distribution_of(line) for line in requirements}
+
+
+def distribution_of(requirement: str) -> str:
+    return normalised(re.split(r"[\s\[<>=!~;]", requirement)[0])
 
 
 def normalised(distribution: str) -> str:
@@ -123,9 +148,12 @@ def test_a_module_imports_only_what_its_layer_may(module: str) -> None:
 @pytest.mark.parametrize("module", modules())
 def test_every_third_party_import_is_declared(module: str) -> None:
     path = modules()[module]
-    allowed = declared_distributions(
-        *{"trainers": ("train", "atari"), "envs": ("atari",)}.get(layer(module), ())
-    )
+    extras = {"trainers": ("train", "atari"), "envs": ("atari",)}.get(layer(module), ())
+    if OPTIONAL.get(module) == "matplotlib":
+        extras = ("train",)
+    allowed = declared_distributions(*extras)
+    if OPTIONAL.get(module) == "networkx":
+        allowed |= {distribution_of(line) for line in importlib.metadata.requires("torch") or ()}
     provided_by = importlib.metadata.packages_distributions()
     names = imported_names(path.read_text(), module, is_package=path.name == "__init__.py")
     tops = {name.split(".")[0] for name in names} - sys.stdlib_module_names - {"torchrl_hmcts", ""}
@@ -149,6 +177,14 @@ def test_every_third_party_import_is_declared(module: str) -> None:
         ("torchrl_hmcts.planners.mcts", "import_module('torchrl_hmcts.trainers.cli')"),
         ("torchrl_hmcts.planners.mcts", "import pymunk"),
         ("torchrl_hmcts.testing", "import matplotlib.pyplot as plt"),
+        ("torchrl_hmcts.testing", "def f():\n    import matplotlib.pyplot as plt"),
+        ("torchrl_hmcts.planners.tree", "def f():\n    import networkx"),
+        ("torchrl_hmcts.planners.drawing", "from matplotlib import pyplot"),
+        ("torchrl_hmcts.planners.drawing", "if True:\n    import matplotlib"),
+        ("torchrl_hmcts.planners.drawing", "class A:\n    import matplotlib"),
+        ("torchrl_hmcts.planners.drawing", "def f():\n    import networkx"),
+        ("torchrl_hmcts.planners.export", "import networkx"),
+        ("torchrl_hmcts.planners.export", "def f():\n    import matplotlib"),
         ("torchrl_hmcts.envs.mazes", "import torchrl_hmcts"),
         ("torchrl_hmcts.envs.mazes", "from torchrl_hmcts.planners import MCTSPlanner"),
         ("torchrl_hmcts.envs.mazes", "from torchrl_hmcts import planners"),
@@ -172,6 +208,8 @@ def test_the_check_catches_a_violation(module: str, source: str) -> None:
         ),
         ("torchrl_hmcts.planners.mcts", "from .tree import SearchTree\nfrom ..modules import x"),
         ("torchrl_hmcts.planners.mcts", "from torchrl_hmcts import planners"),
+        ("torchrl_hmcts.planners.drawing", "def f():\n    from matplotlib import pyplot"),
+        ("torchrl_hmcts.planners.export", "def f():\n    import networkx"),
         ("torchrl_hmcts.envs.mazes", "import pymunk\nfrom torchrl_hmcts.envs import mazes"),
         ("torchrl_hmcts.envs.mazes", "from . import rendering"),
         ("torchrl_hmcts.trainers.demo", "from torchrl_hmcts import envs, planners"),
@@ -210,7 +248,7 @@ def test_importing_the_components_loads_nothing_heavy_beyond_torchrl(tmp_path: P
     )
     heavy = {
         *("numba", "llvmlite", "pymunk", "gymnasium", "ale_py", "matplotlib", "imageio", "PIL"),
-        *("hydra", "omegaconf", "tensorboard", "tqdm"),
+        *("hydra", "omegaconf", "tensorboard", "tqdm", "networkx"),
     }
     assert not (heavy & loaded) - baseline
     assert not {name for name in loaded if layer(name) in ("envs", "trainers")}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import subprocess
 import sys
@@ -21,17 +20,24 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     BestPlan,
+    DirichletNoise,
+    Gumbel,
     HierarchicalPolicy,
     HighestValue,
     MaxBackup,
     MCTSPlanner,
     MostVisited,
+    NodeStatistics,
     RadiusNovelty,
+    RolloutEvaluator,
+    SampledVisits,
     Search,
     SearchBudget,
     SearchProgress,
     SearchTree,
+    extract_plans,
 )
+from torchrl_hmcts.planners.tree import FORBIDDEN, PENDING
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -92,6 +98,11 @@ def trees(search: Search) -> list[tuple[bytes, bytes, list[int]]]:
         )
         for b, n in enumerate(tree.num_nodes)
     ]
+
+
+def assert_nothing_in_flight(tree: SearchTree) -> None:
+    assert not tree.edges["in_flight"].any()
+    assert not (tree.nodes["flags"] & PENDING).any()
 
 
 # ---------------------------------------------------------------------- batches
@@ -317,8 +328,7 @@ def test_several_leaves_per_wave_find_the_same_exhausted_tree(expand: Any) -> No
     one = MCTSPlanner(env, **kwargs).search(env.reset()).tree
     many = MCTSPlanner(env, leaves_per_wave=5, **kwargs).search(env.reset()).tree
     for tree in (one, many):
-        assert not tree.nodes["in_flight"].any()
-        assert not tree.edges["in_flight"].any()
+        assert_nothing_in_flight(tree)
         assert tree.states is not None
         assert sorted(tree.states["state"][0, :15].tolist()) == list(range(15))
     assert one.nodes["value"][0, 0] == many.nodes["value"][0, 0]
@@ -349,7 +359,7 @@ def test_growing_by_doubling_loses_nothing(expand: Any, monkeypatch: pytest.Monk
     grown = planner.search(td)
     assert grown.tree.capacity > 64
     with monkeypatch.context() as patch:
-        roomy = functools.partial(SearchTree, capacity=4096)
+        roomy = lambda roots, options, **kwargs: SearchTree(roots, options, capacity=4096)  # noqa: E731
         patch.setattr("torchrl_hmcts.planners.search.SearchTree", roomy)
         large = planner.search(td)
     assert large.tree.capacity == 4096
@@ -386,7 +396,9 @@ def test_a_simulator_that_raises_in_the_middle_leaves_the_planner_usable() -> No
     with pytest.raises(RuntimeError, match="the physics exploded"):
         planner(td)
     assert "action" not in td.keys()
-    assert planner.last_search is None
+    assert planner.last_search is not None
+    assert planner.last_search.tree.num_nodes[0] > 1
+    assert_nothing_in_flight(planner.last_search.tree)
     env.steps_left = 10_000
     healthy = MCTSPlanner(
         TableEnv(BINARY_TREE, terminal=LEAVES),
@@ -455,7 +467,7 @@ def test_improving_finds_the_better_plan() -> None:
     assert plan.returns.item() == pytest.approx(0.81 * 5.0)
 
 
-@pytest.mark.parametrize("name", ["expansions", "base_steps", "seconds"])
+@pytest.mark.parametrize("name", ["expansions", "simulations", "base_steps", "seconds", "nodes"])
 @pytest.mark.parametrize("value", [0, -1])
 def test_a_budget_of_nothing_is_refused_with_its_value(name: str, value: int) -> None:
     with pytest.raises(ValueError, match=f"{name} > 0.*no plan; got {value}"):
@@ -479,6 +491,376 @@ def test_a_progress_display_is_told_of_every_wave() -> None:
     assert seen[-1].base_steps == 16
     seconds = [p.seconds for p in seen]
     assert seconds == sorted(seconds)
+
+
+# ---------------------------------------------------------------------- simulations and nodes
+
+
+# A ring of 50 states with three options each, none of which ends: no tree is ever exhausted.
+RING = {
+    (s, a): ((s * (a + 2) + a + 1) % 50, 0.01 * ((7 * s + 3 * a) % 11) - 0.05, 1 + (s + a) % 3)
+    for s in range(50)
+    for a in range(3)
+}
+
+
+def simulations(n: int) -> SearchBudget:
+    return SearchBudget(simulations=n, until_plan=False)
+
+
+@pytest.mark.parametrize("leaves_per_wave", [1, 2, 7, 255])
+@pytest.mark.parametrize("n", [1, 13, 40])
+def test_a_budget_of_simulations_is_spent_exactly(leaves_per_wave: int, n: int) -> None:
+    env = CountingEnv(RING)
+    planner = MCTSPlanner(env, expand="one", leaves_per_wave=leaves_per_wave, budget=simulations(n))
+    td = planner(at(env, [0, 5]))
+    assert td["num_simulations"].flatten().tolist() == [n, n]
+    assert td["root_visits"].sum(-1).tolist() == [n, n]
+    assert sum(map(len, env.calls)) == 2 * n
+    # All options of a leaf are simulated together: up to two more of the three.
+    env = CountingEnv(RING)
+    planner = MCTSPlanner(env, leaves_per_wave=leaves_per_wave, budget=simulations(n))
+    assert planner(env.reset())["num_simulations"].item() == 3 * -(-n // 3)
+
+
+def test_revisits_are_simulations_that_cost_no_simulator_call() -> None:
+    env = CountingEnv(BINARY_TREE, terminal=LEAVES)
+    policy = UCT(20.0)  # explores all 14 options of the tree
+    planner = MCTSPlanner(
+        env, tree_policy=policy, expand="one", exhausted="revisit", budget=simulations(100)
+    )
+    td = planner(env.reset())
+    assert td["num_simulations"].item() == 100
+    assert td["num_simulated_steps"].item() == sum(map(len, env.calls)) == 14
+    assert td["root_visits"].sum().item() == 100
+    assert planner.last_search is not None
+    assert planner.last_search.statistics()["revisits"] == 86
+
+
+def test_the_search_stops_when_its_nodes_are_used_up() -> None:
+    env = TableEnv(RING)
+    for leaves, most in ((1, 27), (4, 36)):  # 3 new nodes a leaf; the wave that crosses 25
+        budget = SearchBudget(nodes=25, until_plan=False)
+        planner = MCTSPlanner(env, leaves_per_wave=leaves, budget=budget)
+        used = planner.search(env.reset()).tree.num_nodes[0]
+        assert 25 <= used <= most
+
+
+def test_simulations_end_with_the_first_limit_that_is_reached() -> None:
+    env = TableEnv(RING)
+    budget = SearchBudget(simulations=1000, expansions=4, until_plan=False)
+    assert MCTSPlanner(env, budget=budget)(env.reset())["num_expansions"].item() == 4
+    budget = SearchBudget(simulations=9, expansions=1000, until_plan=False)
+    assert MCTSPlanner(env, budget=budget)(env.reset())["num_expansions"].item() == 3
+
+
+# ---------------------------------------------------------------------- interruptions
+
+
+@pytest.mark.parametrize("expand", ["one", "all"])
+@pytest.mark.parametrize("leaves_per_wave", [1, 2])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_the_best_plan_so_far_survives_an_interruption_and_the_search_goes_on(
+    error: type[BaseException], leaves_per_wave: int, expand: Any
+) -> None:
+    class Interrupted(CountingEnv):
+        interrupt = False
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            if self.interrupt:
+                raise error("stop")
+            return super()._step(tensordict)
+
+    env = Interrupted(BINARY_TREE, terminal=LEAVES)
+    best: list[float] = []
+
+    def watch(progress: SearchProgress) -> None:
+        plans = extract_plans(progress.search)
+        assert plans.found.item() == (progress.num_found == 1)
+        best.append(plans.returns.item())
+        env.interrupt = plans.found.item()
+
+    planner = MCTSPlanner(
+        env,
+        gamma=1.0,
+        expand=expand,
+        leaves_per_wave=leaves_per_wave,
+        budget=FOREVER,
+        progress=watch,
+    )
+    with pytest.raises(error, match="stop"):
+        planner(env.reset())
+    search = planner.last_search
+    assert search is not None
+    assert best == sorted(best)
+    plan = extract_plans(search)
+    assert plan.found.item()
+    assert plan.returns.item() == best[-1] > 0.0
+    assert plan.lengths.item() == 3
+    assert_nothing_in_flight(search.tree)
+    # Each transition pays once in a healthy search, so the rest is simulated now, and no more.
+    env.interrupt = False
+    planner.progress = None
+    assert planner.resume(search) is search
+    assert sorted(pair for call in env.calls for pair in call) == sorted(BINARY_TREE)
+    assert extract_plans(search).returns.item() == 4.0
+    assert search.exhausted(np.array([0])).all()
+    assert_nothing_in_flight(search.tree)
+
+
+@pytest.mark.parametrize("expand", ["one", "all"])
+def test_a_tree_policy_that_raises_leaves_nothing_in_flight(expand: Any) -> None:
+    calls = 0
+
+    def policy(statistics: NodeStatistics) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        if calls == 6:  # in the middle of a wave
+            raise RuntimeError("no idea")
+        return -statistics.option_visits
+
+    env = TableEnv(RING)
+    planner = MCTSPlanner(
+        env, tree_policy=policy, leaves_per_wave=4, expand=expand, budget=simulations(60)
+    )
+    with pytest.raises(RuntimeError, match="no idea"):
+        planner(env.reset())
+    search = planner.last_search
+    assert search is not None
+    assert_nothing_in_flight(search.tree)
+    assert planner.resume(search).num_simulations.tolist() == [60]
+
+
+def test_an_interrupted_gumbel_search_goes_on_with_its_schedule() -> None:
+    class Interrupted(TableEnv):
+        steps_left = 11
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            if self.steps_left == 0:
+                raise KeyboardInterrupt
+            self.steps_left -= 1
+            return super()._step(tensordict)
+
+    env = Interrupted(RING)
+    planner = MCTSPlanner(env, tree_policy=Gumbel(), expand="one", budget=simulations(30), seed=3)
+    with pytest.raises(KeyboardInterrupt):
+        planner.search(env.reset(), seed=8)
+    search = planner.last_search
+    assert search is not None
+    assert search.num_simulations.tolist() == [11]
+    env.steps_left = 1000
+    planner.resume(search)
+    assert trees(search) == trees(planner.search(env.reset(), seed=8))
+    finished = trees(search)
+    assert trees(planner.resume(search)) == finished  # a schedule ends once
+
+
+def test_resuming_grants_a_fresh_budget() -> None:
+    env = TableEnv(RING)
+    planner = MCTSPlanner(env, expand="one", budget=simulations(20))
+    search = planner.search(env.reset())
+    planner.resume(search)
+    assert search.num_simulations.tolist() == [20]
+    assert search.tree.num_nodes.tolist() == [41]
+    planner.budget = simulations(40)
+    assert trees(planner.search(env.reset())) == trees(search)
+
+
+# ---------------------------------------------------------------------- random numbers
+
+
+def skewed(td: TensorDictBase) -> torch.Tensor:
+    return torch.tensor([0.2, 0.3, 0.5]).expand(len(td), 3)
+
+
+def root_priors(seed: int, num_roots: int = 1, **kwargs: Any) -> np.ndarray:
+    env = TableEnv(RING)
+    planner = MCTSPlanner(env, option_prior=skewed, budget=simulations(3), **kwargs)
+    search = planner.search(at(env, [0] * num_roots), seed=seed)
+    below = search.tree.edges["prior"][0, 1]
+    np.testing.assert_allclose(below, [0.2, 0.3, 0.5])  # noise is the root's alone
+    priors: np.ndarray = search.tree.edges["prior"][:, 0]
+    return priors
+
+
+def test_root_noise_is_mixed_into_the_prior_in_its_fraction() -> None:
+    given = np.array([0.2, 0.3, 0.5])
+    none = root_priors(0, root_noise=DirichletNoise(fraction=0.0))
+    np.testing.assert_allclose(none[0], given, rtol=1e-6)
+    half = root_priors(0, root_noise=DirichletNoise(fraction=0.5))[0]
+    full = root_priors(0, root_noise=DirichletNoise(fraction=1.0))[0]
+    np.testing.assert_allclose(half, 0.5 * given + 0.5 * full, rtol=1e-5)
+    assert full.sum() == pytest.approx(1.0)
+    assert not np.allclose(full, given, atol=0.01)
+
+
+def test_root_noise_has_the_moments_of_its_dirichlet_distribution() -> None:
+    # Dir(2, 2, 2): mean 1/3, variance (1/3)(2/3) / (6 + 1) = 0.0317; 600 roots.
+    noise = root_priors(7, 600, root_noise=DirichletNoise(alpha=2.0, fraction=1.0))
+    np.testing.assert_allclose(noise.mean(0), 1 / 3, atol=0.03)
+    np.testing.assert_allclose(noise.var(0), 0.0317, atol=0.006)
+    assert len(np.unique(noise[:, 0])) == 600
+
+
+def test_root_noise_depends_on_the_seed_of_its_root_alone() -> None:
+    noise = DirichletNoise()
+    together = root_priors(40, 5, root_noise=noise)
+    np.testing.assert_array_equal(together, root_priors(40, 5, root_noise=noise))
+    for b in range(5):
+        np.testing.assert_array_equal(together[b], root_priors(40 + b, root_noise=noise)[0])
+
+
+def test_root_noise_leaves_masked_options_at_zero() -> None:
+    table = {(0, 0): (1, 0.0, 1), (0, 2): (1, 0.0, 1), (1, 1): (0, 0.0, 1)}
+    env = TableEnv(table)
+    for fraction in (0.0, 0.25, 1.0):
+        planner = MCTSPlanner(
+            env,
+            option_prior=skewed,
+            root_noise=DirichletNoise(fraction=fraction),
+            budget=simulations(5),
+        )
+        edges = planner.search(env.reset()).tree.edges[0, 0]
+        assert edges["closed"].tolist()[1] == FORBIDDEN
+        assert edges["prior"][1] == 0.0
+        assert edges["prior"].sum() == pytest.approx(1.0)
+        if fraction == 0.0:  # 0.2 and 0.5, scaled to 1
+            np.testing.assert_allclose(edges["prior"], [2 / 7, 0, 5 / 7], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: DirichletNoise(alpha=0.0), "alpha > 0; got 0.0"),
+        (lambda: DirichletNoise(alpha=float("inf")), "alpha > 0; got inf"),
+        (lambda: DirichletNoise(fraction=1.1), r"fraction in \[0, 1\]; got 1.1"),
+        (lambda: SampledVisits(temperature=0.0), r"temperature > 0; got 0.0.*MostVisited\(\)"),
+        (lambda: SampledVisits(temperature=float("nan")), "temperature > 0; got nan"),
+    ],
+)
+def test_noise_and_temperature_out_of_range_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_gumbel_noise_draws_the_first_option_from_the_prior() -> None:
+    # The largest ln P + g is a sample of P; 3000 roots, standard errors below 0.01.
+    env = TableEnv(RING)
+    planner = MCTSPlanner(
+        env, tree_policy=Gumbel(), option_prior=skewed, expand="one", budget=simulations(1)
+    )
+    search = planner.search(at(env, [0] * 3000), seed=0)
+    first = search.tree.nodes["option"][:, 1]
+    np.testing.assert_allclose(np.bincount(first) / 3000, [0.2, 0.3, 0.5], atol=0.03)
+    np.testing.assert_array_equal(planner.choose(search), first)
+
+
+@pytest.mark.parametrize(("temperature", "power"), [(1.0, 1.0), (0.5, 2.0), (2.0, 0.5)])
+def test_sampled_visits_follow_the_visits_to_the_power_of_one_over_t(
+    temperature: float, power: float
+) -> None:
+    env = TableEnv(RING)
+    planner = MCTSPlanner(env, tree_policy=UCT(0.03), expand="one", budget=simulations(60))
+    search = planner.search(at(env, [0] * 3000), seed=5)
+    visits = search.tree.edges["visits"][0, 0].astype(float)
+    assert (search.tree.edges["visits"][:, 0] == visits).all()
+    assert visits.max() > 1.5 * visits.min()  # otherwise every power looks the same
+    chosen = SampledVisits(temperature=temperature).choose(search)
+    expected = visits**power / (visits**power).sum()
+    np.testing.assert_allclose(np.bincount(chosen, minlength=3) / 3000, expected, atol=0.035)
+    np.testing.assert_array_equal(SampledVisits(temperature=temperature).choose(search), chosen)
+
+
+def test_sampled_visits_of_a_low_temperature_are_the_most_visited_option() -> None:
+    env = TableEnv(RING)
+    planner = MCTSPlanner(env, tree_policy=UCT(0.03), expand="one", budget=simulations(61))
+    search = planner.search(at(env, list(range(50))), seed=5)
+    visits = np.sort(search.tree.edges["visits"][:, 0], -1)
+    clear = visits[:, -1] > visits[:, -2]
+    assert clear.sum() > 20
+    for temperature in (1e-2, 1e-4, 1e-300):
+        sampled = SampledVisits(temperature=temperature).choose(search)
+        np.testing.assert_array_equal(sampled[clear], MostVisited().choose(search)[clear])
+
+
+def test_sampled_visits_never_take_a_masked_option() -> None:
+    env = TableEnv({(0, 0): (1, 0.0, 1), (0, 2): (1, 0.0, 1), (1, 1): (0, 0.0, 1)})
+    planner = MCTSPlanner(env, final_choice=SampledVisits(100.0), budget=simulations(20))
+    assert set(planner(at(env, [0] * 100))["action"].tolist()) == {0, 2}
+
+
+def rollouts() -> RolloutEvaluator:
+    return RolloutEvaluator(max_options=3)
+
+
+RANDOM: dict[str, dict[str, Any]] = {
+    "noise": {"root_noise": DirichletNoise(), "tree_policy": PUCT(0.1)},
+    "gumbel": {"tree_policy": Gumbel(max_considered=2), "expand": "one"},
+    "rollouts": {"leaf_evaluator": rollouts, "leaves_per_wave": 3},
+    "sampled": {"final_choice": SampledVisits()},
+}
+
+
+def random_planner(name: str, **kwargs: Any) -> tuple[TableEnv, MCTSPlanner]:
+    kwargs = {**RANDOM[name], **kwargs}
+    if "leaf_evaluator" in kwargs:
+        kwargs["leaf_evaluator"] = kwargs["leaf_evaluator"]()
+    env = TableEnv(RING)
+    return env, MCTSPlanner(env, budget=simulations(30), **kwargs)
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_a_seed_gives_one_tree_whatever_is_searched_beside_it(name: str) -> None:
+    env, planner = random_planner(name)
+    states = [0, 9, 9, 31, 9, 9]
+    together = planner.search(at(env, states), seed=100)
+    chosen = planner.choose(together)
+    again = planner.search(at(env, states), seed=100)
+    assert trees(together) == trees(again)
+    np.testing.assert_array_equal(planner.choose(again), chosen)
+    for b, state in enumerate(states):
+        alone = planner.search(at(env, [state]), seed=100 + b)
+        assert trees(alone)[0] == trees(together)[b]
+        assert planner.choose(alone)[0] == chosen[b]
+    if name != "sampled":  # roots 1, 2, 4 and 5 are the same state under different seeds
+        assert any(trees(together)[1] != trees(together)[b] for b in (2, 4, 5))
+
+
+@pytest.mark.parametrize("name", ["noise", "gumbel", "rollouts"])
+def test_a_planner_with_a_seed_repeats_as_a_whole_but_not_from_call_to_call(name: str) -> None:
+    runs = []
+    for _ in range(2):
+        env, planner = random_planner(name, seed=11)
+        runs.append([trees(planner.search(at(env, 0))) for _ in range(6)])
+    assert runs[0] == runs[1]
+    assert any(run != runs[0][0] for run in runs[0])
+    env, other = random_planner(name, seed=12)
+    assert [trees(other.search(at(env, 0))) for _ in range(6)] != runs[0]
+
+
+def test_without_a_seed_torch_decides() -> None:
+    runs = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        env, planner = random_planner("noise")
+        runs.append([trees(planner.search(at(env, 0))) for _ in range(2)])
+    assert runs[0] == runs[1] != runs[2]
+    assert runs[0][0] != runs[0][1]
+
+
+def test_leaves_per_wave_go_up_to_255() -> None:
+    env = CountingEnv(RING)
+    planner = MCTSPlanner(env, expand="one", leaves_per_wave=255, budget=simulations(2000))
+    search = planner.search(env.reset())
+    assert search.num_simulations.tolist() == [2000]
+    assert max(map(len, env.calls)) > 40
+    assert_nothing_in_flight(search.tree)
+    # One option only: all descents of a wave share the edges on the way, and only one fits.
+    env = CountingEnv({(0, 0): (0, 0.1, 1)})
+    planner = MCTSPlanner(env, expand="one", leaves_per_wave=255, budget=simulations(50))
+    tree = planner.search(env.reset()).tree
+    assert tree.num_nodes.tolist() == [51]
+    assert_nothing_in_flight(tree)
 
 
 # ---------------------------------------------------------------------- final choices
@@ -627,7 +1009,9 @@ def test_a_continuous_action_is_refused_with_two_ways_out() -> None:
         ({"gamma": 0.0}, r"gamma in \(0, 1\]; got 0.0"),
         ({"gamma": 1.01}, r"gamma in \(0, 1\]; got 1.01"),
         ({"gamma": float("nan")}, r"gamma in \(0, 1\]; got nan"),
-        ({"leaves_per_wave": 0}, "leaves_per_wave >= 1; got 0"),
+        ({"leaves_per_wave": 0}, "leaves_per_wave from 1 to 255; got 0"),
+        ({"leaves_per_wave": 256}, "leaves_per_wave from 1 to 255; got 256"),
+        ({"exhausted": "stop"}, "'skip' or 'revisit'; got 'stop'"),
         ({"expand": "some"}, "'all' or 'one'; got 'some'"),
     ],
 )
@@ -743,73 +1127,6 @@ def test_elements_that_a_rollout_no_longer_steps_are_not_planned_for() -> None:
     assert rollout["next", "done"][:, -1].all()
     # Calls alternate: one of the search, one of the rollout itself.
     assert [len(call) for call in env.calls] == [3, 3, 2, 2] + [1, 1] * 4
-
-
-class CountingPlanner(MCTSPlanner):
-    """A planner that records the states it is asked to search from."""
-
-    def search(self, td: TensorDictBase) -> Search:
-        self.__dict__.setdefault("asked", []).append(td["state"].flatten().tolist())
-        return super().search(td)
-
-
-def test_the_hierarchical_policy_plans_once_and_follows_its_plan() -> None:
-    env = ChainEnv(6)
-    planner = CountingPlanner(env)
-    rollout = env.rollout(20, policy=HierarchicalPolicy(planner))
-    assert planner.asked == [[0]]
-    assert rollout["action"].tolist() == [1] * 5
-    assert rollout["plan_step"].flatten().tolist() == [1, 2, 3, 4, 5]
-    assert rollout["plan_length"].flatten().tolist() == [5] * 5
-
-
-def test_the_hierarchical_policy_plans_again_at_the_end_of_its_plan() -> None:
-    env = ChainEnv(6)
-    planner = CountingPlanner(env)
-    rollout = env.rollout(20, policy=HierarchicalPolicy(planner, max_plan_length=2))
-    assert planner.asked == [[0], [2], [4]]
-    assert rollout["next", "reward"].sum().item() == 1.0
-
-
-def test_the_hierarchical_policy_takes_the_planners_choice_where_it_finds_no_plan() -> None:
-    env = ChainEnv(30)
-    planner = CountingPlanner(env, budget=SearchBudget(expansions=2))
-    rollout = env.rollout(4, policy=HierarchicalPolicy(planner))
-    assert len(planner.asked) == 4
-    assert rollout["plan_length"].flatten().tolist() == [1] * 4
-
-
-def test_each_element_of_a_batch_plans_at_its_own_time() -> None:
-    env = ChainEnv(6)
-    planner = CountingPlanner(env)
-    td = env.reset(TensorDict({"state": torch.tensor([0, 3, 4])}, [3]), set_state=True)
-    rollout = env.rollout(
-        20,
-        policy=HierarchicalPolicy(planner, max_plan_length=2),
-        tensordict=td,
-        auto_reset=False,
-        break_when_all_done=True,
-    )
-    # Plans of 5, 2 and 1 options, cut to 2: only the first element ever plans again.
-    assert planner.asked == [[0, 3, 4], [2], [4]]
-    assert rollout["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 4, 5]
-
-
-def test_a_new_episode_is_planned_for_although_the_old_plan_is_not_at_its_end() -> None:
-    env = ChainEnv(6)
-    planner = CountingPlanner(env)
-    policy = HierarchicalPolicy(planner)
-    td = policy(at(env, 1))
-    assert td["plan_step"].item() == 1
-    td.update(at(env, 0)).set("is_init", torch.ones(1, dtype=torch.bool))
-    td = policy(td)
-    assert planner.asked == [[1], [0]]
-    assert (td["plan_length"].item(), td["plan_step"].item()) == (5, 1)
-
-
-def test_a_plan_needs_room_for_one_option() -> None:
-    with pytest.raises(ValueError, match="max_plan_length >= 1; got 0"):
-        HierarchicalPolicy(MCTSPlanner(ChainEnv(3)), max_plan_length=0)
 
 
 # ---------------------------------------------------------------------- without the compiler

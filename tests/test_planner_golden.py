@@ -98,27 +98,28 @@ def test_uct_with_mean_backup_grows_the_tree_worked_out_by_hand(simulations: int
     check_nodes(search, *UCT_ONE_MEAN[simulations - 1])
 
 
-def test_edges_hold_their_own_rewards_discounts_and_values() -> None:
+def test_nodes_hold_the_reward_and_discount_of_their_option_and_edges_its_value() -> None:
     view = search_for(7, tree_policy=UCT(c=1.0), expand="one").tree.view()
     assert view.num_nodes.tolist() == [8]
     # root, node 1 (state 1), 2 (state 2), 3 (end), 4 (state 4), 5 (end), 6 (state 0), 7 (state 1)
     assert view.children[0, :8].tolist() == [
         [1, 2], [3, 4], [-1, -1], [-1, -1], [5, 6], [-1, -1], [7, -1], [-1, -1],
     ]  # fmt: skip
-    assert view.children_visits[0, :7].tolist() == [
-        [6, 1], [1, 4], [0, 0], [0, 0], [1, 2], [0, 0], [1, 0],
+    assert view.children_visits[0, :8].tolist() == [
+        [6, 1], [1, 4], [0, 0], [0, 0], [1, 2], [0, 0], [1, 0], [0, 0],
     ]  # fmt: skip
-    assert view.children_rewards[0, :7].tolist() == [
-        [2, 1], [4, 0], [0, 0], [0, 0], [8, 0], [0, 0], [2, 0],
+    assert view.rewards[0, :8].tolist() == [0, 2, 1, 4, 0, 8, 0, 2]
+    assert view.discounts[0, :8].tolist() == [1, 1 / 8, 1 / 2, 0, 1 / 4, 0, 1 / 2, 1 / 8]
+    # Q = R + D V with the values of simulation 7 above; 0 where nothing was tried
+    expected = [
+        [2 + F(25, 24) / 8, 1], [4, F(9, 4) / 4], [0, 0], [0, 0],
+        [8, F(1, 2)], [0, 0], [2, 0], [0, 0],
     ]  # fmt: skip
-    assert view.children_discounts[0, :7].tolist() == [
-        [1 / 8, 1 / 2], [0, 1 / 4], [0, 0], [0, 0], [0, 1 / 2], [0, 0], [1 / 8, 0],
-    ]  # fmt: skip
-    # an edge's value is that of the node it leads to
-    torch.testing.assert_close(view.children_values[0, 0], torch.tensor([25 / 24, 0.0]))
-    torch.testing.assert_close(view.children_values[0, 1], torch.tensor([0.0, 9 / 4]))
-    q = view.children_rewards + view.children_discounts * view.children_values
-    torch.testing.assert_close(q[0, 0], torch.tensor([2 + 25 / 192, 1.0]))
+    torch.testing.assert_close(
+        view.children_values[0, :8], torch.tensor([[float(q) for q in row] for row in expected])
+    )
+    assert (view.siblings[0, :8] == -1).all()
+    assert (view.samples[0, :8] == 1).all()
     assert view.parents[0, :8].tolist() == [-1, 0, 0, 1, 1, 4, 4, 6]
     assert view.parent_options[0, :8].tolist() == [-1, 0, 1, 0, 1, 0, 1, 0]
     assert view.depths[0, :8].tolist() == [0, 1, 1, 2, 2, 3, 3, 4]
@@ -221,10 +222,8 @@ def test_without_discounting_a_terminal_state_still_ends_the_return() -> None:
     # terminal option of node 1); 2 + 0; 2 + 0 + 8. In node 1: 4; 0; 0 + 8. In node 4: 8.
     search = search_for(5, tree_policy=UCT(c=1.0), expand="one", gamma=1.0)
     check_nodes(search, [6, 4, 1, 1, 2, 1], [F(21, 6), 3, 0, 0, 4, 0])
-    edges = search.tree.edges[0]
-    assert edges["discount"][0].tolist() == [1, 1]
-    assert edges["discount"][1].tolist() == [0, 1]
-    assert edges["discount"][4].tolist() == [0, 0]
+    # nodes 3 and 5 are the terminal state; 1, 2 and 4 go on
+    assert nodes_of(search)["discount"].tolist() == [1, 1, 1, 0, 1, 0]
 
 
 def test_the_leaf_evaluator_counts_at_live_states_and_not_at_terminal_ones() -> None:

@@ -1,4 +1,4 @@
-"""The README's code runs as it stands, in one session from top to bottom."""
+"""The code of README and docs runs as it stands, each page in one session from top to bottom."""
 
 from __future__ import annotations
 
@@ -20,3 +20,14 @@ def test_every_python_block_of_the_readme_runs(capsys):
 def test_pictures_and_links_of_the_readme_exist():
     for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", README.read_text()):
         assert (README.parent / target).exists(), f"README links to {target}, which does not exist"
+
+
+def test_every_python_block_of_the_page_on_planning_runs(capsys):
+    page = README.parent / "docs" / "planning.md"
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    assert len(blocks) >= 8
+    namespace: dict = {}
+    for block in blocks:
+        exec(compile(block, str(page), "exec"), namespace)  # noqa: S102
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text()):
+        assert (page.parent / target).exists(), f"{page.name} links to {target}, which is missing"

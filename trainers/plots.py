@@ -9,26 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.planners import Search
-from torchrl_hmcts.planners.tree import PRUNED
+from torchrl_hmcts.planners.drawing import OPTION_COLORS, option_color
 
-_OPTION_COLORS = (
-    (230, 97, 0),
-    (93, 58, 155),
-    (0, 121, 140),
-    (212, 17, 89),
-    (140, 110, 0),
-    (90, 90, 90),
-    (26, 133, 255),
-    (64, 176, 60),
-)
 _DPI = 110
+_MAX_NODES = 600  # of a tree in a picture
 
 
 def option_rgb(option: int) -> tuple[int, int, int]:
@@ -38,12 +28,7 @@ def option_rgb(option: int) -> tuple[int, int, int]:
         >>> option_rgb(0)
         (230, 97, 0)
     """
-    return _OPTION_COLORS[option % len(_OPTION_COLORS)]
-
-
-def _color(option: int) -> tuple[float, float, float]:
-    red, green, blue = option_rgb(option)
-    return red / 255, green / 255, blue / 255
+    return OPTION_COLORS[option % len(OPTION_COLORS)]
 
 
 def plot_losses(history: Mapping[str, Sequence[float]], base_steps: int, path: Path) -> None:
@@ -151,10 +136,10 @@ def plot_skill_fan(
             points.append(td["position"])
         lines = torch.stack(points, 1).numpy()
         for skill, line in zip(skills.tolist(), lines, strict=True):
-            axes.plot(*line.T, color=_color(skill), linewidth=1.3, alpha=0.7)
+            axes.plot(*line.T, color=option_color(skill), linewidth=1.3, alpha=0.7)
         axes.plot(*start.tolist(), "o", color="black", markersize=6)
         axes.set_title(title, fontsize=10, loc="left")
-    handles = [Line2D([], [], color=_color(z), label=f"skill {z}") for z in range(num_skills)]
+    handles = [Line2D([], [], color=option_color(z), label=f"skill {z}") for z in range(num_skills)]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(8, num_skills))
     figure.savefig(path, dpi=_DPI)
 
@@ -173,81 +158,22 @@ def plot_search(search: Search, env: WaterworldMazeEnv, path: Path, *, root: int
     """
     tree = search.tree
     assert tree.states is not None
-    count = int(tree.num_nodes[root])
-    nodes = tree.nodes[root, :count]
-    position = tree.states["position"][root, :count].numpy()
-    best = int(search.best_node[root])
-    plan = tree.path(root, best) if best >= 0 else [0]
+    names = [f"skill {option}" for option in range(tree.num_options)]
     figure = Figure(figsize=(12.0, 5.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.15))
-
     _draw_walls(left, env.mazes[int(tree.states["maze_index"][root, 0])])
-    _draw_edges(left, nodes, position, plan)
-    left.plot(*position[0], "o", color="#2563eb", markersize=11)
+    tree.plot_positions(root, ax=left, option_names=names, legend=False)
     left.plot(*tree.states["target"][root, 0].tolist(), "o", color="#16a34a", markersize=11)
     left.set_title("where the options led", fontsize=10, loc="left")
-
-    layout = _layered_layout(nodes)
-    _draw_edges(right, nodes, layout, plan)
-    right.plot(*layout[0], "o", color="#2563eb", markersize=8)
-    if best >= 0:
-        right.plot(*layout[best], "o", color="#16a34a", markersize=8)
-    right.invert_yaxis()
-    right.yaxis.set_major_locator(MaxNLocator(integer=True))
-    right.set_xticks([])
-    right.set_ylabel("options from the root")
-    right.spines[["top", "right", "bottom"]].set_visible(False)
-    right.set_title(
-        f"the tree: {count:,} nodes, {int(search.num_expansions[root])} expanded",
-        fontsize=10,
-        loc="left",
+    tree.plot(root, ax=right, max_nodes=_MAX_NODES, option_names=names)
+    legend = right.get_legend()  # one for both
+    legend.remove()
+    figure.legend(
+        legend.legend_handles,
+        [text.get_text() for text in legend.get_texts()],
+        loc="outside lower center",
+        ncols=6,
+        fontsize=9,
+        frameon=False,
     )
-    handles = [Line2D([], [], color=_color(o), label=f"skill {o}") for o in range(tree.num_options)]
-    handles.append(Line2D([], [], color="#c4c4c4", label="refused: not new"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(9, len(handles)))
     figure.savefig(path, dpi=_DPI)
-
-
-def _draw_edges(axes: Axes, nodes: np.ndarray, points: np.ndarray, plan: list[int]) -> None:
-    pruned = (nodes["flags"] & PRUNED) != 0
-    on_plan = np.zeros(len(nodes), bool)
-    on_plan[plan] = True
-    children = np.arange(1, len(nodes))
-    for chosen, width, alpha, order in (
-        (pruned[1:], 0.7, 0.7, 2),
-        (~pruned[1:] & ~on_plan[1:], 1.1, 0.85, 3),
-        (on_plan[1:], 3.6, 1.0, 4),
-    ):
-        ids = children[chosen]
-        if not len(ids):
-            continue
-        segments = np.stack((points[nodes["parent"][ids]], points[ids]), 1)
-        colors = [(0.77, 0.77, 0.77) if pruned[i] else _color(int(nodes["option"][i])) for i in ids]
-        axes.add_collection(
-            LineCollection(
-                list(segments), colors=colors, linewidths=width, alpha=alpha, zorder=order
-            )
-        )
-    axes.autoscale_view()
-
-
-def _layered_layout(nodes: np.ndarray) -> np.ndarray:
-    """Place each node at its depth, over the middle of its leaves, which stand side by side."""
-    count = len(nodes)
-    children: list[list[int]] = [[] for _ in range(count)]
-    for node in range(1, count):
-        children[nodes["parent"][node]].append(node)
-    across = np.zeros(count)
-    leaves = 0
-    stack: list[tuple[int, bool]] = [(0, False)]
-    while stack:
-        node, seen = stack.pop()
-        if not children[node]:
-            across[node] = leaves
-            leaves += 1
-        elif seen:
-            across[node] = np.mean(across[children[node]])
-        else:
-            stack.append((node, True))
-            stack.extend((child, False) for child in reversed(children[node]))
-    return np.stack((across, nodes["depth"].astype(float)), 1)

@@ -1,32 +1,59 @@
 """The manager: Monte Carlo tree search over the options of a macro environment."""
 
+from torchrl_hmcts.planners.array_search import Root, Transition, tree_search
 from torchrl_hmcts.planners.backups import MaxBackup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
-from torchrl_hmcts.planners.choices import BestPlan, HighestValue, MostVisited
+from torchrl_hmcts.planners.chance import ProgressiveWidening
+from torchrl_hmcts.planners.choices import BestPlan, HighestValue, MostVisited, SampledVisits
 from torchrl_hmcts.planners.control import HierarchicalPolicy
+from torchrl_hmcts.planners.evaluators import (
+    MixedEvaluator,
+    ModulePrior,
+    RolloutEvaluator,
+    ValueEvaluator,
+)
 from torchrl_hmcts.planners.mcts import MCTSPlanner, SearchProgress
-from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty
-from torchrl_hmcts.planners.plan import Plan
+from torchrl_hmcts.planners.noise import DirichletNoise
+from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty
+from torchrl_hmcts.planners.plan import Plan, extract_plans
 from torchrl_hmcts.planners.search import Search
+from torchrl_hmcts.planners.torchrl_scores import TorchRLScore
+from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import SearchTree, TreeView
-from torchrl_hmcts.planners.tree_policies import PUCT, UCT
+from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, NodeStatistics
 
 __all__ = [
     "PUCT",
     "UCT",
     "BestPlan",
+    "DirichletNoise",
+    "Gumbel",
     "HierarchicalPolicy",
     "HighestValue",
     "MCTSPlanner",
     "MaxBackup",
     "MeanBackup",
+    "MixedEvaluator",
+    "ModulePrior",
     "MostVisited",
+    "NodeStatistics",
     "NoveltyTest",
     "Plan",
+    "ProgressiveWidening",
     "RadiusNovelty",
+    "RolloutEvaluator",
+    "Root",
+    "SampledVisits",
     "Search",
     "SearchBudget",
     "SearchProgress",
     "SearchTree",
+    "TorchRLScore",
+    "Transition",
+    "Transpositions",
     "TreeView",
+    "ValueEvaluator",
+    "WidthNovelty",
+    "extract_plans",
+    "tree_search",
 ]

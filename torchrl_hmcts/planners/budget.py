@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+_DEFAULT_EXPANSIONS = 1000
+
 
 @dataclass(frozen=True)
 class SearchBudget:
     """Limits of a search, each per root; the first that is reached ends the root's search.
 
+    Simulations are exact with ``expand="one"``; with ``"all"`` the last leaf still simulates all of
+    its options. The others are looked at after every wave, so a search may exceed them by what one
+    wave simulates.
+
     Args:
         expansions: nodes whose options are simulated (with ``expand="one"``: options simulated).
-            Default 1,000.
+            Default: 1,000 if nothing else is limited.
+        simulations: values backed up: an option simulated, or a known leaf visited once more.
+            Default: no limit.
         base_steps: simulated base steps. Default: no limit.
         seconds: wall time of the whole call. Default: no limit.
+        nodes: nodes in the tree. Default: no limit.
         until_plan: stop at the first plan that earns a reward. Default ``True``.
         improve_expansions: expansions after the first plan, to find better ones. Default 0.
 
@@ -21,24 +30,29 @@ class SearchBudget:
         ValueError: if a limit is zero or negative.
 
     Example:
-        >>> SearchBudget(expansions=100, until_plan=False).expansions
+        >>> SearchBudget(simulations=100, until_plan=False).simulations
         100
     """
 
-    expansions: int = 1000
+    expansions: int | None = None
+    simulations: int | None = None
     base_steps: int | None = None
     seconds: float | None = None
+    nodes: int | None = None
     until_plan: bool = True
     improve_expansions: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("expansions", "base_steps", "seconds"):
+        limits = ("expansions", "simulations", "base_steps", "seconds", "nodes")
+        for name in limits:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(
                     f"SearchBudget needs {name} > 0: a search of nothing has no plan; got {value}. "
-                    + ("Use None for no limit." if name != "expansions" else "Try 1000.")
+                    f"Use None for no limit."
                 )
+        if all(getattr(self, name) is None for name in limits):
+            object.__setattr__(self, "expansions", _DEFAULT_EXPANSIONS)
         if self.improve_expansions < 0:
             raise ValueError(
                 f"SearchBudget needs improve_expansions >= 0; got {self.improve_expansions}."

@@ -1,35 +1,62 @@
 """Carrying plans out: a policy over options that plans, follows its plan and plans again.
 
-Letters: *B batch of the tensordict, L ``max_plan_length``.
+Letters: *B batch of the tensordict, L ``max_plan_length``, f numbers of the divergence entries.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_hmcts.planners.mcts import MCTSPlanner
+from torchrl_hmcts.planners.plan import Plan, extract_plans
+from torchrl_hmcts.planners.search import Search
 
 
 class HierarchicalPolicy(TensorDictModuleBase):
-    """Follows a planner's plan option by option, and plans again when it has come to its end.
+    r"""Follows a planner's plan option by option, and plans again when it must.
+
+    It plans again at the plan's end (open loop, the default), after every ``replan_every`` options,
+    or when the state :math:`s_i` after the i-th option is not the state :math:`\hat s_i` that the
+    plan predicted there (closed loop):
+
+    .. math:: \lVert \phi(s_i) - \phi(\hat s_i) \rVert > \text{divergence}
+
+    with :math:`\phi` the entries ``divergence_key`` side by side. Where no plan is found, the
+    planner's choice is taken and planning starts anew after it.
 
     The plan lives in the tensordict, as a recurrent policy's state does: ``"plan"`` (int64
-    ``[*B, L]``), ``"plan_length"`` and ``"plan_step"`` (int64 ``[*B, 1]``). An element without a
-    plan, or at the end of it, is planned for; where no plan is found, the planner's choice is
-    taken and planning starts anew after it.
+    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made in this
+    episode (int64 ``[*B, 1]``), and with ``divergence`` ``"plan_states"`` (float32
+    ``[*B, L + 1, f]``). Where episodes follow each other in one rollout (auto-reset, collectors),
+    append TorchRL's ``InitTracker`` to the env: by its ``"is_init"`` the policy knows that a plan
+    is out of date.
 
-    Where episodes follow each other in one rollout (auto-reset, collectors), append TorchRL's
-    ``InitTracker`` to the env: by its ``"is_init"`` the policy knows that a plan is out of date.
+    With ``reuse`` the trees are kept from one decision to the next: where the options carried out
+    led to a state that the tree holds, its subtree is searched further
+    (:meth:`MCTSPlanner.advance`), elsewhere a new tree is planted. The trees live in the policy,
+    so it serves one rollout at a time; another rollout gets right plans too, but nothing to reuse.
 
     Args:
         planner (MCTSPlanner): the manager.
         max_plan_length (int): options of a plan that are kept, L. Default 64.
+        replan_every (int, optional): options after which to plan again though the plan goes on; 1
+            for every option. Default: at the plan's end.
+        divergence (float, optional): distance from the predicted state, in units of the entries,
+            above which to plan again. Default: the prediction is not looked at.
+        divergence_key (NestedKey or sequence of them, optional): entries of the simulator's state
+            or observation that are compared, e.g. ``"position"``.
+        reuse (bool): keep the trees between decisions. Default ``False``.
 
     Raises:
-        ValueError: if ``max_plan_length`` is below 1.
+        ValueError: if a number is out of range, ``divergence`` comes without ``divergence_key`` or
+            the other way round, or the planner's env has no such entry.
 
     Reference:
         Dissertation, sections 3.2.1 and 4.2: the worker carries the manager's plan out.
@@ -41,55 +68,152 @@ class HierarchicalPolicy(TensorDictModuleBase):
         >>> policy = HierarchicalPolicy(MCTSPlanner(env))
         >>> env.rollout(10, policy=policy)["plan_step"].flatten().tolist()
         [1, 2, 3]
+        >>> policy = HierarchicalPolicy(MCTSPlanner(env), replan_every=1, reuse=True)
+        >>> env.rollout(10, policy=policy)["num_plans"].flatten().tolist()
+        [1, 2, 3]
     """
 
-    def __init__(self, planner: MCTSPlanner, *, max_plan_length: int = 64) -> None:
+    def __init__(
+        self,
+        planner: MCTSPlanner,
+        *,
+        max_plan_length: int = 64,
+        replan_every: int | None = None,
+        divergence: float | None = None,
+        divergence_key: NestedKey | Sequence[NestedKey] | None = None,
+        reuse: bool = False,
+    ) -> None:
         super().__init__()
         if max_plan_length < 1:
             raise ValueError(
                 f"HierarchicalPolicy needs max_plan_length >= 1; got {max_plan_length}."
             )
+        if replan_every is not None and replan_every < 1:
+            raise ValueError(
+                f"HierarchicalPolicy needs replan_every >= 1, in options; got {replan_every}. Use "
+                f"None to plan again at the plan's end only."
+            )
+        if (divergence is None) != (divergence_key is None):
+            raise ValueError(
+                f"HierarchicalPolicy compares divergence_key with the plan and plans again above "
+                f"divergence; got divergence={divergence} and divergence_key={divergence_key!r}. "
+                f"Pass both or neither."
+            )
+        if divergence is not None and not (math.isfinite(divergence) and divergence >= 0.0):
+            raise ValueError(
+                f"HierarchicalPolicy needs a divergence >= 0, a distance; got {divergence}."
+            )
         self.planner = planner
         self.max_plan_length = max_plan_length
-        self.in_keys = list(planner.in_keys)
-        self.out_keys = [planner.option_key, "plan", "plan_length", "plan_step"]
+        self.replan_every = replan_every
+        self.divergence = divergence
+        self.reuse = reuse
+        keys: list[NestedKey] = []
+        if isinstance(divergence_key, (str, tuple)):
+            keys = [divergence_key]
+        elif divergence_key is not None:
+            keys = list(divergence_key)
+        self.divergence_keys = [unravel_key(k) for k in keys]
+        planner.simulator.keep(self.divergence_keys)
+        self.in_keys = list(dict.fromkeys([*planner.in_keys, *self.divergence_keys]))
+        self._plan_keys = ["plan", "plan_length", "plan_step", "num_plans"]
+        if divergence is not None:
+            self._plan_keys.append("plan_states")
+        self.out_keys = [planner.option_key, *self._plan_keys]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the trees that ``reuse`` keeps; the next call plants new ones."""
+        self._search: Search | None = None
+        self._shape: torch.Size | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         shape = tensordict.batch_size
-        plan = tensordict.get("plan", None)
-        if plan is None:
-            empty = torch.zeros((*shape, 1), dtype=torch.int64, device=tensordict.device)
-            plan = empty.expand(*shape, self.max_plan_length).clone()
-            length, step = empty, empty.clone()
-        else:
-            plan = plan.clone()
-            length, step = (tensordict.get(k).clone() for k in ("plan_length", "plan_step"))
-        needs = (step >= length).squeeze(-1)
         is_init, done, stepped = (tensordict.get(k, None) for k in ("is_init", "done", "_step"))
+        kept = {key: tensordict.get(key, None) for key in self._plan_keys}
+        if any(value is None for value in kept.values()):
+            kept = self._no_plans(tensordict)
+        else:
+            kept = {key: value.clone() for key, value in kept.items()}
+        plan, length, step = kept["plan"], kept["plan_length"], kept["plan_step"]
         if is_init is not None:
-            needs = needs | is_init.reshape(shape)
+            begins = is_init.reshape(shape)
+            for name in ("plan_length", "plan_step", "num_plans"):
+                kept[name][begins] = 0
+        needs = (step >= length).squeeze(-1)
+        if self.replan_every is not None:
+            needs = needs | (step >= self.replan_every).squeeze(-1)
+        if self.divergence is not None:
+            needs = needs | self._diverged(tensordict, kept["plan_states"], step)
         if done is not None:
             needs = needs & ~done.reshape(shape)
         if stepped is not None:  # False where a rollout goes on without the element
             needs = needs & stepped.reshape(shape)
         if needs.any():
-            step[needs] = 0
-            plan[needs], length[needs] = self._plan(tensordict[needs])
+            behind = torch.arange(self.max_plan_length, device=plan.device) >= step
+            self._plan(tensordict, needs, plan.masked_fill(behind, -1), kept)
         option = plan.gather(-1, step.clamp_max(self.max_plan_length - 1)).squeeze(-1)
         tensordict.set(self.planner.option_key, self.planner.simulator.encode(option))
-        tensordict.set("plan", plan)
-        tensordict.set("plan_length", length)
-        tensordict.set("plan_step", step + 1)
+        step += 1
+        for key, value in kept.items():
+            tensordict.set(key, value)
         return tensordict
 
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, Tensor]:
-        found = self.planner.plan(td)
-        search = self.planner.last_search
-        assert search is not None
+    def _no_plans(self, td: TensorDictBase) -> dict[str, Tensor]:
+        def zeros(*size: int, dtype: torch.dtype = torch.int64) -> Tensor:
+            return torch.zeros((*td.batch_size, *size), dtype=dtype, device=td.device)
+
+        kept = {"plan": zeros(self.max_plan_length)}
+        kept.update({k: zeros(1) for k in ("plan_length", "plan_step", "num_plans")})
+        if self.divergence is not None:
+            width = self._features(td).shape[-1]
+            kept["plan_states"] = zeros(self.max_plan_length + 1, width, dtype=torch.float32)
+        return kept
+
+    def _features(self, td: TensorDictBase) -> Tensor:
+        """The divergence entries side by side, float32 ``[*batch, f]``."""
+        parts = [td.get(k).to(torch.float32) for k in self.divergence_keys]
+        return torch.cat([p.reshape(*td.batch_size, -1) for p in parts], -1)
+
+    def _diverged(self, td: TensorDictBase, predicted: Tensor, step: Tensor) -> Tensor:
+        at = step.clamp_max(self.max_plan_length).unsqueeze(-1)
+        at = at.expand(*step.shape, predicted.shape[-1])
+        distance = (self._features(td) - predicted.gather(-2, at).squeeze(-2)).norm(dim=-1)
+        return ~(distance <= self.divergence)  # a state that is not a number has diverged too
+
+    def _plan(
+        self, td: TensorDictBase, needs: Tensor, executed: Tensor, kept: dict[str, Tensor]
+    ) -> None:
+        """Plan for the elements ``needs`` and write their plans."""
+        found, fallback = self._searched(td, needs, executed)
+        device = kept["plan"].device
         width = min(found.options.shape[-1], self.max_plan_length)
         plan = torch.zeros((len(found), self.max_plan_length), dtype=torch.int64)
         plan[:, :width] = found.options[:, :width].clamp_min(0)
-        fallback = torch.from_numpy(self.planner._choose(search))
         plan[~found.found, 0] = fallback[~found.found]
         length = torch.where(found.found, found.lengths.clamp_max(self.max_plan_length), 1)
-        return plan, length.unsqueeze(-1)
+        kept["plan"][needs] = plan.to(device)
+        kept["plan_length"][needs] = length.unsqueeze(-1).to(device)
+        kept["plan_step"][needs] = 0
+        kept["num_plans"][needs] += 1
+        if self.divergence is not None:
+            states = kept["plan_states"][needs]
+            states[:, : width + 1] = self._features(found.states)[:, : width + 1].to(device)
+            kept["plan_states"][needs] = states
+
+    def _searched(self, td: TensorDictBase, needs: Tensor, executed: Tensor) -> tuple[Plan, Tensor]:
+        """The plans of the elements ``needs``, and the planner's choice for each."""
+        planner = self.planner
+        if not self.reuse:
+            search = planner.search(td[needs])
+            return extract_plans(search), torch.from_numpy(planner.choose(search))
+        before, self._search = self._search, None  # an error leaves no half-moved trees behind
+        if before is None or self._shape != td.batch_size:
+            search = planner.plant(td)
+        else:
+            search = before
+            planner.advance(search, executed, td, where=needs)
+        planner.resume(search, where=needs)
+        self._search, self._shape = search, td.batch_size
+        rows = needs.reshape(-1).cpu()
+        return extract_plans(search)[rows], torch.from_numpy(planner.choose(search))[rows]

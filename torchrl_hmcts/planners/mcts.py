@@ -20,19 +20,32 @@ from torchrl.envs import Compose, EnvBase
 
 from torchrl_hmcts.planners.backups import Backup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
-from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, HighestValue, MostVisited
+from torchrl_hmcts.planners.chance import ProgressiveWidening
+from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, MostVisited
+from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.search import Outcomes, Search, Wave
+from torchrl_hmcts.planners.search import NO_LIMIT, Outcomes, RootStates, Search, Wave
 from torchrl_hmcts.planners.simulator import Simulator
-from torchrl_hmcts.planners.tree_policies import UCT, TreePolicy
+from torchrl_hmcts.planners.transpositions import Transpositions
+from torchrl_hmcts.planners.tree import TERMINAL
+from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, TreePolicy
 
 Evaluator = Callable[[TensorDictBase], Tensor]
+
+# Entry with a seed for each state, int64 [m], given to evaluators that draw random numbers.
+SEED_KEY = "_seed"
+
+# Revisits in a row, without a limit of simulations, after which a root has nothing left to find.
+_MAX_FRUITLESS_REVISITS = 10_000
 
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """What a progress display is told after every wave."""
+    """What a progress display is told after every wave.
+
+    ``search`` is the search as it stands; ``extract_plans(search)`` gives the best plans so far.
+    """
 
     num_roots: int
     num_active: int
@@ -40,6 +53,7 @@ class SearchProgress:
     expansions: int
     base_steps: int
     seconds: float
+    search: Search
 
 
 class MCTSPlanner(TensorDictModuleBase):
@@ -56,35 +70,53 @@ class MCTSPlanner(TensorDictModuleBase):
     truncated one is worth what the leaf evaluator says. Subtrees in which nothing is left to find
     are closed and never simulated again.
 
+    Root ``b`` of a call with seed ``s`` draws its random numbers (root noise, Gumbel, rollouts,
+    sampled choices) from ``s + b``, so that it has the same tree whatever is searched beside it.
+
     Args:
         env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or
             any env with a discrete action, that is stateless (``batch_locked=False``, its state in
-            the tensordict). It is not stepped through ``env.step``; its own state, if any, is not
-            touched.
+            the tensordict) or can be set to a state by ``reset(td, set_state=True)``. The planner
+            changes the state of an env of the second kind: give it one of its own.
         gamma (float, optional): discount per base step. Default: that of the env's
             ``OptionTransform``, else 0.99.
-        tree_policy: :class:`UCT` (default, ``c=1``) or :class:`PUCT`.
+        tree_policy: :class:`UCT` (default, ``c=1``), :class:`PUCT`, :class:`Gumbel`,
+            :class:`TorchRLScore`, or a callable over :class:`NodeStatistics`.
         novelty (NoveltyTest, optional): which new nodes are worth searching, e.g.
             ``RadiusNovelty("position", 0.35)``. Default: all.
+        transpositions (Transpositions, optional): which states are the same. Default: none are.
+        chance (ProgressiveWidening, optional): for a stochastic simulator, how often an option is
+            simulated in a node. Default: once.
         leaf_evaluator (callable, optional): ``leaf_evaluator(td) -> values [m]`` or ``[m, 1]`` of
-            new nodes, from their state and observation. Default: 0.
-        option_prior (callable, optional): ``option_prior(td) -> probabilities [m, A]``. Default:
-            uniform.
+            new nodes, from their state and observation: :class:`ValueEvaluator`,
+            :class:`RolloutEvaluator`, :class:`MixedEvaluator` or your own. Default: 0.
+        option_prior (callable, optional): ``option_prior(td) -> probabilities [m, A]``:
+            :class:`ModulePrior` or your own. Default: uniform.
+        root_noise (DirichletNoise, optional): noise in the prior of the roots. Default: none.
         backup: :class:`MeanBackup` (default) or :class:`MaxBackup`.
-        final_choice: :class:`BestPlan` (default), :class:`MostVisited` or :class:`HighestValue`.
+        final_choice: :class:`BestPlan`, :class:`MostVisited`, :class:`HighestValue` or
+            :class:`SampledVisits`. Default: best plan; with ``chance`` most visited, since no
+            sequence of options is sure to repeat; with :class:`Gumbel` its own choice.
         budget (SearchBudget): limits per root. Default: 1,000 expansions, until a plan is found.
         expand: ``"all"`` simulates every option of a leaf at once (default), ``"one"`` only the
             option that the tree policy chooses, as in the textbook.
         leaves_per_wave (int): leaves of each root that share a simulator call. More are faster for
-            few roots and search less selectively. Default 1.
+            few roots and search less selectively. At most 255; default 1.
+        exhausted: what a descent does with an option behind which nothing is left to simulate:
+            ``"skip"`` it (default: every simulation finds something new), or ``"revisit"`` it and
+            back its known value up once more, at no simulator's cost, so that visits and mean
+            values are those of the textbook. Always ``"revisit"`` with ``chance`` or ``Gumbel``.
         duration_key, mask_key (NestedKey): entries of the env with the base steps of a step, int64
             ``[*B, 1]`` (1 if the env has none), and the options that may be taken, bool ``[*B,
             A]`` (all if it has none).
+        reward_key (NestedKey, optional): which reward, if the env has several.
+        seed (int, optional): of the planner's random numbers; every call moves on from it. Default:
+            drawn from torch's global generator when first needed.
         progress (callable, optional): called with a :class:`SearchProgress` after every wave.
 
     Writes: the env's action (the option), and ``"plan_found"`` (bool ``[*B, 1]``), ``"root_value"``
-    (float ``[*B, 1]``), ``"root_visits"`` (int64 ``[*B, A]``), ``"num_expansions"`` and
-    ``"num_simulated_steps"`` (int64 ``[*B, 1]``).
+    (float ``[*B, 1]``), ``"root_visits"`` (int64 ``[*B, A]``), ``"num_simulations"``,
+    ``"num_expansions"`` and ``"num_simulated_steps"`` (int64 ``[*B, 1]``).
 
     Raises:
         ValueError: at construction if the env cannot be set to a state or its action is not
@@ -110,43 +142,82 @@ class MCTSPlanner(TensorDictModuleBase):
         gamma: float | None = None,
         tree_policy: TreePolicy | None = None,
         novelty: NoveltyTest | None = None,
+        transpositions: Transpositions | None = None,
+        chance: ProgressiveWidening | None = None,
         leaf_evaluator: Evaluator | None = None,
         option_prior: Evaluator | None = None,
+        root_noise: DirichletNoise | None = None,
         backup: Backup | None = None,
         final_choice: FinalChoice | None = None,
         budget: SearchBudget | None = None,
         expand: Literal["all", "one"] = "all",
         leaves_per_wave: int = 1,
+        exhausted: Literal["skip", "revisit"] = "skip",
         duration_key: NestedKey = "duration",
         mask_key: NestedKey = "action_mask",
+        reward_key: NestedKey | None = None,
+        seed: int | None = None,
         progress: Callable[[SearchProgress], None] | None = None,
     ) -> None:
         super().__init__()
-        if expand not in ("all", "one"):
-            raise ValueError(f"MCTSPlanner: expand is 'all' or 'one'; got {expand!r}.")
-        if leaves_per_wave < 1:
-            raise ValueError(f"MCTSPlanner needs leaves_per_wave >= 1; got {leaves_per_wave}.")
+        for name, value, names in (
+            ("expand", expand, ("all", "one")),
+            ("exhausted", exhausted, ("skip", "revisit")),
+        ):
+            if value not in names:
+                raise ValueError(f"MCTSPlanner: {name} is {_or(names)}; got {value!r}.")
+        if not 1 <= leaves_per_wave <= 255:
+            raise ValueError(
+                f"MCTSPlanner needs leaves_per_wave from 1 to 255; got {leaves_per_wave}."
+            )
         if gamma is None:
             gamma = _option_gamma(env)
         if not 0.0 < gamma <= 1.0:
             raise ValueError(f"MCTSPlanner needs a discount gamma in (0, 1]; got {gamma}.")
-        extra = list(novelty.in_keys) if novelty is not None else []
-        for part in (leaf_evaluator, option_prior):
+        tree_policy = UCT() if tree_policy is None else tree_policy
+        budget = SearchBudget() if budget is None else budget
+        _check_tree_policy(tree_policy, budget, expand, leaves_per_wave)
+        if chance is not None and transpositions is not None:
+            raise ValueError(
+                "MCTSPlanner: transpositions share what follows a state, which chance redraws; "
+                "leave one of the two out."
+            )
+        extra = []
+        for part in (novelty, transpositions, leaf_evaluator, option_prior):
             extra += [unravel_key(k) for k in getattr(part, "in_keys", ())]
         self.simulator = Simulator(
-            env, extra_keys=extra, duration_key=duration_key, mask_key=mask_key
+            env,
+            extra_keys=extra,
+            duration_key=duration_key,
+            mask_key=mask_key,
+            reward_key=reward_key,
         )
         self.gamma = gamma
-        self.tree_policy = UCT() if tree_policy is None else tree_policy
+        self.tree_policy = tree_policy
         self.novelty = novelty
+        self.transpositions = transpositions
+        self.chance = chance
+        # Not sub-modules: training or moving the planner must not change its owner's networks.
         self.__dict__["leaf_evaluator"] = leaf_evaluator
         self.__dict__["option_prior"] = option_prior
+        for part in (leaf_evaluator, option_prior):
+            bind = getattr(part, "bind", None)
+            if bind is not None:
+                bind(self.simulator, gamma)
+        self.root_noise = root_noise
         self.backup = MeanBackup() if backup is None else backup
-        self.final_choice = BestPlan() if final_choice is None else final_choice
-        self.budget = SearchBudget() if budget is None else budget
+        if final_choice is None:
+            final_choice = BestPlan() if chance is None else MostVisited()
+            self._gumbel_choice = isinstance(tree_policy, Gumbel)
+        else:
+            self._gumbel_choice = False
+        self.final_choice = final_choice
+        self.budget = budget
         self.expand = expand
         self.leaves_per_wave = leaves_per_wave
+        self.exhausted = exhausted
         self.progress = progress
+        self._seeds = None if seed is None else np.random.SeedSequence(seed)
         self.option_key = self.simulator.option_key
         self.num_options = self.simulator.num_options
         self.in_keys = list(self.simulator.root_keys)
@@ -155,6 +226,7 @@ class MCTSPlanner(TensorDictModuleBase):
             "plan_found",
             "root_value",
             "root_visits",
+            "num_simulations",
             "num_expansions",
             "num_simulated_steps",
         ]
@@ -165,7 +237,7 @@ class MCTSPlanner(TensorDictModuleBase):
         search = self.search(tensordict)
         shape = tensordict.batch_size
         device = self.simulator.env.device
-        option = self.simulator.encode(torch.from_numpy(self._choose(search)).view(shape))
+        option = self.simulator.encode(torch.from_numpy(self.choose(search)).view(shape))
         tree = search.tree
 
         def column(array: np.ndarray) -> Tensor:
@@ -178,6 +250,7 @@ class MCTSPlanner(TensorDictModuleBase):
             "root_visits": torch.from_numpy(tree.edges["visits"][:, 0].astype(np.int64)).view(
                 *shape, self.num_options
             ),
+            "num_simulations": column(search.num_simulations),
             "num_expansions": column(search.num_expansions),
             "num_simulated_steps": column(search.num_base_steps),
         }
@@ -194,9 +267,17 @@ class MCTSPlanner(TensorDictModuleBase):
         plans = extract_plans(self.search(td))
         return plans.reshape(td.batch_size)
 
-    def search(self, td: TensorDictBase) -> Search:
-        """Search from every state of ``td`` (any batch shape, flattened) and return the trees."""
+    def search(self, td: TensorDictBase, *, seed: int | None = None) -> Search:
+        """Search from every state of ``td`` (any batch shape, flattened) and return the trees.
+
+        While it runs, and after an interruption, ``last_search`` holds what was found so far.
+        """
         begin = time.perf_counter()
+        search = self.plant(td, seed=seed)
+        return self._grow(search, begin, np.arange(search.num_roots))
+
+    def plant(self, td: TensorDictBase, *, seed: int | None = None) -> Search:
+        """Plant a tree at every state of ``td``; nothing is simulated until :meth:`resume`."""
         root = self.simulator.root(td)
         num_roots = root.batch_size[0]
         search = Search(
@@ -205,33 +286,175 @@ class MCTSPlanner(TensorDictModuleBase):
             tree_policy=self.tree_policy,
             backup=self.backup,
             novelty=self.novelty,
+            transpositions=self.transpositions,
+            chance=self.chance,
             expand=self.expand,
             leaves_per_wave=self.leaves_per_wave,
+            exhausted=self.exhausted,
+            capacity=self._capacity(num_roots),
         )
+        self._seed(search, seed)
+        self._plant(search, root, None)
+        self.last_search = search
+        return search
+
+    def _capacity(self, num_roots: int) -> int:
+        """Nodes to make room for at once: all that the budget allows, if that is not very many."""
+        budget = self.budget
+        limits = [x for x in (budget.simulations, budget.nodes) if x is not None]
+        per_wave = self.leaves_per_wave * self.num_options
+        if not limits or num_roots * min(limits) > 2**20:
+            return 64
+        return min(limits) + per_wave + 1
+
+    def resume(self, search: Search, *, where: Tensor | None = None) -> Search:
+        """Go on with a search, with a fresh budget; with ``Gumbel`` to the end of its schedule.
+
+        Only the roots ``where`` (bool ``[*B]``) are searched, all by default.
+        """
+        return self._grow(search, time.perf_counter(), _rows(search, where))
+
+    def advance(
+        self,
+        search: Search,
+        options: Tensor,
+        td: TensorDictBase,
+        *,
+        where: Tensor | None = None,
+        seed: int | None = None,
+    ) -> Tensor:
+        """Move the roots of a search along: ``options`` were carried out and led to ``td``.
+
+        Where an outcome of the options in the tree is the state in ``td``, bit for bit, its subtree
+        is kept; elsewhere a new tree is planted. Nothing is simulated until :meth:`resume`.
+
+        Args:
+            search: as :meth:`search` returned it.
+            options: int64 ``[*B]``, or ``[*B, k]`` for several one after the other, with -1 behind
+                the last; -1 alone for a new tree.
+            td: states ``[*B]`` after the options.
+            where: bool ``[*B]``, the roots to move; the others stay as they are. Default: all.
+            seed: as in :meth:`search`.
+
+        Returns:
+            Which subtrees were kept, bool ``[*B]``.
+
+        Raises:
+            ValueError: if the options or states do not fit the search.
+        """
+        shape = td.batch_size
+        if shape.numel() != search.num_roots or options.shape[: len(shape)] != shape:
+            raise ValueError(
+                f"advance needs options and a state for each of the {search.num_roots} roots of "
+                f"the search; got options {list(options.shape)} and states {list(shape)}."
+            )
+        if options.ndim > len(shape) + 1:
+            raise ValueError(
+                f"advance needs options [*B] or [*B, k] with *B = {list(shape)}; got "
+                f"{list(options.shape)}."
+            )
+        if options.numel() and int(options.max()) >= self.num_options:
+            raise ValueError(
+                f"advance needs options below {self.num_options}; got {int(options.max())}."
+            )
+        rows = _rows(search, where)
+        if not len(rows):
+            return torch.zeros(shape, dtype=torch.bool)
+        index = torch.from_numpy(rows)
+        root = self.simulator.root(td.reshape(-1)[index])
+        taken = options.reshape(search.num_roots, -1)[index].tolist()
+        state, done = self.simulator.state(root), self.simulator.done(root)
+        kept = np.zeros(search.num_roots, np.bool_)
+        self._seed(search, seed)
+        reuse = not isinstance(self.tree_policy, Gumbel)  # halving starts from zero visits
+        for i, b in enumerate(rows.tolist()):
+            path = [option for option in taken[i] if option >= 0]
+            node = self._find_outcome(search, b, path, state[i], done[i]) if path and reuse else -1
+            if node >= 0:
+                search.reroot(b, node)
+                kept[b] = True
+        fresh = np.flatnonzero(~kept[rows])
+        if len(fresh):
+            self._plant(search, root[torch.from_numpy(fresh)], rows[fresh])
+        if self.root_noise is not None and kept.any():
+            search.add_noise(self.root_noise, np.flatnonzero(kept))
+        self.last_search = search
+        return torch.from_numpy(kept).view(shape)
+
+    def _find_outcome(
+        self, search: Search, b: int, path: list[int], state: TensorDictBase, done: bool
+    ) -> int:
+        """The outcome of the options ``path`` of root ``b`` with exactly this state, or -1."""
+        states, nodes = search.tree.states, search.tree.nodes[b]
+        assert states is not None
+        reached = [0]
+        for option in path:
+            outcomes = [n for above in reached for n in search.outcomes_of(b, option, above)]
+            twins = [int(nodes["twin"][n]) for n in outcomes]  # where an equal state is searched
+            reached = [t if t >= 0 else n for n, t in zip(outcomes, twins, strict=True)]
+        for node in reached:
+            if bool(nodes["flags"][node] & TERMINAL) == done and all(
+                torch.equal(states.get(key)[b, node], state.get(key))
+                for key in self.simulator.state_keys
+            ):
+                return node
+        return -1
+
+    def _seed(self, search: Search, seed: int | None) -> None:
+        if seed is None:
+            if self._seeds is None:
+                self._seeds = np.random.SeedSequence(
+                    int(torch.empty((), dtype=torch.int64).random_())
+                )
+            seed = int(self._seeds.spawn(1)[0].generate_state(1, np.uint32)[0])
+        search.seed((np.arange(search.num_roots) + int(seed)) & np.iinfo(np.int64).max)
+
+    def _plant(self, search: Search, root: TensorDictBase, rows: np.ndarray | None) -> None:
+        """Plant the roots ``rows`` of a search, all by default, at the states ``root``."""
+        simulator = self.simulator
+        where = np.arange(search.num_roots) if rows is None else rows
         with torch.no_grad():
-            done = self.simulator.done(root)
-            masks = self.simulator.masks(root)
+            done = simulator.done(root)
+            masks = simulator.masks(root)
             if len(masks) and not (masks.any(-1) | done).all():
-                bad = int(np.flatnonzero(~(masks.any(-1) | done))[0])
+                bad = int(where[np.flatnonzero(~(masks.any(-1) | done))[0]])
                 raise ValueError(
                     f"Root {bad} has no option that may be taken: its action mask is all False. "
                     f"Plan from a state that is not a dead end, or mark it as done."
                 )
-            values = self._evaluate(root, self.simulator.terminated(root))
-            search.start(values, done, self._priors(root), masks, self._features(root))
-            roots = np.arange(num_roots)
-            search.tree.set_states(roots, np.zeros_like(roots), self.simulator.state(root))
-            self._grow(search, begin)
-        self.last_search = search
-        return search
+            values = self._evaluate(root, simulator.terminated(root), lambda: search.seeds[where])
+            known = RootStates(
+                values=values,
+                done=done,
+                priors=self._priors(root),
+                masks=masks,
+                features=self._features(root),
+                codes=self._codes(root),
+            )
+        search.start(known, rows)
+        search.tree.set_states(where, np.zeros_like(where), simulator.state(root))
+        if self.root_noise is not None:
+            search.add_noise(self.root_noise, where)
 
-    def _grow(self, search: Search, begin: float) -> None:
+    @torch.no_grad()
+    def _grow(self, search: Search, begin: float, rows: np.ndarray) -> Search:
         budget = self.budget
-        active = np.flatnonzero(~search.exhausted(np.arange(search.num_roots)))
+        search.begin(budget.simulations)
+        if isinstance(self.tree_policy, Gumbel):
+            assert budget.simulations is not None
+            search.halve(budget.simulations)
+            # There is one schedule per search: after an interruption it goes on where it stood.
+            search.roots["simulations"] = search.tree.edges["visits"][:, 0].sum(-1)
+        since = search.roots["revisits"].copy()  # at the last outcome of each root
+        active = self._still_active(search, rows)
         while len(active):
             wave = search.select(active)
-            if len(wave.roots):
-                self._simulate(search, wave)
+            if len(wave):
+                try:
+                    self._simulate(search, wave)
+                except BaseException:
+                    search.cancel(wave)
+                    raise
             seconds = time.perf_counter() - begin
             if self.progress is not None:
                 self.progress(
@@ -242,45 +465,95 @@ class MCTSPlanner(TensorDictModuleBase):
                         expansions=int(search.num_expansions.sum()),
                         base_steps=int(search.num_base_steps.sum()),
                         seconds=seconds,
+                        search=search,
                     )
                 )
             if budget.seconds is not None and seconds >= budget.seconds:
-                return
-            spent = search.num_expansions[active]
-            over = spent >= budget.expansions
-            if budget.base_steps is not None:
-                over |= search.num_base_steps[active] >= budget.base_steps
-            if budget.until_plan:
-                since = search.expansions_to_plan[active]
-                over |= (since >= 0) & (spent >= since + budget.improve_expansions)
-            active = active[~over]
-            stuck = search.exhausted(active)
-            if stuck.any():
-                hopeless = [b for b in active[stuck] if not search.relax(int(b))]
-                active = active[~np.isin(active, hopeless)]
+                break
+            if budget.simulations is None:  # a root may revisit what it knows for ever
+                revisits = search.roots["revisits"]
+                since[wave.roots] = revisits[wave.roots]
+                active = active[revisits[active] - since[active] < _MAX_FRUITLESS_REVISITS]
+            active = self._still_active(search, active)
+        for root in rows[search.exhausted(rows)]:
+            search.solve(int(root))
+        return search
+
+    def _still_active(self, search: Search, active: np.ndarray) -> np.ndarray:
+        """The roots among ``active`` that have budget left and something to simulate."""
+        budget = self.budget
+        kept, stuck = np.empty_like(active), np.empty_like(active)
+        num_kept, num_stuck = search._kernels.still_active(
+            search.tree.nodes,
+            search.tree.roots,
+            active,
+            NO_LIMIT if budget.expansions is None else budget.expansions,
+            NO_LIMIT if budget.base_steps is None else budget.base_steps,
+            NO_LIMIT if budget.nodes is None else budget.nodes,
+            budget.until_plan,
+            budget.improve_expansions,
+            kept,
+            stuck,
+        )
+        if not num_stuck:
+            return kept[:num_kept]
+        revisits = search.revisits_exhausted
+        opened = [b for b in stuck[:num_stuck].tolist() if search.relax(b) or revisits]
+        return np.sort(np.concatenate((kept[:num_kept], np.array(opened, np.int64))))
 
     def _simulate(self, search: Search, wave: Wave) -> None:
-        simulator = self.simulator
-        states = search.tree.get_states(wave.roots, wave.nodes, simulator.state_keys)
+        simulator, tree = self.simulator, search.tree
+        states = tree.get_states(wave.roots, wave.nodes, simulator.state_keys)
         after = simulator.step(states, wave.options)
         terminated, done = simulator.terminated(after), simulator.done(after)
         durations = simulator.durations(after)
-        discounts = np.where(terminated, 0.0, self.gamma**durations).astype(np.float32)
+        if simulator.duration_key is None:
+            discounts = np.where(terminated, np.float32(0.0), np.float32(self.gamma))
+        else:
+            discounts = np.where(terminated, 0.0, self.gamma**durations).astype(np.float32)
         outcomes = Outcomes(
             rewards=simulator.rewards(after),
             discounts=discounts,
             durations=durations,
             done=done,
-            values=self._evaluate(after, terminated),
+            values=self._evaluate(after, terminated, lambda: _row_seeds(search, wave)),
             priors=self._priors(after),
             masks=simulator.masks(after),
+            features=self._features(after),
+            codes=self._codes(after),
         )
-        nodes = search.insert(wave, outcomes, self._features(after))
-        search.tree.set_states(wave.roots, nodes, simulator.state(after))
+        merges = None
+        if self.chance is not None:
+            merges = self._find_merges(search, wave, after, done)
+        nodes = search.insert(wave, outcomes, merges)
+        tree.set_states(wave.roots, nodes, after)
 
-    def _evaluate(self, td: TensorDictBase, terminated: np.ndarray) -> np.ndarray:
+    def _find_merges(
+        self, search: Search, wave: Wave, after: TensorDictBase, done: np.ndarray
+    ) -> np.ndarray:
+        """Known outcomes of the same option with the same state, or -1, int64 ``[m]``."""
+        tree, keys = search.tree, self.simulator.state_keys
+        merges = np.full(len(wave), -1, np.int64)
+        assert tree.states is not None
+        first = tree.edges["child"][wave.roots, wave.nodes, wave.options]
+        for i in np.flatnonzero(first >= 0).tolist():
+            b, node = wave.roots[i], int(first[i])
+            while node >= 0:
+                if bool(tree.nodes["flags"][b, node] & TERMINAL) == done[i] and all(
+                    torch.equal(tree.states.get(key)[b, node], after.get(key)[i]) for key in keys
+                ):
+                    merges[i] = node
+                    break
+                node = int(tree.nodes["sibling"][b, node])
+        return merges
+
+    def _evaluate(
+        self, td: TensorDictBase, terminated: np.ndarray, seeds: Callable[[], np.ndarray]
+    ) -> np.ndarray:
         if self.leaf_evaluator is None:
             return np.zeros(td.batch_size[0], np.float32)
+        if getattr(self.leaf_evaluator, "is_random", False):
+            td = td.copy().set(SEED_KEY, torch.from_numpy(seeds()))
         values = _as_tensor(self.leaf_evaluator(td), "leaf_evaluator")
         num_states = td.batch_size[0]
         if tuple(values.shape) not in ((num_states,), (num_states, 1)):
@@ -317,26 +590,64 @@ class MCTSPlanner(TensorDictModuleBase):
     def _features(self, td: TensorDictBase) -> np.ndarray | None:
         return None if self.novelty is None else self.novelty.features(td)
 
-    def _choose(self, search: Search) -> np.ndarray:
-        edges = search.tree.edges[:, 0]
-        visits = edges["visits"].astype(np.int64)
-        q = np.where(visits > 0, edges["reward"] + edges["discount"] * edges["value"], -np.inf)
-        if isinstance(self.final_choice, HighestValue):
-            return q.argmax(-1)
-        order = np.lexsort((-q, -visits), axis=-1)[:, 0]
-        if isinstance(self.final_choice, MostVisited):
-            return order
-        planned = [
-            search.tree.options(b, int(node))[0] if node > 0 else order[b]
-            for b, node in enumerate(search.best_node)
-        ]
-        return np.array(planned, np.int64)
+    def _codes(self, td: TensorDictBase) -> np.ndarray | None:
+        return None if self.transpositions is None else self.transpositions.codes(td)
+
+    def choose(self, search: Search) -> np.ndarray:
+        """Return the option to take in each root of a search, int64 ``[B]``."""
+        return search.gumbel_choice() if self._gumbel_choice else self.final_choice.choose(search)
 
     def __repr__(self) -> str:
         return (
             f"MCTSPlanner(num_options={self.num_options}, tree_policy={self.tree_policy}, "
             f"novelty={self.novelty}, budget={self.budget})"
         )
+
+
+def _rows(search: Search, where: Tensor | None) -> np.ndarray:
+    """The roots that a mask names, all by default."""
+    if where is None:
+        return np.arange(search.num_roots)
+    if where.numel() != search.num_roots:
+        raise ValueError(
+            f"where needs one entry for each of the {search.num_roots} roots of the search; got "
+            f"{list(where.shape)}."
+        )
+    return np.flatnonzero(where.reshape(-1).cpu().numpy())
+
+
+def _or(names: tuple[str, ...]) -> str:
+    return " or ".join(map(repr, names))
+
+
+def _check_tree_policy(
+    tree_policy: TreePolicy, budget: SearchBudget, expand: str, leaves_per_wave: int
+) -> None:
+    if not callable(tree_policy) and not isinstance(tree_policy, (UCT, PUCT, Gumbel)):
+        raise TypeError(
+            f"MCTSPlanner needs a tree policy: UCT(), PUCT(), Gumbel(), TorchRLScore(...) or a "
+            f"callable over NodeStatistics; got {tree_policy!r}."
+        )
+    if isinstance(tree_policy, Gumbel) and (
+        budget.simulations is None or expand != "one" or leaves_per_wave != 1
+    ):
+        raise ValueError(
+            f"Gumbel halves a known number of simulations of one option each; got "
+            f"budget.simulations={budget.simulations}, expand={expand!r}, "
+            f"leaves_per_wave={leaves_per_wave}. Pass "
+            f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
+            f"leaves_per_wave=1."
+        )
+
+
+def _row_seeds(search: Search, wave: Wave) -> np.ndarray:
+    """A seed for each outcome that depends on its root, node, option and order, int64 ``[m]``."""
+    mixed = search.seeds[wave.roots].astype(np.uint64) * np.uint64(0xBF58476D1CE4E5B9)
+    counted = search.num_simulations[wave.roots]
+    for part in (wave.nodes, wave.options, counted):
+        mixed = (mixed ^ part.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return (mixed >> np.uint64(1)).astype(np.int64)
 
 
 def _as_tensor(value: Tensor, name: str) -> Tensor:

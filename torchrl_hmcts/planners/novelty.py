@@ -16,18 +16,30 @@ from tensordict.utils import NestedKey
 
 
 class NoveltyTest(Protocol):
-    """What a planner asks of a novelty test; write your own with these members."""
+    """What a planner asks of a novelty test; write your own with these members.
+
+    A method ``statistics() -> dict`` is optional: its counts join those of the search.
+    """
 
     in_keys: list[NestedKey]
 
     def start(self, num_roots: int) -> None:
-        """Forget everything: ``num_roots`` searches begin."""
+        """Forget everything: ``num_roots`` searches begin.
+
+        Assign new arrays here: each search starts a shallow copy of the test, of its own.
+        """
+
+    def restart(self, root: int) -> None:
+        """Forget the states of one root."""
 
     def features(self, tensordict: TensorDictBase) -> np.ndarray:
-        """Return the features of states, float32 ``[m, F]``."""
+        """Return the features of states, ``[m, F]`` of any numeric type."""
 
-    def accept(self, roots: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Return which of the new states are novel, bool ``[m]``, in order, and remember those."""
+    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        """Return which of the new states are novel, bool ``[m]``, in order, and remember those.
+
+        ``base_steps`` (int64 ``[m]``) lie between the root and the state.
+        """
 
     def relax(self, root: int) -> bool:
         """Be less strict for one root whose search is exhausted; False if that is impossible."""
@@ -44,6 +56,14 @@ class RadiusNovelty:
     radius must be smaller than the distance an option covers, or every outcome is refused; an
     exhausted search shrinks it and reopens what it had refused.
 
+    With ``shorter_paths`` a state is novel as well if its :math:`k` base steps from the root are
+    fewer than those of all accepted states around it, so that plans get shorter after the first:
+
+    .. math:: k(s) < \beta \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
+
+    The subtree behind the longer path stays. A grid of cells makes the cost of a test independent
+    of the size of the tree; with more than three features it spans the three that vary most.
+
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``.
         radius: in units of the (scaled) entries.
@@ -51,19 +71,28 @@ class RadiusNovelty:
         relaxation: factor of the radius when a search is exhausted, in ``(0, 1)``. Default
             0.75; a smaller factor reopens more at once, which the hardest searches pay for.
         max_relaxations: how often the radius of a search may be relaxed. Default 14, to a sixtieth.
+        shorter_paths: accept states near others that are reached in fewer base steps. Default
+            False: a place is searched from the first path to it. Meant for a budget that goes on
+            after the first plan (``improve_expansions``).
+        shorter_by: :math:`\beta` in ``(0, 1]``, the share of the base steps that a shorter path may
+            need at most. Default 1: a single step less will do; 0.9 asks for a tenth.
 
     Raises:
-        ValueError: if the radius is not positive, or the scales do not match the keys.
+        ValueError: if no key is given, the radius is not positive, the scales do not match the
+            keys, or a factor is out of its range.
 
     Reference:
         The idea for continuous states of width-1 novelty: Lipovetzky, Ramirez and Geffner,
-        "Classical planning with simulators", 2015.
+        "Classical planning with simulators", 2015. Shorter paths: the local dominance of Li,
+        Littlefield and Bekris, "Asymptotically optimal sampling-based kinodynamic planning", 2016
+        (stable sparse RRT).
 
     Example:
         >>> import numpy as np, torch
         >>> novelty = RadiusNovelty("position", radius=0.5)
         >>> novelty.start(num_roots=1)
-        >>> novelty.accept(np.array([0, 0, 0]), np.array([[0, 0], [0, 0.4], [0, 0.6]], np.float32))
+        >>> states = np.array([[0, 0], [0, 0.4], [0, 0.6]], np.float32)
+        >>> novelty.accept(np.array([0, 0, 0]), states, base_steps=np.array([0, 10, 10]))
         array([ True, False,  True])
     """
 
@@ -75,16 +104,17 @@ class RadiusNovelty:
         scale: Sequence[float] | None = None,
         relaxation: float = 0.75,
         max_relaxations: int = 14,
+        shorter_paths: bool = False,
+        shorter_by: float = 1.0,
     ) -> None:
-        keys = [key] if isinstance(key, (str, tuple)) else list(key)
-        self.in_keys = [unravel_key(k) for k in keys]
-        self.scale = [1.0] * len(keys) if scale is None else list(scale)
+        self.in_keys = _keys(key, "RadiusNovelty")
+        self.scale = [1.0] * len(self.in_keys) if scale is None else list(scale)
         if not (math.isfinite(radius) and radius > 0.0):
             raise ValueError(
                 f"RadiusNovelty needs a radius > 0, in units of {self.in_keys}; got {radius}. To "
                 f"search without a novelty test pass novelty=None to the planner."
             )
-        if len(self.scale) != len(keys):
+        if len(self.scale) != len(self.in_keys):
             raise ValueError(
                 f"RadiusNovelty needs one scale per key; got {len(self.scale)} for {self.in_keys}."
             )
@@ -94,17 +124,49 @@ class RadiusNovelty:
                 f"RadiusNovelty needs a relaxation in (0, 1), by which an exhausted search shrinks "
                 f"its radius; got {relaxation}."
             )
+        if not 0.0 < shorter_by <= 1.0:
+            raise ValueError(
+                f"RadiusNovelty needs shorter_by in (0, 1], the share of the base steps that a "
+                f"shorter path may need; got {shorter_by}. Use 1 for any path that is shorter."
+            )
         self.relaxation = float(relaxation)
         self.max_relaxations = max_relaxations
+        self.shorter_paths = shorter_paths
+        self.shorter_by = float(shorter_by)
         self.start(0)
 
     def start(self, num_roots: int) -> None:
-        self._radius = np.full(num_roots, self.radius)
+        self._num_roots = num_roots
+        self._known: np.ndarray | None = None  # [B] of novelty_kernels.RADIUS_ROOT
         self._relaxed = np.zeros(num_roots, np.int64)
-        self._num_seen = np.zeros(num_roots, np.int64)
-        self._seen = np.zeros((num_roots, 0, 0), np.float32)
         self.num_tested = 0
-        self.num_refused = 0
+        self._tally = np.zeros(2, np.int64)
+
+    def _make_room(self, num_features: int) -> None:
+        """Allocate for the first states, or double what there is; the grids are built anew."""
+        from torchrl_hmcts.planners.novelty_kernels import RADIUS_ROOT, accept_distant
+
+        self._accept_distant = accept_distant
+        if self._known is None:
+            self._known = np.zeros(self._num_roots, RADIUS_ROOT)
+            self._known["radius"] = self.radii
+            self._seen = np.zeros((self._num_roots, 0, num_features), np.float32)
+            self._seen_steps = np.zeros((self._num_roots, 0), np.int64)
+        old = self._seen.shape[1]
+        shape = (self._num_roots, max(64, 2 * old))
+        seen = np.zeros((*shape, num_features), np.float32)
+        seen[:, :old] = self._seen
+        steps = np.zeros(shape, np.int64)
+        steps[:, :old] = self._seen_steps
+        self._seen, self._seen_steps = seen, steps
+        self._links = np.zeros(shape, np.int32)
+        self._heads = np.zeros(shape, np.int32)
+        self._known["cell"] = 0.0
+
+    @property
+    def radii(self) -> np.ndarray:
+        """The radius of each root after its relaxations, float64 ``[B]``."""
+        return self.radius * self.relaxation**self._relaxed
 
     def features(self, tensordict: TensorDictBase) -> np.ndarray:
         parts = []
@@ -115,27 +177,213 @@ class RadiusNovelty:
         joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
         return joined.cpu().contiguous().numpy()
 
-    def accept(self, roots: np.ndarray, features: np.ndarray) -> np.ndarray:
-        from torchrl_hmcts.planners import kernels
+    def restart(self, root: int) -> None:
+        self._relaxed[root] = 0
+        if self._known is not None:
+            self._known[root] = 0
+            self._known["radius"][root] = self.radius
 
-        needed = int(self._num_seen.max(initial=0)) + len(roots)
-        if self._seen.shape[1] < needed or self._seen.shape[2] != features.shape[1]:
-            room = np.zeros((len(self._radius), max(64, 2 * needed), features.shape[1]), np.float32)
-            if self._seen.size:
-                room[:, : self._seen.shape[1]] = self._seen
-            self._seen = room
-        accepted = np.empty(len(roots), np.bool_)
-        kernels.accept_distant(self._seen, self._num_seen, self._radius, roots, features, accepted)
+    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        features = np.ascontiguousarray(features, np.float32)
+        if self._known is None:
+            self._make_room(features.shape[1])
+        _check_width(self, features, self._seen.shape[2])
+        accepted = np.zeros(len(roots), np.bool_)
+        shorter_by = self.shorter_by if self.shorter_paths else 0.0
+        begin = 0
+        while True:
+            begin = self._accept_distant(
+                self._seen, self._seen_steps, self._links, self._heads, self._known, self._tally,
+                roots, features, base_steps, shorter_by, accepted, begin,
+            )  # fmt: skip
+            if begin == len(roots):
+                break
+            self._make_room(features.shape[1])
         self.num_tested += len(roots)
-        self.num_refused += int(len(roots) - accepted.sum())
         return accepted
 
     def relax(self, root: int) -> bool:
         if self._relaxed[root] >= self.max_relaxations:
             return False
         self._relaxed[root] += 1
-        self._radius[root] *= self.relaxation
+        if self._known is not None:
+            self._known["radius"][root] = self.radii[root]
         return True
 
+    @property
+    def num_refused(self) -> int:
+        """How many of the tests refused a state."""
+        return int(self._tally[0])
+
+    def statistics(self) -> dict[str, int]:
+        """Return how many tests were made, and how many states they refused.
+
+        Tests repeated after a relaxation, or when the root moved on, are counted again. With
+        ``shorter_paths`` also how many states were accepted for a shorter path alone.
+        """
+        counts = {"novelty_tested": self.num_tested, "novelty_refused": self.num_refused}
+        if self.shorter_paths:
+            counts["novelty_shorter"] = int(self._tally[1])
+        return counts
+
     def __repr__(self) -> str:
-        return f"RadiusNovelty({self.in_keys}, radius={self.radius})"
+        shorter = ", shorter_paths=True" if self.shorter_paths else ""
+        return f"RadiusNovelty({self.in_keys}, radius={self.radius}{shorter})"
+
+
+class WidthNovelty:
+    r"""Refuses a state in which no feature has a value that is new to its tree.
+
+    .. math:: \text{novel}(s) \iff \exists f:\ \lvert \{ s' \in A : s'_f = s_f \} \rvert < n
+
+    with :math:`A` the accepted states and :math:`n = 1`, raised by one whenever a search is
+    exhausted. At most as many states are accepted as features have values, times :math:`n`: width-1
+    search, the "IW(1)" of classical planning. For discrete features, e.g. the 128 RAM bytes of an
+    Atari game.
+
+    Args:
+        key: entry or entries of the simulator's state or observation, ``[*B, f]``, of an integer
+            type or bool.
+        max_relaxations: how often :math:`n` may be raised for a search. Default 14; at most 254.
+
+    Raises:
+        ValueError: if no key is given or ``max_relaxations`` is out of its range.
+        TypeError: at the call, if an entry is not of an integer type.
+
+    Reference:
+        Lipovetzky, Ramirez and Geffner, "Classical planning with simulators: results on the Atari
+        video games", 2015.
+
+    Example:
+        >>> import numpy as np
+        >>> novelty = WidthNovelty("ram")
+        >>> novelty.start(num_roots=1)
+        >>> states = np.array([[1, 1], [2, 1], [2, 2], [1, 2]], np.uint8)
+        >>> novelty.accept(np.array([0, 0, 0, 0]), states, base_steps=np.array([0, 1, 1, 2]))
+        array([ True,  True,  True, False])
+    """
+
+    def __init__(self, key: NestedKey | Sequence[NestedKey], *, max_relaxations: int = 14) -> None:
+        self.in_keys = _keys(key, "WidthNovelty")
+        if not 0 <= max_relaxations <= 254:
+            raise ValueError(
+                f"WidthNovelty counts values up to 255, so that max_relaxations is from 0 to 254; "
+                f"got {max_relaxations}."
+            )
+        self.max_relaxations = max_relaxations
+        self.start(0)
+
+    def start(self, num_roots: int) -> None:
+        self._limits = np.ones(num_roots, np.int64)
+        self._used: np.ndarray | None = None
+        self.num_tested = 0
+        self._tally = np.zeros(1, np.int64)
+
+    def features(self, tensordict: TensorDictBase) -> np.ndarray:
+        parts = []
+        for key in self.in_keys:
+            part = tensordict.get(key)
+            if part.is_floating_point() or part.is_complex():
+                raise TypeError(
+                    f"WidthNovelty compares discrete values; {key!r} is of type {part.dtype}. Use "
+                    f"RadiusNovelty({key!r}, radius=...), or discretise the entry."
+                )
+            part = part.to(torch.uint8) if part.dtype == torch.bool else part
+            parts.append(part.reshape(len(part), -1))
+        joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+        return joined.cpu().contiguous().numpy()
+
+    def restart(self, root: int) -> None:
+        self._limits[root] = 1
+        if self._used is not None:
+            self._used[root] = 0
+            self._counts[root] = 0
+            self._owners[root] = -1
+
+    def _make_room(self, features: np.ndarray) -> None:
+        """Allocate the table of bytes, or of other integers, or double that of the latter."""
+        from torchrl_hmcts.planners import novelty_kernels
+
+        self._kernels = novelty_kernels
+        num_roots, num_features = len(self._limits), features.shape[1]
+        first = self._used is None
+        if first:
+            self._used = np.zeros(num_roots, np.int64)  # values in the hash table
+            self._slots = np.zeros(num_features, np.int64)
+            self._values = np.zeros((num_roots, 0), np.int64)
+            self._owners = np.zeros((num_roots, 0), np.int32)
+        if features.dtype == np.uint8:
+            self._counts: np.ndarray = np.zeros((num_roots, num_features, 256), np.uint8)
+            return
+        size = 64
+        while size < 4 * num_features or size <= self._owners.shape[1]:
+            size *= 2
+        values = np.zeros((num_roots, size), np.int64)
+        owners = np.full((num_roots, size), -1, np.int32)
+        counts = np.zeros((num_roots, size), np.uint8)
+        if not first:
+            self._kernels.move_values(
+                self._values, self._owners, self._counts, values, owners, counts
+            )
+        self._values, self._owners, self._counts = values, owners, counts
+
+    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        if features.dtype != np.uint8:
+            features = features.astype(np.int64, copy=False)
+        features = np.ascontiguousarray(features)
+        if self._used is None:
+            self._make_room(features)
+        _check_width(self, features, len(self._slots))
+        accepted = np.zeros(len(roots), np.bool_)
+        if features.dtype == np.uint8:
+            self._kernels.accept_new_bytes(
+                self._counts, self._limits, self._tally, roots, features, accepted
+            )
+        else:
+            begin = 0
+            while True:
+                begin = self._kernels.accept_new_integers(
+                    self._values, self._owners, self._counts, self._used, self._limits,
+                    self._tally, roots, features, accepted, self._slots, begin,
+                )  # fmt: skip
+                if begin == len(roots):
+                    break
+                self._make_room(features)
+        self.num_tested += len(roots)
+        return accepted
+
+    def relax(self, root: int) -> bool:
+        if self._limits[root] > self.max_relaxations:
+            return False
+        self._limits[root] += 1
+        return True
+
+    @property
+    def num_refused(self) -> int:
+        """How many of the tests refused a state."""
+        return int(self._tally[0])
+
+    def statistics(self) -> dict[str, int]:
+        """Return how many tests were made, and how many states they refused.
+
+        Tests repeated after a relaxation, or when the root moved on, are counted again.
+        """
+        return {"novelty_tested": self.num_tested, "novelty_refused": self.num_refused}
+
+    def __repr__(self) -> str:
+        return f"WidthNovelty({self.in_keys})"
+
+
+def _keys(key: NestedKey | Sequence[NestedKey], name: str) -> list[NestedKey]:
+    keys = [key] if isinstance(key, (str, tuple)) else list(key)
+    if not keys:
+        raise ValueError(f'{name} needs the entries it compares; got none. Name them, e.g. "ram".')
+    return [unravel_key(k) for k in keys]
+
+
+def _check_width(test: RadiusNovelty | WidthNovelty, features: np.ndarray, width: int) -> None:
+    if features.shape[1] != width:
+        raise ValueError(
+            f"{test} has seen states with {width} features; got {features.shape[1]}. Call "
+            f"start(num_roots) before testing others."
+        )

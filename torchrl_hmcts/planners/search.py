@@ -6,22 +6,43 @@ search, and :meth:`Search.insert`. Nothing here knows tensordicts or environment
 
 from __future__ import annotations
 
+import copy
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from torchrl_hmcts.planners.backups import Backup, MaxBackup
+from torchrl_hmcts.planners.chance import ProgressiveWidening
+from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
-from torchrl_hmcts.planners.tree import CLOSED, PRUNED, REWARDED, SearchTree
-from torchrl_hmcts.planners.tree_policies import PUCT, TreePolicy
+from torchrl_hmcts.planners.scored_descent import select_by_scores
+from torchrl_hmcts.planners.transpositions import Transpositions
+from torchrl_hmcts.planners.tree import (
+    CLOSED,
+    FORBIDDEN,
+    PENDING,
+    PRUNED,
+    REWARDED,
+    TERMINAL,
+    WAVE,
+    SearchTree,
+)
+from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, TreePolicy
+
+NO_LIMIT = np.iinfo(np.int64).max
 
 
-class Wave(NamedTuple):
+class Wave:
     """What to simulate next: take ``options[i]`` in node ``nodes[i]`` of root ``roots[i]``."""
 
-    roots: np.ndarray  # [m] int64
-    nodes: np.ndarray  # [m] int64
-    options: np.ndarray  # [m] int64
+    def __init__(self, records: np.ndarray) -> None:
+        self.records = records  # [m] of tree.WAVE
+        self.roots = np.ascontiguousarray(records["root"])  # [m] int64
+        self.nodes = np.ascontiguousarray(records["node"])  # [m] int64
+        self.options = np.ascontiguousarray(records["option"])  # [m] int64
+
+    def __len__(self) -> int:
+        return len(self.records)
 
 
 class Outcomes(NamedTuple):
@@ -34,6 +55,19 @@ class Outcomes(NamedTuple):
     values: np.ndarray  # [m] float32, the leaf evaluator's
     priors: np.ndarray  # [m, A] float32, or [0, A] for uniform
     masks: np.ndarray  # [m, A] bool: options that may be taken, or [0, A] for all
+    features: np.ndarray | None = None  # [m, F], the novelty test's
+    codes: np.ndarray | None = None  # [m, K] uint8, states as bytes: for equal states
+
+
+class RootStates(NamedTuple):
+    """What is known of roots before they are searched."""
+
+    values: np.ndarray  # [m] float32
+    done: np.ndarray  # [m] bool
+    priors: np.ndarray  # [m, A] float32, or [0, A] for uniform
+    masks: np.ndarray  # [m, A] bool, or [0, A] for all
+    features: np.ndarray | None = None  # [m, F]
+    codes: np.ndarray | None = None  # [m, K] uint8
 
 
 class Search:
@@ -45,9 +79,14 @@ class Search:
         tree_policy: see :mod:`~torchrl_hmcts.planners.tree_policies`.
         backup: see :mod:`~torchrl_hmcts.planners.backups`.
         novelty: see :mod:`~torchrl_hmcts.planners.novelty`, or None.
+        transpositions: see :mod:`~torchrl_hmcts.planners.transpositions`, or None.
+        chance: see :mod:`~torchrl_hmcts.planners.chance`, or None for a deterministic simulator.
         expand: ``"all"`` simulates every option of a leaf, ``"one"`` the option the tree policy
             chooses.
-        leaves_per_wave: leaves each root contributes to a wave.
+        leaves_per_wave: leaves each root contributes to a wave, at most 255.
+        exhausted: what a descent does with an option behind which nothing is left to simulate:
+            ``"skip"`` it, or ``"revisit"`` it and back its known value up once more.
+        capacity: nodes per root to make room for at first.
     """
 
     def __init__(
@@ -57,130 +96,306 @@ class Search:
         *,
         tree_policy: TreePolicy,
         backup: Backup,
-        novelty: NoveltyTest | None,
+        novelty: NoveltyTest | None = None,
+        transpositions: Transpositions | None = None,
+        chance: ProgressiveWidening | None = None,
         expand: Literal["all", "one"] = "all",
         leaves_per_wave: int = 1,
+        exhausted: Literal["skip", "revisit"] = "skip",
+        capacity: int = 64,
     ) -> None:
         from torchrl_hmcts.planners import kernels
 
         self._kernels = kernels
         self.tree_policy = tree_policy
-        self.novelty = novelty
+        # Copies: what one search has seen is nothing to the next, nor to one that is resumed later.
+        self.novelty = copy.copy(novelty)
+        self.transpositions = copy.copy(transpositions)
         self.num_options = num_options
         self.num_roots = num_roots
         self.expand_all = expand == "all"
         self.leaves_per_wave = leaves_per_wave
-        is_puct = isinstance(tree_policy, PUCT)
-        self._score = kernels.PUCT_SCORE if is_puct else kernels.UCT_SCORE
-        self._unvisited_value = (
-            tree_policy.unvisited_value if isinstance(tree_policy, PUCT) else 0.0
+        self.stochastic = chance is not None
+        self.max_backup = isinstance(backup, MaxBackup)
+        self.settings = np.zeros(1, kernels.SETTINGS)
+        settings = self.settings[0]
+        settings["backup"] = kernels.MAX_BACKUP if self.max_backup else kernels.MEAN_BACKUP
+        settings["expand_all"] = self.expand_all
+        settings["leaves"] = leaves_per_wave
+        settings["mark"] = leaves_per_wave > 1
+        # Chance options never close, and halving counts visits: both land on what they know.
+        revisit = exhausted == "revisit" or self.stochastic or isinstance(tree_policy, Gumbel)
+        settings["revisit"] = revisit
+        settings["twins"] = transpositions is not None
+        if chance is not None:
+            settings["widening"], settings["widening_exponent"] = chance.k, chance.alpha
+        self._set_policy(tree_policy)
+        self.tree = SearchTree(num_roots, num_options, capacity=capacity)
+        self._wave = np.zeros(
+            num_roots * leaves_per_wave * (num_options if self.expand_all else 1), WAVE
         )
-        self._backup = kernels.MAX_BACKUP if isinstance(backup, MaxBackup) else kernels.MEAN_BACKUP
-        self.tree = SearchTree(num_roots, num_options)
-        self.num_expansions = np.zeros(num_roots, np.int64)
-        self.num_base_steps = np.zeros(num_roots, np.int64)
-        self.best_node = np.full(num_roots, -1, np.int64)  # end of the best plan so far
-        self.best_return = np.full(num_roots, -np.inf)
-        self.expansions_to_plan = np.full(num_roots, -1, np.int64)
-        self.base_steps_to_plan = np.full(num_roots, -1, np.int64)
+        self._gumbel = np.zeros((0, 0), np.float32)
+        self.seeds = np.arange(num_roots)
+        self._room = 1  # nodes of the largest tree, at most
 
-    def start(
+    def __getstate__(self) -> dict[str, Any]:  # a module can be neither copied nor sent
+        return {**self.__dict__, "_kernels": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        from torchrl_hmcts.planners import kernels
+
+        self.__dict__.update(state, _kernels=kernels)
+
+    def _set_policy(self, tree_policy: TreePolicy) -> None:
+        kernels, settings = self._kernels, self.settings[0]
+        self._scores = None
+        if isinstance(tree_policy, UCT):
+            settings["score"], settings["c"] = kernels.UCT_SCORE, tree_policy.c
+        elif isinstance(tree_policy, PUCT):
+            settings["score"], settings["c"] = kernels.PUCT_SCORE, tree_policy.c
+            settings["c_base"] = tree_policy.c_base or 0.0
+            settings["unvisited_value"] = tree_policy.unvisited_value
+            settings["normalize"] = {
+                None: kernels.RAW_VALUES,
+                "siblings": kernels.SIBLINGS,
+                "tree": kernels.WHOLE_TREE,
+            }[tree_policy.normalize]
+        elif isinstance(tree_policy, Gumbel):
+            settings["score"], settings["c"] = kernels.GUMBEL_SCORE, tree_policy.c_visit
+            settings["c_scale"] = tree_policy.c_scale
+        else:
+            self._scores, settings["mark"] = tree_policy, 1
+
+    # ------------------------------------------------------------------ what is known of the roots
+
+    @property
+    def roots(self) -> np.ndarray:
+        """Counters of the roots, ``[B]`` of ``tree.ROOT``."""
+        return self.tree.roots
+
+    @property
+    def num_simulations(self) -> np.ndarray:
+        """Options simulated or revisited since :meth:`begin`, int64 ``[B]``."""
+        return self.roots["simulations"]
+
+    @property
+    def num_expansions(self) -> np.ndarray:
+        """Expansions since :meth:`begin`, int64 ``[B]``."""
+        return self.roots["expansions"]
+
+    @property
+    def num_base_steps(self) -> np.ndarray:
+        """Base steps simulated since :meth:`begin`, int64 ``[B]``."""
+        return self.roots["base_steps"]
+
+    @property
+    def best_node(self) -> np.ndarray:
+        """End of the best plan so far, int64 ``[B]``, -1 without one."""
+        return self.roots["best_node"]
+
+    @property
+    def best_return(self) -> np.ndarray:
+        """Discounted return of the best plan so far, float64 ``[B]``, -inf without one."""
+        return self.roots["best_return"]
+
+    @property
+    def expansions_to_plan(self) -> np.ndarray:
+        """Expansions when the first plan was found, int64 ``[B]``, -1 without one."""
+        return self.roots["expansions_to_plan"]
+
+    @property
+    def base_steps_to_plan(self) -> np.ndarray:
+        """Base steps simulated when the first plan was found, int64 ``[B]``, -1 without one."""
+        return self.roots["base_steps_to_plan"]
+
+    # ------------------------------------------------------------------ growing
+
+    def begin(self, max_simulations: int | None = None) -> None:
+        """Count simulations, expansions and base steps from 0, up to a number of simulations."""
+        limit = NO_LIMIT if max_simulations is None else max_simulations
+        self._kernels.begin(self.tree.roots, limit)
+
+    def start(self, known: RootStates, rows: np.ndarray | None = None) -> None:
+        """Plant the roots ``rows`` (all by default), one for each row of ``known``."""
+        first = rows is None
+        if rows is None:
+            rows = np.arange(self.num_roots)
+        tree = self.tree
+        for test, codes in ((self.novelty, known.features), (self.transpositions, known.codes)):
+            if test is not None:
+                assert codes is not None
+                if first:
+                    test.start(self.num_roots)
+                else:
+                    for root in rows:
+                        test.restart(int(root))
+        if known.features is not None and first:
+            features = known.features
+            shape = (self.num_roots, tree.capacity, features.shape[1])
+            tree.features = np.zeros(shape, features.dtype)
+        if known.codes is not None and first:
+            shape = (self.num_roots, tree.capacity, known.codes.shape[1])
+            tree.codes = np.zeros(shape, np.uint8)
+        self._kernels.add_roots(
+            tree.nodes, tree.edges, tree.roots, rows, known.values, known.done, known.priors,
+            known.masks,
+        )  # fmt: skip
+        zeros = np.zeros(len(rows), np.int64)
+        self._remember(rows, zeros, known.features, known.codes)
+        if self.novelty is not None and known.features is not None:
+            self.novelty.accept(rows, known.features, zeros)
+        if self.transpositions is not None and known.codes is not None:
+            self.transpositions.find(rows, known.codes, zeros)
+
+    def _remember(
         self,
-        values: np.ndarray,
-        done: np.ndarray,
-        priors: np.ndarray,
-        masks: np.ndarray,
+        roots: np.ndarray,
+        nodes: np.ndarray,
         features: np.ndarray | None,
+        codes: np.ndarray | None,
     ) -> None:
-        """Plant the roots: values and done ``[B]``, priors and masks as in :class:`Outcomes`."""
-        tree = self.tree
         if features is not None:
-            assert self.novelty is not None
-            tree.features = np.zeros((self.num_roots, tree.capacity, features.shape[1]), np.float32)
-            tree.features[:, 0] = features
-            self.novelty.start(self.num_roots)
-            self.novelty.accept(np.arange(self.num_roots), features)
-        for b in range(self.num_roots):
-            self._kernels.add_root(
-                tree.nodes, tree.edges, tree.num_nodes, b, values[b], done[b], priors, masks
+            self.tree.features[roots, nodes] = features
+        if codes is not None:
+            self.tree.codes[roots, nodes] = codes
+
+    def select(self, active: np.ndarray | None = None) -> Wave:
+        """Choose the options to simulate for the roots ``active`` (all that are, by default).
+
+        A root that is exhausted or has spent its simulations adds none.
+        """
+        if active is not None:
+            self.roots["active"] = 0
+            self.roots["active"][active] = 1
+        tree = self.tree
+        if self._scores is not None:
+            try:
+                count = select_by_scores(self, self._scores, self._wave)
+            except BaseException:  # e.g. a policy that raises: forget the half-made wave
+                tree.edges["in_flight"] = 0
+                tree.nodes["flags"] &= ~PENDING
+                raise
+        else:
+            count = self._kernels.select(
+                tree.nodes, tree.edges, tree.roots, self.settings, self._gumbel, self._wave
             )
+        return Wave(self._wave[:count])
 
-    def select(self, active: np.ndarray) -> Wave:
-        """Choose the options to simulate for the roots ``active``; none for a closed root."""
-        size = len(active) * self.leaves_per_wave * (self.num_options if self.expand_all else 1)
-        roots, nodes, options = (np.empty(size, np.int64) for _ in range(3))
-        tree = self.tree
-        count = self._kernels.select(
-            tree.nodes,
-            tree.edges,
-            active,
-            self.leaves_per_wave,
-            self.expand_all,
-            self._score,
-            self.tree_policy.c,
-            self._unvisited_value,
-            roots,
-            nodes,
-            options,
-        )
-        return Wave(roots[:count], nodes[:count], options[:count])
+    def cancel(self, wave: Wave) -> None:
+        """Take a wave back that will not be inserted, e.g. after an error in the simulator."""
+        self._kernels.cancel(self.tree.nodes, self.tree.edges, self.settings, wave.records)
 
-    def insert(self, wave: Wave, outcomes: Outcomes, features: np.ndarray | None) -> np.ndarray:
-        """Append the outcomes of a wave and back them up; return their nodes, int64 ``[m]``."""
-        tree, m = self.tree, len(wave.roots)
-        per_root = np.bincount(wave.roots, minlength=self.num_roots)
-        tree.reserve(int((tree.num_nodes + per_root).max()))
+    def insert(
+        self, wave: Wave, outcomes: Outcomes, merges: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Append the outcomes of a wave and back them up; return their nodes, int64 ``[m]``.
+
+        ``merges`` (int64 ``[m]``) names the outcome of the same option that has the same state, or
+        -1; only in a stochastic simulator.
+        """
+        tree, m = self.tree, len(wave)
+        self.reserve_wave()
         novel = np.ones(m, np.bool_)
-        if features is not None:
-            assert self.novelty is not None
-            open_ended = np.flatnonzero(~outcomes.done)
-            novel[open_ended] = self.novelty.accept(wave.roots[open_ended], features[open_ended])
-        new_nodes = np.empty(m, np.int64)
+        nothing = np.empty(0, np.int64)
+        twins = nothing
+        if self.transpositions is not None or self.novelty is not None:
+            goes_on = np.flatnonzero(~outcomes.done)
+            roots = wave.roots[goes_on]
+        if self.transpositions is not None:
+            assert outcomes.codes is not None
+            twins = np.full(m, -1, np.int64)
+            nodes = self._kernels.number_nodes(tree.roots, wave.roots)
+            twins[goes_on] = self.transpositions.find(
+                roots, outcomes.codes[goes_on], nodes[goes_on]
+            )
+            goes_on = goes_on[twins[goes_on] < 0]
+            roots = wave.roots[goes_on]
+        if self.novelty is not None:
+            assert outcomes.features is not None
+            steps = tree.nodes["base_steps"][wave.roots, wave.nodes] + outcomes.durations
+            novel[goes_on] = self.novelty.accept(roots, outcomes.features[goes_on], steps[goes_on])
         self._kernels.insert(
-            tree.nodes,
-            tree.edges,
-            tree.num_nodes,
-            m,
-            wave.roots,
-            wave.nodes,
-            wave.options,
-            outcomes.rewards,
-            outcomes.discounts,
-            outcomes.durations,
-            outcomes.done,
-            novel,
-            outcomes.values,
-            outcomes.priors,
+            tree.nodes, tree.edges, tree.roots, self.settings, wave.records, outcomes.rewards,
+            outcomes.discounts, outcomes.durations, outcomes.done, novel, twins,
+            nothing if merges is None else merges, outcomes.values, outcomes.priors,
             outcomes.masks,
-            self.expand_all,
-            self._backup,
-            new_nodes,
-        )
-        if features is not None:
-            tree.features[wave.roots, new_nodes] = features
-        self._count(wave, outcomes, new_nodes)
+        )  # fmt: skip
+        new_nodes = np.ascontiguousarray(wave.records["new_node"])
+        self._remember(wave.roots, new_nodes, outcomes.features, outcomes.codes)
         return new_nodes
 
-    def _count(self, wave: Wave, outcomes: Outcomes, new_nodes: np.ndarray) -> None:
-        if self.expand_all:
-            leaves = np.unique(np.stack((wave.roots, wave.nodes)), axis=1)[0]
-        else:
-            leaves = wave.roots
-        self.num_expansions += np.bincount(leaves, minlength=self.num_roots)
-        steps = np.bincount(wave.roots, weights=outcomes.durations, minlength=self.num_roots)
-        self.num_base_steps += steps.astype(np.int64)
-        for i in np.flatnonzero(outcomes.rewards > 0.0):
-            b = wave.roots[i]
-            total = self.tree.nodes[b, new_nodes[i]]["path_return"]
-            if total > self.best_return[b]:
-                self.best_return[b], self.best_node[b] = total, new_nodes[i]
-            if self.expansions_to_plan[b] < 0:
-                self.expansions_to_plan[b] = self.num_expansions[b]
-                self.base_steps_to_plan[b] = self.num_base_steps[b]
+    def seed(self, seeds: np.ndarray) -> None:
+        """Give each root the seed of its random numbers, int64 ``[B]``."""
+        self.seeds = seeds
+
+    def generator(self, root: int, purpose: str) -> np.random.Generator:
+        """Return random numbers that depend on the root's seed and on what they are for."""
+        return np.random.default_rng([int(self.seeds[root]), *purpose.encode()])
+
+    def add_noise(self, noise: DirichletNoise, roots: np.ndarray) -> None:
+        """Mix noise into the priors of the roots' options."""
+        edges = self.tree.edges
+        for b in roots.tolist():
+            allowed = edges["closed"][b, 0] != FORBIDDEN
+            prior = np.where(allowed, edges["prior"][b, 0], 0.0)
+            drawn = np.zeros(self.num_options)
+            if not allowed.any():
+                continue
+            drawn[allowed] = self.generator(b, "noise").dirichlet(
+                np.full(int(allowed.sum()), noise.alpha)
+            )
+            prior = prior / max(prior.sum(), 1e-12)
+            edges["prior"][b, 0] = (1.0 - noise.fraction) * prior + noise.fraction * drawn
+
+    def halve(self, num_simulations: int) -> None:
+        """Draw the Gumbel noise of the roots, and plan how simulations are halved among options."""
+        policy = self.tree_policy
+        assert isinstance(policy, Gumbel)
+        allowed = self.allowed()
+        self._gumbel = np.zeros((self.num_roots, self.num_options + num_simulations), np.float32)
+        schedules: dict[int, list[int]] = {}
+        with np.errstate(divide="ignore"):
+            logits = np.log(self.tree.edges["prior"][:, 0])
+        self._gumbel[:, : self.num_options] = np.maximum(logits, -1e9)
+        for b, num_allowed in enumerate(allowed.sum(-1).tolist()):
+            if policy.scale > 0.0:
+                noise = self.generator(b, "gumbel").gumbel(size=self.num_options)
+                self._gumbel[b, : self.num_options] += policy.scale * noise
+            considered = min(policy.max_considered, num_allowed)
+            if considered not in schedules:
+                schedules[considered] = policy.considered_visits(considered, num_simulations)
+            self._gumbel[b, self.num_options :] = schedules[considered]
+
+    def gumbel_choice(self) -> np.ndarray:
+        """Return the option that a Gumbel search ends on for each root, int64 ``[B]``."""
+        assert isinstance(self.tree_policy, Gumbel)
+        tree, sigma = self.tree, np.empty(self.num_options)
+        allowed = self.allowed()
+        visits = np.where(allowed, tree.edges["visits"][:, 0], -1)
+        scores = np.where(visits == visits.max(-1, keepdims=True), 0.0, -np.inf)
+        for b in range(self.num_roots):
+            self._kernels.completed_values(tree.nodes, tree.edges, self.settings, b, 0, sigma)
+            scores[b] += self._gumbel[b, : self.num_options] + sigma
+        choice: np.ndarray = np.where(allowed, scores, -np.inf).argmax(-1)
+        return choice
+
+    def reserve_wave(self) -> None:
+        """Make room for the nodes of one wave."""
+        per_root = len(self._wave) // max(self.num_roots, 1)
+        if self._room + per_root > self.tree.capacity:
+            self._room = int(self.tree.num_nodes.max(initial=1))
+            self.tree.reserve(self._room + per_root)
+        self._room += per_root
 
     def exhausted(self, roots: np.ndarray) -> np.ndarray:
         """Return which of the roots have nothing left to simulate, bool ``[len(roots)]``."""
-        return (self.tree.nodes[roots, 0]["flags"] & CLOSED) != 0
+        return (self.tree.nodes["flags"][roots, 0] & CLOSED) != 0
+
+    @property
+    def revisits_exhausted(self) -> bool:
+        """Whether an exhausted root still spends its simulations on what it knows."""
+        revisit = bool(self.settings["revisit"][0])
+        return revisit and bool((self.roots["limit"] != NO_LIMIT).all())
 
     def relax(self, root: int) -> bool:
         """Make the novelty test less strict for an exhausted root; return whether it opened."""
@@ -188,28 +403,109 @@ class Search:
             return False
         tree = self.tree
         while self.novelty.relax(root):
-            flags = tree.nodes[root, : tree.num_nodes[root]]["flags"]
+            flags = tree.nodes["flags"][root, : tree.num_nodes[root]]
             pruned = np.flatnonzero(flags & PRUNED)
+            pruned = pruned[tree.nodes["twin"][root, pruned] < 0]
             if not len(pruned):
                 return False
-            again = self.novelty.accept(
-                np.full(len(pruned), root), np.ascontiguousarray(tree.features[root, pruned])
-            )
-            for node in pruned[again]:
-                if tree.nodes[root, node]["open_options"] > 0:
-                    self._kernels.reopen(tree.nodes, tree.edges, root, node)
+            self._reopen(root, pruned)
             if not self.exhausted(np.array([root]))[0]:
                 return True
         return False
+
+    def _reopen(self, root: int, pruned: np.ndarray) -> None:
+        """Put nodes that were refused to the novelty test again."""
+        tree = self.tree
+        again = np.ones(len(pruned), np.bool_)
+        if self.novelty is not None:
+            again = self.novelty.accept(
+                np.full(len(pruned), root),
+                np.ascontiguousarray(tree.features[root, pruned]),
+                tree.nodes["base_steps"][root, pruned].astype(np.int64),
+            )
+        for node in pruned[again]:
+            self._kernels.reopen(tree.nodes, tree.edges, root, node)
+
+    def solve(self, root: int, tolerance: float = 1e-7) -> None:
+        """Make the values of an exhausted tree exact, where equal states share what is known.
+
+        With a max backup only; without transpositions they are exact already.
+        """
+        if self.max_backup and self.transpositions is not None:
+            tree = self.tree
+            self._kernels.solve(tree.nodes, tree.edges, tree.roots, root, tolerance, 10_000)
+
+    # ------------------------------------------------------------------ from decision to decision
+
+    def outcomes_of(self, root: int, option: int, node: int = 0) -> list[int]:
+        """Return the nodes that an option of a node, the root by default, has led to."""
+        nodes, child = [], int(self.tree.edges["child"][root, node, option])
+        while child >= 0:
+            nodes.append(child)
+            child = int(self.tree.nodes["sibling"][root, child])
+        return nodes
+
+    def reroot(self, root: int, node: int) -> None:
+        """Make a node the new root: its subtree stays, with all values, the rest is dropped."""
+        tree = self.tree
+        kept = np.empty(tree.num_nodes[root], np.int64)
+        count = self._kernels.reroot(tree.nodes, tree.edges, tree.roots, root, node, kept)
+        kept = kept[:count]
+        tree.features[root, :count] = tree.features[root, kept]
+        tree.codes[root, :count] = tree.codes[root, kept]
+        if tree.states is not None:
+            rows = tree.states[root]
+            rows[:count] = rows[kept]
+        flags = tree.nodes["flags"][root, :count]
+        goes_on = np.flatnonzero((flags & (PRUNED | TERMINAL)) == 0)
+        pruned = np.flatnonzero((flags & PRUNED) != 0)
+        if self.transpositions is not None:
+            self.transpositions.restart(root)
+            self.transpositions.find(
+                np.full(len(goes_on), root),
+                np.ascontiguousarray(tree.codes[root, goes_on]),
+                goes_on,
+            )
+            twins = self.transpositions.find(
+                np.full(len(pruned), root), np.ascontiguousarray(tree.codes[root, pruned]), pruned
+            )
+            tree.nodes["twin"][root, pruned] = twins
+            pruned = pruned[twins < 0]
+        if self.novelty is not None:
+            self.novelty.restart(root)
+            self.novelty.accept(
+                np.full(len(goes_on), root),
+                np.ascontiguousarray(tree.features[root, goes_on]),
+                tree.nodes["base_steps"][root, goes_on].astype(np.int64),
+            )
+        if len(pruned):  # what refused them may be gone
+            self._reopen(root, pruned)
+        self._room = tree.capacity
+
+    # ------------------------------------------------------------------ looking at it
+
+    def allowed(self, nodes: np.ndarray | int = 0) -> np.ndarray:
+        """Return the options that may be taken in a node of each root, bool ``[B, A]``."""
+        rows = np.arange(self.num_roots)
+        allowed: np.ndarray = self.tree.edges["closed"][rows, nodes] != FORBIDDEN
+        return allowed
 
     def statistics(self) -> dict[str, Any]:
         """Return counts of the whole search, for logs."""
         used = np.arange(self.tree.capacity) < self.tree.num_nodes[:, None]
         flags = self.tree.nodes["flags"]
-        return {
+        twins = self.tree.nodes["twin"] >= 0
+        counts = {
             "nodes": int(self.tree.num_nodes.sum()),
             "pruned": int(((flags & PRUNED) != 0)[used].sum()),
+            "transposed": int(twins[used].sum()) if self.transpositions is not None else 0,
             "rewarded": int(((flags & REWARDED) != 0)[used].sum()),
+            "simulations": int(self.num_simulations.sum()),
+            "revisits": int(self.roots["revisits"].sum()),
             "expansions": int(self.num_expansions.sum()),
             "base_steps": int(self.num_base_steps.sum()),
         }
+        for test in (self.novelty, self.transpositions):
+            if test is not None and hasattr(test, "statistics"):
+                counts.update(test.statistics())
+        return counts

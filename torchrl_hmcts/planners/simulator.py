@@ -1,5 +1,10 @@
 """A macro environment as the planner sees it: states in, outcomes of options out.
 
+Two kinds of env can be set to any state. A stateless one (``batch_locked=False``) keeps its state
+in the tensordict: all states of a wave are one call. One with a state of its own (e.g. TorchRL's
+MuJoCo envs) is set by ``reset(td, set_state=True)`` and steps as many states at a time as its batch
+size holds.
+
 Letters: ``m`` states of one call, ``A`` options.
 """
 
@@ -17,13 +22,14 @@ from torchrl.envs import EnvBase
 
 
 class Simulator:
-    """Sets a stateless macro environment to states and takes one macro-step from each of them.
+    """Sets a macro environment to states and takes one macro-step from each of them.
 
     Args:
         env: the macro environment.
-        extra_keys: further entries to keep with every node, for novelty tests and evaluators.
+        extra_keys: further entries that novelty tests and evaluators read.
         duration_key: base steps of a macro-step.
         mask_key: options that may be taken.
+        reward_key: Default: the env's only reward.
 
     Raises:
         ValueError: if the env cannot be set to a state or has no single discrete action.
@@ -36,6 +42,7 @@ class Simulator:
         extra_keys: Sequence[NestedKey] = (),
         duration_key: NestedKey = "duration",
         mask_key: NestedKey = "action_mask",
+        reward_key: NestedKey | None = None,
     ) -> None:
         name = type(getattr(env, "base_env", env)).__name__
         if not isinstance(env, EnvBase):
@@ -43,12 +50,14 @@ class Simulator:
                 f"MCTSPlanner plans in a TorchRL env; got {type(env).__name__}. Wrap a Gymnasium "
                 f"env as described in TorchRL's GymWrapper, with a state that can be set."
             )
-        if not env._supports_set_state or env.batch_locked:
+        self.stateless = not env.batch_locked
+        if not (env._supports_set_state or self.stateless):
             raise ValueError(
                 f"MCTSPlanner needs an env it can set to any state; {name} cannot "
                 f"(_supports_set_state={env._supports_set_state}, "
-                f"batch_locked={env.batch_locked}). Use "
-                f"one that is stateless, e.g. WaterworldMazeEnv() or GridworldMazeEnv()."
+                f"batch_locked={env.batch_locked}). Use one that is stateless, e.g. "
+                f"WaterworldMazeEnv() or GridworldMazeEnv(), or one whose reset(td, "
+                f"set_state=True) restores the state in td."
             )
         if len(env.action_keys) != 1:
             raise ValueError(
@@ -73,27 +82,27 @@ class Simulator:
         if not self.state_keys:
             raise ValueError(
                 f"{name} has an empty state_spec, so its state cannot be stored in a tree. Declare "
-                f"in state_spec every entry that its _step reads."
+                f"in state_spec every entry that its _step reads or that reset(td, set_state=True) "
+                f"restores (for TorchRL's MujocoEnv qpos and qvel, by a transform)."
             )
         available = {unravel_key(k) for k in env.full_observation_spec.keys(True, True)}
         available |= set(self.state_keys)
+        self._available, self._name = available, name
         extra = [unravel_key(k) for k in extra_keys]
-        for key in extra:
-            if key not in available:
-                raise ValueError(
-                    f"The novelty test or an evaluator reads {key!r}, which {name} does not have. "
-                    f"Its entries: {sorted(map(str, available))}."
-                )
+        self._check_available(extra, "The novelty test or an evaluator")
+        self.kept_keys = list(self.state_keys)
         self.duration_key = unravel_key(duration_key) if duration_key in available else None
         self.mask_key = unravel_key(mask_key) if mask_key in available else None
         self.root_keys = list(dict.fromkeys([*self.state_keys, *extra]))
         if self.mask_key is not None:
             self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))
-        self._reward_key = env.reward_keys[0]
+        self._reward_key = _reward_key(env, name, reward_key)
         self._done_spec = env.full_done_spec_unbatched  # a call has m states, not env.batch_size
-        leaves = [unravel_key(k) for k in env.done_keys]
+        leaves = self._done_keys = [unravel_key(k) for k in env.done_keys]
         self._done_key = next(k for k in leaves if _last(k) == "done")
         self._terminated_key = next((k for k in leaves if _last(k) == "terminated"), self._done_key)
+        self._ones = np.ones(0, np.int64)
+        self._no_masks = np.zeros((0, self.num_options), np.bool_)
 
     def root(self, td: TensorDictBase) -> TensorDictBase:
         """Return the root states in one batch dimension, after checking them."""
@@ -110,37 +119,69 @@ class Simulator:
                 bad = value[~torch.isfinite(value)][0].item()
                 raise ValueError(
                     f'The state to plan from has "{key}" = {bad}. A state that is not finite '
-                    f"cannot be "
-                    f"simulated; find the step that wrote it."
+                    f"cannot be simulated; find the step that wrote it."
                 )
         flat: TensorDictBase = td.reshape(-1) if len(td.batch_size) != 1 else td
         return flat
 
     def state(self, td: TensorDictBase) -> TensorDictBase:
-        """Return the part of ``td`` from which the simulator can go on."""
-        return td.select(*self.state_keys)
+        """Return what is stored of a state: that from which the simulator can go on, and more."""
+        return td.select(*self.kept_keys)
+
+    def keep(self, keys: Sequence[NestedKey]) -> None:
+        """Store further entries of the observation with every node, before a search begins."""
+        self._check_available(keys, "The policy that carries plans out")
+        self.kept_keys = list(dict.fromkeys([*self.kept_keys, *keys]))
+        self.root_keys = list(dict.fromkeys([*self.root_keys, *keys]))
+
+    def _check_available(self, keys: Sequence[NestedKey], reader: str) -> None:
+        for key in keys:
+            if key not in self._available:
+                raise ValueError(
+                    f"{reader} reads {key!r}, which {self._name} does not have. "
+                    f"Its entries: {sorted(map(str, self._available))}."
+                )
 
     def step(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Take option ``options[i]`` in state ``i``; return what the env writes as next."""
         option = torch.from_numpy(options)
-        if self.env.device is not None:
+        if self.env.device is not None and self.env.device.type != "cpu":
             option = option.to(self.env.device)
-        states.set(self.option_key, self.encode(option))
-        after = self.env._step(states)
-        self.env._complete_done(self._done_spec, after)
+        _put(states, self.option_key, self.encode(option))
+        after = self.env._step(states) if self.stateless else self._step_in_turn(states)
+        if any(_entry(after, key) is None for key in self._done_keys):
+            self.env._complete_done(self._done_spec, after)
+        for key in self.state_keys:
+            if _entry(after, key) is None:  # the env leaves it as it was
+                after.set(key, states.get(key))
         return after
+
+    def _step_in_turn(self, states: TensorDictBase) -> TensorDictBase:
+        """Set an env with a state of its own to as many states as it holds at a time, and step."""
+        env, m = self.env, len(states)
+        size = env.batch_size.numel()
+        parts = []
+        for begin in range(0, m, size):
+            rows = torch.arange(begin, begin + size).clamp_max(m - 1)  # the last one fills up
+            part = states[rows].reshape(env.batch_size)
+            before = env.reset(part.select(*self.state_keys), set_state=True)
+            # A reset sets what transforms keep in the tensordict, e.g. a step count, back to 0.
+            after = env.step(before.update(part)).get("next")
+            parts.append(after.reshape(-1)[: min(size, m - begin)])
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
 
     def encode(self, options: Tensor) -> Tensor:
         """Return option indices ``[*B]`` in the form of the env's action spec."""
         if self._one_hot:
             return torch.nn.functional.one_hot(options, self.num_options).to(self._option_dtype)
+        if not self._option_shape:
+            return options
         return options.reshape((*options.shape, *self._option_shape))
 
     def rewards(self, after: TensorDictBase) -> np.ndarray:
         """Return the rewards, float32 ``[m]``."""
-        rewards: np.ndarray = (
-            after.get(self._reward_key).to(torch.float32).cpu().reshape(-1).numpy()
-        )
+        reward = _required(after, self._reward_key)
+        rewards = _array(reward if reward.dtype == torch.float32 else reward.to(torch.float32))
         if not np.isfinite(rewards).all():
             raise ValueError(
                 f"The simulator returned a reward of {rewards[~np.isfinite(rewards)][0]}. Rewards "
@@ -155,8 +196,8 @@ class Simulator:
         zeros, which are no state to plan from: they have ended too.
         """
         done = self._flag(td, self._done_key)
-        stepped = td.get("_step", None)
-        return done if stepped is None else done | ~stepped.cpu().reshape(-1).numpy()
+        stepped = _entry(td, "_step")
+        return done if stepped is None else done | ~_array(stepped)
 
     def terminated(self, td: TensorDictBase) -> np.ndarray:
         """Return which states are terminal, bool ``[m]``."""
@@ -165,23 +206,64 @@ class Simulator:
     def durations(self, after: TensorDictBase) -> np.ndarray:
         """Return base steps per macro-step, int64 ``[m]``."""
         if self.duration_key is None:
-            return np.ones(after.batch_size[0], np.int64)
-        durations: np.ndarray = after.get(self.duration_key).cpu().reshape(-1).numpy()
-        return durations
+            if len(self._ones) != after.batch_size[0]:
+                self._ones = np.ones(after.batch_size[0], np.int64)
+            return self._ones
+        return _array(_required(after, self.duration_key))
 
     def masks(self, td: TensorDictBase) -> np.ndarray:
         """Return which options may be taken, bool ``[m, A]``, or ``[0, A]`` for all."""
         if self.mask_key is None:
-            return np.zeros((0, self.num_options), np.bool_)
-        mask: np.ndarray = td.get(self.mask_key).cpu().reshape(-1, self.num_options).numpy()
-        return mask
+            return self._no_masks
+        return _array(_required(td, self.mask_key)).reshape(-1, self.num_options)
 
     def _flag(self, td: TensorDictBase, key: NestedKey) -> np.ndarray:
-        flag = td.get(key, None)
-        if flag is None:
-            return np.zeros(td.batch_size[0], np.bool_)
-        array: np.ndarray = flag.cpu().reshape(-1).numpy()
-        return array
+        flag = _entry(td, key)
+        return np.zeros(td.batch_size[0], np.bool_) if flag is None else _array(flag)
+
+
+def _entry(td: TensorDictBase, key: NestedKey) -> Tensor | None:
+    """An entry or None; ``TensorDict.get`` unravels its key at ten times the cost of the look-up.
+
+    ``key`` is unravelled already.
+    """
+    if isinstance(key, str):
+        entry: Tensor | None = td._get_str(key, None)
+    else:
+        entry = td._get_tuple(key, None)
+    return entry
+
+
+def _required(td: TensorDictBase, key: NestedKey) -> Tensor:
+    entry = _entry(td, key)
+    return td.get(key) if entry is None else entry  # whose error names the key
+
+
+def _put(td: TensorDictBase, key: NestedKey, value: Tensor) -> None:
+    if isinstance(key, str):
+        td._set_str(key, value, validated=True, inplace=False, non_blocking=False)
+    else:
+        td.set(key, value)
+
+
+def _array(value: Tensor) -> np.ndarray:
+    """The numbers of a tensor in one dimension."""
+    if value.device.type != "cpu":
+        value = value.cpu()
+    array: np.ndarray = value.numpy().reshape(-1)
+    return array
+
+
+def _reward_key(env: EnvBase, name: str, reward_key: NestedKey | None) -> NestedKey:
+    keys = [unravel_key(k) for k in env.reward_keys]
+    if reward_key is not None and unravel_key(reward_key) in keys:
+        return unravel_key(reward_key)
+    if reward_key is not None or len(keys) != 1:
+        raise ValueError(
+            f"MCTSPlanner plans for one reward; {name} has {keys}, and reward_key is "
+            f"{reward_key!r}. Name one of them, e.g. reward_key={keys[0]!r}."
+        )
+    return keys[0]
 
 
 def _last(key: NestedKey) -> str:

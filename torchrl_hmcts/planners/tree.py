@@ -3,14 +3,17 @@
 Letters, here and in the rest of the package: ``B`` roots searched at once, ``N`` nodes a root has
 room for, ``A`` options, ``m`` outcomes of one wave, ``F`` novelty features.
 
-An edge is one option taken in one node. It keeps the SMDP's numbers: the reward ``R`` (discounted
-sum over the option), its own discount ``D`` (``gamma ** duration``, 0 after a terminal state) and
-the value ``V`` of the node it leads to; its value is ``Q = R + D * V``.
+An edge is one option taken in one node, a node is one outcome of it. The node keeps the SMDP's
+numbers of the step that led to it: the reward ``R`` (discounted sum over the option) and its own
+discount ``D`` (``gamma ** duration``, 0 after a terminal state). With the node's value ``V`` the
+edge's value is ``Q = R + D * V``; where a stochastic simulator gave several outcomes, they are
+linked by ``sibling`` and ``Q`` is their mean, weighted by how often each was drawn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,34 +21,65 @@ from tensordict import TensorClass, TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+if TYPE_CHECKING:
+    from torchrl.data.map.tree import Tree
+
 NODE = np.dtype(
     [
         ("visits", np.int32),
-        ("in_flight", np.int32),
         ("value", np.float32),
         ("raw_value", np.float32),
+        ("reward", np.float32),
+        ("discount", np.float32),
         ("parent", np.int32),
         ("option", np.int32),
+        ("sibling", np.int32),
+        ("samples", np.int32),
+        ("twin", np.int32),
         ("depth", np.int32),
         ("open_options", np.int32),
         ("base_steps", np.int32),
         ("path_return", np.float32),
         ("path_discount", np.float32),
         ("flags", np.int32),
-    ]
-)  # 48 bytes
+    ],
+    align=True,
+)  # 64 bytes, a cache line
 EDGE = np.dtype(
     [
         ("child", np.int32),
         ("visits", np.int32),
-        ("in_flight", np.int32),
         ("value", np.float32),
-        ("reward", np.float32),
-        ("discount", np.float32),
         ("prior", np.float32),
-        ("closed", np.int32),
-    ]
-)  # 32 bytes
+        ("squares", np.float32),
+        ("samples", np.uint16),
+        ("in_flight", np.uint8),
+        ("closed", np.uint8),
+    ],
+    align=True,
+)  # 24 bytes
+ROOT = np.dtype(
+    [
+        ("num_nodes", np.int64),
+        ("active", np.int64),
+        ("simulations", np.int64),
+        ("limit", np.int64),
+        ("revisits", np.int64),
+        ("expansions", np.int64),
+        ("base_steps", np.int64),
+        ("best_node", np.int64),
+        ("best_return", np.float64),
+        ("expansions_to_plan", np.int64),
+        ("base_steps_to_plan", np.int64),
+        ("lowest", np.float64),
+        ("highest", np.float64),
+    ],
+    align=True,
+)
+WAVE = np.dtype(
+    [("root", np.int64), ("node", np.int64), ("option", np.int64), ("new_node", np.int64)],
+    align=True,
+)
 
 # Bits of a node's flags. The compiled kernels hold their values: after changing one, delete the
 # __pycache__ of this folder, since numba looks at kernels.py only.
@@ -56,29 +90,38 @@ PRUNED = 8  # the novelty test refused it
 CLOSED = 16  # no simulation below it can add anything
 REWARDED = 32  # the option that led here earned a positive reward
 
+# An edge's ``closed``: 0, or one of these.
+SOLVED = 1  # nothing is left to simulate behind it
+FORBIDDEN = 2  # the mask does not allow the option
+
 
 class TreeView(TensorClass):
     """A search tree as tensors that share the memory of the kernels' records.
 
-    Only the first ``num_nodes[b]`` nodes of root ``b`` have a meaning. Node 0 is the root.
+    Only the first ``num_nodes[b]`` nodes of root ``b`` have a meaning. Node 0 is the root. A view
+    is of the arrays at the time it was made: make a new one after the tree has grown.
     """
 
     num_nodes: Tensor  # [B] nodes in use
     node_visits: Tensor  # [B, N] backups through a node, its own evaluation included
     node_values: Tensor  # [B, N] value V of a node
     raw_values: Tensor  # [B, N] the leaf evaluator's value of a node
+    rewards: Tensor  # [B, N] reward R of the option that led here
+    discounts: Tensor  # [B, N] its discount D
     parents: Tensor  # [B, N] node above, -1 for the root
     parent_options: Tensor  # [B, N] option that led here, -1 for the root
+    siblings: Tensor  # [B, N] next outcome of the same option, -1 for the last
+    samples: Tensor  # [B, N] how often the simulator gave this outcome
+    twins: Tensor  # [B, N] node of the same state that is searched in its place, -1 for none
     depths: Tensor  # [B, N] options from the root
     base_steps: Tensor  # [B, N] base steps from the root
     path_returns: Tensor  # [B, N] discounted reward collected from the root
     flags: Tensor  # [B, N] bits EXPANDED ... REWARDED of this module
-    children: Tensor  # [B, N, A] node an option leads to, -1 if not simulated
+    children: Tensor  # [B, N, A] first outcome of an option, -1 if not simulated
     children_visits: Tensor  # [B, N, A] backups through an option
-    children_values: Tensor  # [B, N, A] value V of the node an option leads to
-    children_rewards: Tensor  # [B, N, A] reward R of an option
-    children_discounts: Tensor  # [B, N, A] discount D of an option
+    children_values: Tensor  # [B, N, A] value Q = R + D V of an option
     children_priors: Tensor  # [B, N, A] prior probability of an option
+    children_closed: Tensor  # [B, N, A] 0 open, SOLVED or FORBIDDEN
     states: TensorDictBase  # [B, N] what the simulator needs to go on from a node
 
 
@@ -100,9 +143,19 @@ class SearchTree:
         self.capacity = capacity
         self.nodes = np.zeros((num_roots, capacity), NODE)
         self.edges = np.zeros((num_roots, capacity, num_options), EDGE)
+        self.roots = np.zeros(num_roots, ROOT)
         self.features = np.zeros((num_roots, capacity, num_features), np.float32)
-        self.num_nodes = np.zeros(num_roots, np.int64)
+        self.codes = np.zeros((num_roots, capacity, 0), np.uint8)  # states as bytes
         self.states: TensorDictBase | None = None
+        self._flat: tuple[TensorDictBase, dict[NestedKey, Tensor]] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy of the columns would not share memory
+        return {**self.__dict__, "_flat": None}
+
+    @property
+    def num_nodes(self) -> np.ndarray:
+        """Nodes in use, int64 ``[B]``."""
+        return self.roots["num_nodes"]
 
     def reserve(self, num_nodes: int) -> None:
         """Make room for ``num_nodes`` nodes per root; nothing that is stored changes."""
@@ -118,7 +171,7 @@ class SearchTree:
             return np.concatenate((array, room), 1)
 
         self.nodes, self.edges = grow(self.nodes), grow(self.edges)
-        self.features = grow(self.features)
+        self.features, self.codes = grow(self.features), grow(self.codes)
         if self.states is not None:
             room = self.states[:, :1].expand(self.num_roots, extra).clone()
             self.states = torch.cat((self.states, room), 1)
@@ -136,20 +189,35 @@ class SearchTree:
                 batch_size=shape,
                 device=states.device,
             )
-        where = (torch.from_numpy(roots), torch.from_numpy(nodes))
-        for key, value in states.items(True, True):
-            self.states.get(key).index_put_(where, value)
+        where = self._rows(roots, nodes)
+        for key, column in self._columns().items():
+            column.index_copy_(0, where, states.get(key))
 
     def get_states(
         self, roots: np.ndarray, nodes: np.ndarray, keys: Sequence[NestedKey]
     ) -> TensorDict:
         """Return the states ``[m]`` of nodes ``[m]``."""
         assert self.states is not None
-        where = (torch.from_numpy(roots), torch.from_numpy(nodes))
-        out = TensorDict({}, batch_size=[len(roots)], device=self.states.device)
-        for key in keys:
-            out.set(key, self.states.get(key)[where])
-        return out
+        where, columns = self._rows(roots, nodes), self._columns()
+        entries = {key: columns[key].index_select(0, where) for key in keys}
+        size = torch.Size([len(roots)])
+        if all(isinstance(key, str) for key in keys):  # the constructor's checks cost more
+            return TensorDict._new_unsafe(entries, size, device=self.states.device)
+        return TensorDict(entries, size, device=self.states.device)
+
+    def _columns(self) -> dict[NestedKey, Tensor]:
+        """The states' entries ``[B * N, ...]``, which share their memory."""
+        if self._flat is None or self._flat[0] is not self.states:
+            assert self.states is not None
+            columns = {key: x.flatten(0, 1) for key, x in self.states.items(True, True)}
+            self._flat = (self.states, columns)
+        return self._flat[1]
+
+    def _rows(self, roots: np.ndarray, nodes: np.ndarray) -> Tensor:
+        rows = torch.from_numpy(roots * self.capacity + nodes)
+        assert self.states is not None
+        device = self.states.device
+        return rows if device is None else rows.to(device)
 
     def path(self, root: int, node: int) -> list[int]:
         """Return the nodes from the root to ``node``, both included."""
@@ -173,12 +241,17 @@ class SearchTree:
         if states is None:
             states = TensorDict({}, batch_size=[self.num_roots, self.capacity])
         return TreeView(
-            num_nodes=torch.from_numpy(self.num_nodes),
+            num_nodes=tensor(self.roots, "num_nodes"),
             node_visits=tensor(nodes, "visits"),
             node_values=tensor(nodes, "value"),
             raw_values=tensor(nodes, "raw_value"),
+            rewards=tensor(nodes, "reward"),
+            discounts=tensor(nodes, "discount"),
             parents=tensor(nodes, "parent"),
             parent_options=tensor(nodes, "option"),
+            siblings=tensor(nodes, "sibling"),
+            samples=tensor(nodes, "samples"),
+            twins=tensor(nodes, "twin"),
             depths=tensor(nodes, "depth"),
             base_steps=tensor(nodes, "base_steps"),
             path_returns=tensor(nodes, "path_return"),
@@ -186,9 +259,40 @@ class SearchTree:
             children=tensor(edges, "child"),
             children_visits=tensor(edges, "visits"),
             children_values=tensor(edges, "value"),
-            children_rewards=tensor(edges, "reward"),
-            children_discounts=tensor(edges, "discount"),
             children_priors=tensor(edges, "prior"),
+            children_closed=tensor(edges, "closed"),
             states=states,
             batch_size=[self.num_roots],
         )
+
+    def summary(self, root: int = 0, option_names: Sequence[str] | None = None) -> str:
+        """Return what was found as text; see :func:`~torchrl_hmcts.planners.export.summary`."""
+        from torchrl_hmcts.planners import export
+
+        return export.summary(self, root, option_names)
+
+    def to_networkx(
+        self, root: int = 0, *, max_nodes: int | None = None, states: bool = False
+    ) -> Any:
+        """Return a graph; see :func:`~torchrl_hmcts.planners.export.to_networkx`."""
+        from torchrl_hmcts.planners import export
+
+        return export.to_networkx(self, root, max_nodes=max_nodes, states=states)
+
+    def to_torchrl(self, root: int = 0) -> Tree:
+        """Return TorchRL's ``Tree``; see :func:`~torchrl_hmcts.planners.export.to_torchrl`."""
+        from torchrl_hmcts.planners import export
+
+        return export.to_torchrl(self, root)
+
+    def plot(self, root: int = 0, **kwargs: Any) -> Any:
+        """Draw the tree; see :func:`~torchrl_hmcts.planners.drawing.plot_tree` for keywords."""
+        from torchrl_hmcts.planners import drawing
+
+        return drawing.plot_tree(self, root, **kwargs)
+
+    def plot_positions(self, root: int = 0, key: Any = "position", **kwargs: Any) -> Any:
+        """Draw where nodes lie; see :func:`~torchrl_hmcts.planners.drawing.plot_positions`."""
+        from torchrl_hmcts.planners import drawing
+
+        return drawing.plot_positions(self, root, key, **kwargs)

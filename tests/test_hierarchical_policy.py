@@ -1,0 +1,296 @@
+"""Carrying plans out: at a plan's end, every k options, on divergence, with trees that are kept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import InitTracker, TransformedEnv
+
+from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, Search, SearchBudget
+from torchrl_hmcts.testing import ChainEnv, TableEnv
+
+FOREVER = SearchBudget(expansions=10_000, until_plan=False)
+
+# A binary tree of depth 3: the children of s are 2 s + 1 and 2 s + 2, the leaves 7 to 14 are
+# terminal and pay s.
+BINARY_TREE = {
+    (s, a): (2 * s + 1 + a, 2 * s + 1 + a if s >= 3 else 0.0, 1) for s in range(7) for a in range(2)
+}
+LEAVES = list(range(7, 15))
+
+# Forward from 0 to 5, which pays 1; beside the way lies 6, which option 0 leaves for 3.
+ROAD = {(s, 1): (s + 1, float(s == 4), 1) for s in range(5)}
+ROAD.update({(s, 0): (s, 0.0, 1) for s in range(5)})
+ROAD.update({(6, 0): (3, 0.0, 1), (6, 1): (6, 0.0, 1)})
+# The same, but from 2 the road leads off to 6.
+SLIPPERY_ROAD = {**ROAD, (2, 1): (6, 0.0, 1)}
+
+
+class CountingEnv(TableEnv):
+    """A table that records the states it is asked to simulate from."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.calls: list[list[int]] = []
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.calls.append(tensordict["state"].flatten().tolist())
+        return super()._step(tensordict)
+
+
+def at(env: TableEnv | ChainEnv, states: Any) -> TensorDictBase:
+    """The state of an env at the given table states, any shape."""
+    state = torch.as_tensor(states)
+    return env.reset(TensorDict({"state": state}, state.shape), set_state=True)
+
+
+class CountingPlanner(MCTSPlanner):
+    """A planner that records the states it is asked to search from."""
+
+    def search(self, td: TensorDictBase) -> Search:
+        self.__dict__.setdefault("asked", []).append(td["state"].flatten().tolist())
+        return super().search(td)
+
+
+def test_the_hierarchical_policy_plans_once_and_follows_its_plan() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    rollout = env.rollout(20, policy=HierarchicalPolicy(planner))
+    assert planner.asked == [[0]]
+    assert rollout["action"].tolist() == [1] * 5
+    assert rollout["plan_step"].flatten().tolist() == [1, 2, 3, 4, 5]
+    assert rollout["plan_length"].flatten().tolist() == [5] * 5
+
+
+def test_the_hierarchical_policy_plans_again_at_the_end_of_its_plan() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    rollout = env.rollout(20, policy=HierarchicalPolicy(planner, max_plan_length=2))
+    assert planner.asked == [[0], [2], [4]]
+    assert rollout["next", "reward"].sum().item() == 1.0
+
+
+def test_the_hierarchical_policy_takes_the_planners_choice_where_it_finds_no_plan() -> None:
+    env = ChainEnv(30)
+    planner = CountingPlanner(env, budget=SearchBudget(expansions=2))
+    rollout = env.rollout(4, policy=HierarchicalPolicy(planner))
+    assert len(planner.asked) == 4
+    assert rollout["plan_length"].flatten().tolist() == [1] * 4
+
+
+def test_each_element_of_a_batch_plans_at_its_own_time() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    td = env.reset(TensorDict({"state": torch.tensor([0, 3, 4])}, [3]), set_state=True)
+    rollout = env.rollout(
+        20,
+        policy=HierarchicalPolicy(planner, max_plan_length=2),
+        tensordict=td,
+        auto_reset=False,
+        break_when_all_done=True,
+    )
+    # Plans of 5, 2 and 1 options, cut to 2: only the first element ever plans again.
+    assert planner.asked == [[0, 3, 4], [2], [4]]
+    assert rollout["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 4, 5]
+
+
+def test_a_new_episode_is_planned_for_although_the_old_plan_is_not_at_its_end() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    policy = HierarchicalPolicy(planner)
+    td = policy(at(env, 1))
+    assert td["plan_step"].item() == 1
+    td.update(at(env, 0)).set("is_init", torch.ones(1, dtype=torch.bool))
+    td = policy(td)
+    assert planner.asked == [[1], [0]]
+    assert (td["plan_length"].item(), td["plan_step"].item()) == (5, 1)
+
+
+# ---------------------------------------------------------------------- closed loop
+
+
+def test_a_plan_is_made_anew_after_every_k_options() -> None:
+    env = ChainEnv(6)
+    planner = CountingPlanner(env)
+    rollout = env.rollout(20, policy=HierarchicalPolicy(planner, replan_every=2))
+    assert planner.asked == [[0], [2], [4]]
+    assert rollout["action"].tolist() == [1] * 5
+    assert rollout["plan_step"].flatten().tolist() == [1, 2, 1, 2, 1]
+    assert rollout["plan_length"].flatten().tolist() == [5, 5, 3, 3, 1]
+    assert rollout["num_plans"].flatten().tolist() == [1, 1, 2, 2, 3]
+
+
+@pytest.mark.parametrize("reuse", [False, True])
+def test_only_closed_loop_control_reaches_the_goal_where_the_real_env_differs(reuse: bool) -> None:
+    real = TableEnv(SLIPPERY_ROAD, terminal=[5])
+    model = TableEnv(ROAD, terminal=[5])
+
+    def states(**kwargs: Any) -> list[int]:
+        policy = HierarchicalPolicy(MCTSPlanner(model), reuse=reuse, **kwargs)
+        return real.rollout(6, policy=policy)["next", "state"].tolist()
+
+    # The plan of five times option 1 goes on in state 6, where it leads nowhere.
+    assert states() == [1, 2, 6, 6, 6, 3]
+    assert states(divergence=0.5, divergence_key="state") == [1, 2, 6, 3, 4, 5]
+    assert states(replan_every=1) == [1, 2, 6, 3, 4, 5]
+
+
+def test_a_plan_is_kept_up_to_the_divergence_that_is_allowed() -> None:
+    real = TableEnv(SLIPPERY_ROAD, terminal=[5])
+    planner = MCTSPlanner(TableEnv(ROAD, terminal=[5]))
+    # State 6 instead of 3, then 6 instead of 4 and of 5: distances of 3, 2 and 1.
+    for divergence, num_plans in ((2.5, [1, 1, 1, 2]), (3.0, [1, 1, 1, 1])):
+        policy = HierarchicalPolicy(planner, divergence=divergence, divergence_key="state")
+        rollout = real.rollout(4, policy=policy)
+        assert rollout["num_plans"].flatten().tolist() == num_plans
+    predicted = rollout["plan_states"][0]
+    assert predicted.shape == (65, 1)
+    assert predicted[:6].flatten().tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_divergence_may_be_measured_in_several_entries_of_the_observation() -> None:
+    real = TableEnv(SLIPPERY_ROAD, terminal=[5])
+    planner = MCTSPlanner(TableEnv(ROAD, terminal=[5]))
+    # The duration is an observation that no state needs; it is 1 in both, so adds nothing.
+    policy = HierarchicalPolicy(planner, divergence=0.5, divergence_key=["state", "duration"])
+    rollout = real.rollout(6, policy=policy)
+    assert rollout["next", "state"].tolist() == [1, 2, 6, 3, 4, 5]
+    assert rollout["plan_states"].shape == (6, 65, 2)
+    assert rollout["plan_states"][0, :6].tolist() == [[s, min(s, 1)] for s in range(6)]
+
+
+def test_only_the_element_that_diverged_plans_again() -> None:
+    real = TableEnv(SLIPPERY_ROAD, terminal=[5])
+    planner = CountingPlanner(TableEnv(ROAD, terminal=[5]))
+    policy = HierarchicalPolicy(planner, divergence=0.5, divergence_key="state")
+    rollout = real.rollout(
+        6, policy, tensordict=at(real, [0, 3]), auto_reset=False, break_when_all_done=True
+    )
+    assert planner.asked == [[0, 3], [6]]
+    assert rollout["num_plans"][..., 0].tolist() == [[1, 1, 1, 2, 2, 2], [1, 1, 1, 1, 1, 1]]
+    assert rollout["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 5]
+
+
+# ---------------------------------------------------------------------- trees that are kept
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (2, 1)])
+def test_kept_trees_give_the_options_of_new_ones_with_less_simulation(
+    shape: tuple[int, ...],
+) -> None:
+    actions, calls = {}, {}
+    for reuse in (False, True):
+        real = TableEnv(BINARY_TREE, terminal=LEAVES)
+        model = CountingEnv(BINARY_TREE, terminal=LEAVES)
+        policy = HierarchicalPolicy(MCTSPlanner(model, budget=FOREVER), replan_every=1, reuse=reuse)
+        rollout = real.rollout(
+            5, policy, tensordict=at(real, torch.zeros(shape, dtype=torch.int64)), auto_reset=False
+        )
+        actions[reuse], calls[reuse] = rollout["action"].flatten().tolist(), len(model.calls)
+        assert rollout["num_plans"].flatten()[:3].tolist() == [1, 2, 3]
+    assert actions[True] == actions[False] == [1] * 3 * torch.Size(shape).numel()
+    # All 7 inner states, then the 3 and the 1 of the subtree that was entered, which are known.
+    assert calls == {False: 7 + 3 + 1, True: 7}
+
+
+def test_kept_trees_are_searched_further_where_they_are_not_exhausted() -> None:
+    env = ChainEnv(30)
+    planner = MCTSPlanner(env, budget=SearchBudget(expansions=3))
+    policy = HierarchicalPolicy(planner, reuse=True)
+    td, visits = env.reset(), []
+    for _ in range(3):
+        td = policy(td)
+        assert planner.last_search is not None
+        visits.append(int(planner.last_search.tree.nodes["visits"][0, 0]))
+        td = env.step(td)["next"].update(td.select("plan", "plan_length", "plan_step", "num_plans"))
+    assert visits[0] == 1 + 2 * 3
+    assert visits[1] > visits[0]  # its own expansions, and what was there
+
+
+def test_each_element_keeps_its_own_tree_and_plans_at_its_own_time() -> None:
+    real, model = TableEnv(ROAD, terminal=[5]), CountingEnv(ROAD, terminal=[5])
+    policy = HierarchicalPolicy(MCTSPlanner(model), max_plan_length=2, reuse=True)
+    rollout = real.rollout(
+        20, policy, tensordict=at(real, [0, 3, 4]), auto_reset=False, break_when_all_done=True
+    )
+    assert rollout["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 4, 5]
+    assert rollout["num_plans"][0].flatten().tolist() == [1, 1, 2, 2, 3]
+    assert rollout["action"][0].tolist() == [1] * 5
+    # Every tree holds the way to its end after the first search: nothing is simulated again.
+    num_calls = len(model.calls)
+    policy.reset()
+    policy(at(real, [0, 3, 4]))
+    assert len(model.calls) == 2 * num_calls
+
+
+def test_kept_trees_do_not_outlive_a_reset_another_shape_or_an_error() -> None:
+    model = CountingEnv(ROAD, terminal=[5])
+    policy = HierarchicalPolicy(MCTSPlanner(model), reuse=True, replan_every=1)
+
+    def simulates(td: TensorDictBase) -> bool:
+        model.calls.clear()
+        policy(td)
+        return len(model.calls) > 0
+
+    def stepped(td: TensorDictBase) -> TensorDictBase:
+        return td.update(model.step(td.clone())["next"].select("state", "action_mask"))
+
+    td = at(model, [0])
+    assert simulates(td)
+    assert not simulates(stepped(td))
+    policy.reset()
+    assert simulates(stepped(td))
+    assert simulates(at(model, [0, 0]))
+    td = at(model, [0])
+    assert simulates(td)
+    broken = stepped(td).clone()
+    with pytest.raises(ValueError, match="lacks"):
+        policy(broken.exclude("action_mask"))
+    assert simulates(td)
+
+
+def test_a_rollout_with_another_state_than_the_trees_gets_plans_of_its_own() -> None:
+    env = ChainEnv(6)
+    policy = HierarchicalPolicy(MCTSPlanner(env), reuse=True, replan_every=1)
+    td = policy(at(env, [2]))
+    td["state"] = torch.tensor([1])  # not where option 1 leads
+    td = policy(td)
+    assert td["plan"][0, :4].tolist() == [1, 1, 1, 1]
+    assert td["plan_length"].item() == 4
+
+
+@pytest.mark.parametrize("reuse", [False, True])
+@pytest.mark.parametrize("replan_every", [None, 1])
+def test_episodes_follow_each_other_in_a_collector(reuse: bool, replan_every: int | None) -> None:
+    env = TransformedEnv(ChainEnv(4), InitTracker())
+    policy = HierarchicalPolicy(MCTSPlanner(ChainEnv(4)), reuse=reuse, replan_every=replan_every)
+    collector = Collector(env, policy, frames_per_batch=9, total_frames=18)
+    for batch in collector:
+        assert batch["action"].tolist() == [1] * 9
+        assert batch["next", "reward"].flatten().tolist() == [0, 0, 1] * 3
+        one_episode = [1, 1, 1] if replan_every is None else [1, 2, 3]
+        assert batch["num_plans"].flatten().tolist() == one_episode * 3
+    collector.shutdown()
+
+
+# ---------------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"max_plan_length": 0}, "max_plan_length >= 1; got 0"),
+        ({"replan_every": 0}, "replan_every >= 1, in options; got 0"),
+        ({"divergence": 0.5}, "divergence=0.5 and divergence_key=None"),
+        ({"divergence_key": "state"}, "divergence=None and divergence_key='state'"),
+        ({"divergence": -1.0, "divergence_key": "state"}, "divergence >= 0, a distance; got -1.0"),
+        ({"divergence": 1.0, "divergence_key": "place"}, "reads 'place', which ChainEnv does not"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        HierarchicalPolicy(MCTSPlanner(ChainEnv(3)), **kwargs)

@@ -1,0 +1,296 @@
+"""Tree search over a transition function on plain arrays: the engine without tensordicts.
+
+Letters: ``B`` roots, ``A`` options, ``m`` outcomes of one wave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_hmcts.planners.backups import Backup, MeanBackup
+from torchrl_hmcts.planners.search import Outcomes, RootStates, Search
+from torchrl_hmcts.planners.tree_policies import PUCT, Gumbel, TreePolicy
+
+Array = np.ndarray | Tensor
+
+
+class Root(NamedTuple):
+    """The states to search from."""
+
+    prior: Array  # [B, A] float32, probabilities of options
+    value: Array  # [B] float32
+    embedding: Array  # [B, ...] what the transition function needs of a state, any dtype
+
+
+class Transition(NamedTuple):
+    """What options did: the answer of a transition function."""
+
+    reward: Array  # [m] float32, R
+    discount: Array  # [m] float32, D: gamma ** duration, 0 for a terminal state
+    prior: Array  # [m, A] float32, probabilities of options in the next state
+    value: Array  # [m] float32, of the next state
+    embedding: Array  # [m, ...] of the next state, shape and dtype of the roots'
+
+
+TransitionFunction = Callable[[Any, Any], Transition]
+
+
+def tree_search(
+    root: Root,
+    transition: TransitionFunction,
+    num_simulations: int,
+    *,
+    tree_policy: TreePolicy | None = None,
+    backup: Backup | None = None,
+    mask: Array | None = None,
+    leaves_per_wave: int = 1,
+    exhausted: Literal["skip", "revisit"] = "revisit",
+    seed: int = 0,
+) -> Search:
+    r"""Search from ``B`` states at once with a transition function of your own.
+
+    The counterpart of mctx's ``muzero_policy(params, key, root, recurrent_fn)``: the planner's
+    trees, policies and backups without environments or tensordicts in the loop. Every simulation
+    takes one option in one leaf, for all roots in one call of ``transition``, and backs up
+
+    .. math:: Q = R + D\, V.
+
+    Args:
+        root: states to search from. NumPy arrays or CPU tensors; the transition function is called
+            with the kind the embedding has.
+        transition: ``transition(embedding [m, ...], option [m] int64) -> Transition`` of
+            contiguous float32 arrays. The arrays it is given are reused by the next call.
+        num_simulations: per root.
+        tree_policy: Default ``PUCT()``.
+        backup: Default ``MeanBackup()``.
+        mask: bool ``[B, A]``, options that may be taken in the roots. Default: all.
+        leaves_per_wave: leaves of each root in one call. Default 1.
+        exhausted: as in :class:`~torchrl_hmcts.planners.MCTSPlanner`. Default ``"revisit"``.
+        seed: of the Gumbel noise; root ``b`` draws from ``seed + b``.
+
+    Returns:
+        The :class:`~torchrl_hmcts.planners.Search`: ``search.tree.view().children_visits[:, 0]``
+        are the visits of the roots' options. States of nodes are not kept in the tree.
+
+    Raises:
+        ValueError: if shapes do not fit, or a number is out of range.
+
+    Example:
+        A chain of five states, of which the last ends the episode with reward 1:
+
+        >>> import numpy as np
+        >>> from torchrl_hmcts.planners import Root, Transition, tree_search
+        >>> def transition(state, option):
+        ...     state = np.clip(state + 2 * option - 1, 0, 4)
+        ...     end = (state == 4).astype(np.float32)
+        ...     prior = np.full((len(state), 2), 0.5, np.float32)
+        ...     return Transition(end, 0.9 * (1 - end), prior, 0 * end, state)
+        >>> root = Root(np.full((1, 2), 0.5, np.float32), np.zeros(1, np.float32), np.array([2]))
+        >>> search = tree_search(root, transition, num_simulations=30)
+        >>> search.tree.view().children_visits[:, 0].argmax(-1)
+        tensor([1])
+    """
+    tree_policy = PUCT() if tree_policy is None else tree_policy
+    backup = MeanBackup() if backup is None else backup
+    prior, value = _check_root(root)
+    num_roots, num_options = prior.shape
+    if num_simulations < 1:
+        raise ValueError(f"tree_search needs num_simulations >= 1; got {num_simulations}.")
+    if not 1 <= leaves_per_wave <= 255:
+        raise ValueError(f"tree_search needs leaves_per_wave from 1 to 255; got {leaves_per_wave}.")
+    if exhausted not in ("skip", "revisit"):
+        raise ValueError(f"tree_search: exhausted is 'skip' or 'revisit'; got {exhausted!r}.")
+    search = Search(
+        num_roots,
+        num_options,
+        tree_policy=tree_policy,
+        backup=backup,
+        expand="one",
+        leaves_per_wave=leaves_per_wave,
+        exhausted=exhausted,
+        capacity=num_simulations + 1,
+    )
+    no_masks = np.zeros((0, num_options), np.bool_)
+    masks = no_masks if mask is None else np.ascontiguousarray(np.asarray(mask, np.bool_))
+    if mask is not None and masks.shape != (num_roots, num_options):
+        raise ValueError(f"mask must be bool {[num_roots, num_options]}; got {list(masks.shape)}.")
+    if mask is not None and not masks.any(-1).all():
+        raise ValueError(
+            f"Root {int(np.flatnonzero(~masks.any(-1))[0])} has no option that may be taken: its "
+            f"mask is all False. Leave it out of the batch."
+        )
+    search.start(RootStates(value, np.zeros(num_roots, np.bool_), prior, masks))
+    search.begin(num_simulations)
+    search.seed(np.arange(num_roots) + seed)
+    if isinstance(tree_policy, Gumbel):
+        search.halve(num_simulations)
+    loop = _Loop(search, root.embedding, transition, no_masks)
+    if search._scores is None:
+        loop.run()
+    else:
+        loop.run_in_python()
+    return search
+
+
+class _Loop:
+    """Moves embeddings between the trees and the transition function, as rows of bytes."""
+
+    def __init__(
+        self, search: Search, embedding: Array, transition: TransitionFunction, masks: np.ndarray
+    ) -> None:
+        self.search, self.transition, self.masks = search, transition, masks
+        self.is_tensor = isinstance(embedding, Tensor)
+        first = np.ascontiguousarray(_numpy(embedding))
+        rows = len(search._wave)
+        self.dtype, self.shape = first.dtype, first.shape[1:]
+        self.size = first.nbytes // len(first)
+        self.nothing = first[:0]
+        self.stored = np.zeros((search.num_roots, search.tree.capacity, self.size), np.uint8)
+        self.stored[:, 0] = first.reshape(len(first), -1).view(np.uint8)
+        self.buffer = np.zeros(rows * self.size, np.uint8)
+        self.states: Any = self.buffer.view(self.dtype).reshape(rows, *self.shape)
+        self.options: Any = search._wave["option"]
+        if self.is_tensor:
+            self.states, self.options = map(torch.from_numpy, (self.states, self.options))
+
+    def run(self) -> None:
+        search, tree = self.search, self.search.tree
+        transition: Callable[..., Any] = self.transition
+        states, options, size = self.states, self.options, len(self.states)
+        kernels = search._kernels
+        arrays = (
+            tree.nodes,
+            tree.edges,
+            tree.roots,
+            search.settings,
+            search._gumbel,
+            search._wave,
+            self.masks,
+            self.stored,
+            self.buffer,
+        )
+        advance: Any
+        if kernels.COMPILED:
+            advance = partial(kernels.advance_at, kernels.handle(*arrays))
+        else:
+            advance = partial(kernels.advance, *arrays)
+        # As bytes, any dtype and shape runs the same code; indices are spared the conversion.
+        as_bytes = not kernels.COMPILED or self.dtype != np.int64 or self.shape != ()
+        none, no_prior = np.zeros(0, np.float32), np.zeros((0, search.num_options), np.float32)
+        nothing = _bytes(self.nothing) if as_bytes else self.nothing
+        count = advance(0, none, none, none, no_prior, nothing)
+        reward: Any
+        discount: Any
+        prior: Any
+        value: Any
+        embedding: Any
+        if count:
+            answer = transition(states[:count], options[:count])
+            self._check(answer, count)
+            reward, discount, prior, value, embedding = answer
+        while count:
+            if self.is_tensor:
+                reward, discount, prior, value, embedding = (
+                    x.detach().numpy() for x in (reward, discount, prior, value, embedding)
+                )
+            if as_bytes:
+                embedding = _bytes(embedding)
+            count = advance(count, reward, discount, value, prior, embedding)
+            if count == size:
+                reward, discount, prior, value, embedding = transition(states, options)
+            elif count:
+                reward, discount, prior, value, embedding = transition(
+                    states[:count], options[:count]
+                )
+
+    def run_in_python(self) -> None:
+        """The same with a tree policy that is not compiled."""
+        search = self.search
+        states = self.stored.view(self.dtype).reshape(*self.stored.shape[:2], *self.shape)
+        active = np.arange(search.num_roots)
+        while len(active):
+            wave = search.select(active)
+            if len(wave):
+                state, option = states[wave.roots, wave.nodes], wave.options
+                answer = self.transition(
+                    *map(torch.from_numpy, (state, option)) if self.is_tensor else (state, option)
+                )
+                self._check(answer, len(wave))
+                reward, discount, prior, value, embedding = map(_numpy, answer)
+                done = discount == 0.0
+                outcomes = Outcomes(
+                    rewards=reward,
+                    discounts=discount,
+                    durations=np.ones(len(wave), np.int64),
+                    done=done,
+                    values=np.where(done, np.float32(0.0), value),
+                    priors=prior,
+                    masks=self.masks,
+                )
+                states[wave.roots, search.insert(wave, outcomes)] = embedding
+            active = active[search.roots["simulations"][active] < search.roots["limit"][active]]
+            if not search.revisits_exhausted:
+                active = active[~search.exhausted(active)]
+
+    def _check(self, answer: Transition, count: int) -> None:
+        """Check what a transition function returns; the compiled loop relies on it."""
+        num_options = self.search.num_options
+        shapes = {
+            "reward": (count,),
+            "discount": (count,),
+            "prior": (count, num_options),
+            "value": (count,),
+            "embedding": (count, *self.shape),
+        }
+        for (name, shape), array in zip(shapes.items(), answer, strict=True):
+            dtype = self.dtype if name == "embedding" else np.dtype(np.float32)
+            if not isinstance(array, Tensor if self.is_tensor else np.ndarray):
+                raise TypeError(
+                    f"The transition function returned {name} as {type(array).__name__}; return "
+                    f"what the embedding is, a {'tensor' if self.is_tensor else 'NumPy array'}."
+                )
+            got = _numpy(array)
+            if got.shape != shape or got.dtype != dtype or not got.flags.c_contiguous:
+                order = "" if got.flags.c_contiguous else " (not contiguous)"
+                raise ValueError(
+                    f"The transition function returned {name} as {got.dtype} {list(got.shape)}"
+                    f"{order}; it must be {dtype} {list(shape)} and contiguous."
+                )
+            if name != "embedding" and not np.isfinite(got).all():
+                raise ValueError(
+                    f"The transition function returned the {name} {got[~np.isfinite(got)][0]}; "
+                    f"rewards, discounts, priors and values must be finite."
+                )
+
+
+def _bytes(array: np.ndarray) -> np.ndarray:
+    return array.reshape(-1).view(np.uint8)
+
+
+def _numpy(array: Array) -> np.ndarray:
+    return array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+
+
+def _check_root(root: Root) -> tuple[np.ndarray, np.ndarray]:
+    prior, value = (
+        np.ascontiguousarray(_numpy(x), dtype=np.float32) for x in (root.prior, root.value)
+    )
+    if prior.ndim != 2 or not prior.size:
+        raise ValueError(f"The roots' prior must be [B, A]; got {list(prior.shape)}.")
+    for name, array in (("value", value), ("embedding", root.embedding)):
+        if array.ndim < 1 or len(array) != len(prior) or (name == "value" and array.ndim > 1):
+            raise ValueError(
+                f"The roots' {name} must have one row for each of the {len(prior)} rows of the "
+                f"prior; got shape {list(array.shape)}."
+            )
+    for name, array in (("prior", prior), ("value", value)):
+        if not np.isfinite(array).all() or (name == "prior" and (array < 0.0).any()):
+            bad = array[~np.isfinite(array) | (array < 0.0)][0]
+            raise ValueError(f"The roots' {name} holds {bad}, which is no {name}.")
+    return prior, value

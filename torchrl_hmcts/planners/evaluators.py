@@ -1,0 +1,449 @@
+"""Leaf evaluators and option priors: what a search is told about a new state.
+
+Letters: ``m`` states of one call, ``A`` options, ``w`` rollouts that still run.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_hmcts.planners.mcts import SEED_KEY, Evaluator
+
+if TYPE_CHECKING:
+    from torchrl_hmcts.planners.simulator import Simulator
+
+
+class ValueEvaluator:
+    r"""The value of a state is what a network says: :math:`V(s) = v_\theta(s)`.
+
+    The network is called in the mode it is in (``module.eval()`` is yours to call), without
+    gradients, and never becomes part of the planner. The network of a plain ``TensorDictModule``
+    is called on its tensors, which saves most of the cost of a small one. Networks may round
+    differently when more states share a call; then the last digits of a tree depend on its company.
+
+    Args:
+        module: a TensorDictModule whose inputs are entries of the macro environment.
+        value_key: its output to use, ``[m, 1]`` or ``[m]``. Default ``"state_value"``.
+
+    Raises:
+        TypeError: if ``module`` is no TensorDictModule.
+        ValueError: if it has no output ``value_key``.
+
+    Reference:
+        Silver et al., "Mastering the game of Go without human knowledge", 2017.
+
+    Example:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl_hmcts.planners import MCTSPlanner, ValueEvaluator
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> class Distance(torch.nn.Module):
+        ...     def forward(self, state):
+        ...         return state / 10
+        >>> value = TensorDictModule(Distance(), in_keys=["state"], out_keys=["state_value"])
+        >>> env = ChainEnv(length=5)
+        >>> planner = MCTSPlanner(env, leaf_evaluator=ValueEvaluator(value))
+        >>> planner(env.reset())["action"]
+        tensor(1)
+    """
+
+    def __init__(self, module: TensorDictModuleBase, value_key: NestedKey = "state_value") -> None:
+        self._network = _Network("ValueEvaluator", module, value_key)
+        self.module = module
+        self.in_keys = self._network.in_keys
+
+    def __call__(self, td: TensorDictBase) -> Tensor:
+        return self._network(td)
+
+    def __repr__(self) -> str:
+        return f"ValueEvaluator({self._network})"
+
+
+class ModulePrior:
+    r"""The prior of the options is what a network says: :math:`P(s, \cdot)`.
+
+    Args:
+        module: a TensorDictModule that writes probabilities or logits ``[m, A]``. Of a
+            ``ProbabilisticActor`` only the part before the distribution is used.
+        prob_key: its output with probabilities.
+        logits_key: its output with logits, of which the softmax is taken. Default, if neither key
+            is given: ``"probs"`` if the module writes it, else ``"logits"``.
+
+    Raises:
+        TypeError: if ``module`` is no TensorDictModule.
+        ValueError: if both keys are given, or the module does not write the entry.
+
+    Reference:
+        Silver et al., "Mastering the game of Go without human knowledge", 2017.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl_hmcts.planners import ModulePrior
+        >>> net = TensorDictModule(torch.nn.Identity(), in_keys=["x"], out_keys=["logits"])
+        >>> ModulePrior(net)(TensorDict({"x": torch.zeros(1, 4)}, [1]))
+        tensor([[0.2500, 0.2500, 0.2500, 0.2500]])
+    """
+
+    def __init__(
+        self,
+        module: TensorDictModuleBase,
+        *,
+        prob_key: NestedKey | None = None,
+        logits_key: NestedKey | None = None,
+    ) -> None:
+        if prob_key is not None and logits_key is not None:
+            raise ValueError(
+                f"ModulePrior reads probabilities or logits; got prob_key={prob_key!r} and "
+                f"logits_key={logits_key!r}. Leave one of the two out."
+            )
+        self.module = module
+        if isinstance(module, ProbabilisticTensorDictSequential):
+            module = module.det_part
+        key = prob_key if logits_key is None else logits_key
+        if key is None:
+            writes = getattr(module, "out_keys", ())
+            key = "logits" if "probs" not in writes and "logits" in writes else "probs"
+            logits_key = key if key == "logits" else None
+        self._network = _Network("ModulePrior", module, key)
+        self._is_logits = logits_key is not None
+        self.in_keys = self._network.in_keys
+
+    def __call__(self, td: TensorDictBase) -> Tensor:
+        out = self._network(td)
+        return torch.softmax(out.to(torch.float32), -1) if self._is_logits else out
+
+    def __repr__(self) -> str:
+        return f"ModulePrior({self._network})"
+
+
+class RolloutEvaluator:
+    r"""The value of a state is the return of rollouts from it: the simulation step of the textbook.
+
+    .. math:: V(s) = R_1 + D_1 (R_2 + D_2 (\dots (R_n + D_n\, b(s_n)))), \qquad D_i = \gamma^{k_i}
+
+    for options of :math:`k_i` base steps that a policy takes in the planner's own simulator, up to
+    the end of the episode or ``max_options``. :math:`b` is 0 at a terminal state, else the
+    bootstrap evaluator's value. All rollouts of a wave run in one simulator call per option, and
+    those that have ended cost nothing. In a deterministic simulator a state's value depends on the
+    state and its seed only, not on what is evaluated beside it. The budget of the search does not
+    count these steps: ``num_base_steps`` does.
+
+    Args:
+        policy: ``policy(td) -> probabilities [m, A]`` of the options, e.g. :class:`ModulePrior`;
+            options that the mask forbids are never taken. Default: uniform.
+        max_options: options of a rollout at most. Default 10.
+        num_rollouts: rollouts from each state, of which the mean is taken. Default 1.
+        bootstrap: evaluator of the state in which a rollout was cut off: by ``max_options``, a
+            truncation, or a state without an option that may be taken. Default: 0.
+
+    Raises:
+        ValueError: if a number is below 1; at the call if the policy gives no probabilities.
+        RuntimeError: at the call if no planner has given it a simulator.
+
+    Reference:
+        Kocsis and Szepesvari, "Bandit based Monte-Carlo planning", 2006; dissertation, section
+        2.4.2.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner, RolloutEvaluator
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=5)
+        >>> rollouts = RolloutEvaluator(max_options=20, num_rollouts=4)
+        >>> planner = MCTSPlanner(env, leaf_evaluator=rollouts, seed=0)
+        >>> planner(env.reset())["action"]
+        tensor(1)
+        >>> rollouts.num_base_steps > 0
+        True
+    """
+
+    is_random = True
+
+    def __init__(
+        self,
+        policy: Evaluator | None = None,
+        max_options: int = 10,
+        num_rollouts: int = 1,
+        *,
+        bootstrap: Evaluator | None = None,
+    ) -> None:
+        for name, number in (("max_options", max_options), ("num_rollouts", num_rollouts)):
+            if number < 1:
+                raise ValueError(f"RolloutEvaluator needs {name} >= 1; got {number}.")
+        self.policy = policy
+        self.max_options = max_options
+        self.num_rollouts = num_rollouts
+        self.bootstrap = bootstrap
+        self.in_keys = _joined_keys(policy, bootstrap)
+        self.num_base_steps = 0
+        self._simulator: Simulator | None = None
+        self._gamma = 1.0
+
+    def bind(self, simulator: Simulator, gamma: float) -> None:
+        """Take the simulator and the discount per base step of a planner; a planner calls this."""
+        bound = self._simulator
+        if bound is not None and (bound.env is not simulator.env or gamma != self._gamma):
+            raise ValueError(
+                "This RolloutEvaluator simulates for a planner with another env or discount. Give "
+                "each planner one of its own."
+            )
+        self._simulator, self._gamma = simulator, gamma
+        _bind(self.bootstrap, simulator, gamma)
+
+    @torch.no_grad()
+    def __call__(self, td: TensorDictBase) -> Tensor:
+        simulator = self._simulator
+        if simulator is None:
+            raise RuntimeError(
+                "RolloutEvaluator has no simulator yet. Pass it to a planner, "
+                "MCTSPlanner(env, leaf_evaluator=...), or call its bind(simulator, gamma)."
+            )
+        num_states, device = td.batch_size[0], td.device
+        streams = self._streams(td)  # [m * num_rollouts]
+        values, discounts = np.zeros(len(streams)), np.ones(len(streams))
+        walkers = np.arange(len(streams))  # [w] rollouts that still run
+        if self.num_rollouts > 1:
+            td = td[torch.arange(num_states).repeat_interleave(self.num_rollouts)]
+        for step in range(self.max_options + 1):
+            terminated = simulator.terminated(td)
+            stops = terminated | simulator.done(td)
+            masks = None if simulator.mask_key is None else simulator.masks(td)
+            if masks is not None:
+                stops |= ~masks.any(-1)
+            if step == self.max_options:
+                stops[:] = True
+            if self.bootstrap is not None:
+                cut = np.flatnonzero(stops & ~terminated)
+                if len(cut):
+                    rows = walkers[cut]
+                    seeds = _uniform_bits(streams[rows], step)
+                    values[rows] += discounts[rows] * self._bootstrap(_rows(td, cut), seeds)
+            runs = np.flatnonzero(~stops)
+            if not len(runs):
+                break
+            if len(runs) < len(walkers):
+                td, walkers = _rows(td, runs), walkers[runs]
+                masks = None if masks is None else masks[runs]
+            options = self._draw(td, masks, _uniform_bits(streams[walkers], step))
+            td = simulator.step(simulator.state(td), options)
+            durations = simulator.durations(td)
+            values[walkers] += discounts[walkers] * simulator.rewards(td)
+            discounts[walkers] *= self._gamma**durations
+            self.num_base_steps += int(durations.sum())
+        means = values.reshape(num_states, self.num_rollouts).mean(-1)
+        return torch.from_numpy(means.astype(np.float32)).to(device or "cpu")
+
+    def _streams(self, td: TensorDictBase) -> np.ndarray:
+        """One random stream for each rollout, uint64 ``[m * num_rollouts]``."""
+        seeds = td.get(SEED_KEY, None)
+        if seeds is None:
+            raise ValueError(
+                f'RolloutEvaluator reads a seed for each state from "{SEED_KEY}" (int64 [m]), '
+                f"which a planner writes; this tensordict has none. Outside of a planner set it: "
+                f'td.set("{SEED_KEY}", torch.arange(len(td))).'
+            )
+        states = _mix(seeds.cpu().reshape(-1).numpy().astype(np.uint64))
+        rollouts = np.arange(self.num_rollouts, dtype=np.uint64)
+        return _mix(states[:, None] + rollouts).reshape(-1)
+
+    def _draw(self, td: TensorDictBase, masks: np.ndarray | None, bits: np.ndarray) -> np.ndarray:
+        """Draw an option for each state, int64 ``[w]``, from random bits, uint64 ``[w]``."""
+        assert self._simulator is not None
+        shape = (td.batch_size[0], self._simulator.num_options)
+        weights = np.ones(shape) if masks is None else masks.astype(np.float64)
+        if self.policy is not None:
+            probabilities = self.policy(td)
+            got = list(getattr(probabilities, "shape", ()))
+            if not isinstance(probabilities, Tensor) or got != list(shape):
+                raise ValueError(
+                    f"The rollout policy returned a {type(probabilities).__name__} {got}; it must "
+                    f"give one probability per state and option, a tensor {list(shape)}. Wrap a "
+                    f"module in ModulePrior."
+                )
+            given = probabilities.to(torch.float64).cpu().numpy()
+            if not (np.isfinite(given) & (given >= 0.0)).all():
+                bad = given[~(np.isfinite(given) & (given >= 0.0))][0]
+                raise ValueError(
+                    f"The rollout policy returned a probability of {bad}. Probabilities must be "
+                    f"finite and not negative; apply a softmax to logits."
+                )
+            weights = weights * given
+        cumulative = weights.cumsum(-1)
+        total = cumulative[:, -1:]
+        if not (total > 0.0).all():
+            raise ValueError(
+                "The rollout policy gives probability 0 to every option that may be taken in a "
+                "state. Give each option some."
+            )
+        # 32 bits keep the threshold below the total: an option of weight 0 is never met.
+        threshold = (bits >> np.uint64(32)).astype(np.float64)[:, None] * 2.0**-32 * total
+        options: np.ndarray = (cumulative <= threshold).sum(-1)
+        return options
+
+    def _bootstrap(self, td: TensorDictBase, bits: np.ndarray) -> np.ndarray:
+        assert self.bootstrap is not None
+        if getattr(self.bootstrap, "is_random", False):
+            seeds = (bits >> np.uint64(1)).astype(np.int64)
+            td = td.copy().set(SEED_KEY, torch.from_numpy(seeds))
+        return _values(self.bootstrap, td, "bootstrap").to(torch.float64).numpy()
+
+    def __repr__(self) -> str:
+        return (
+            f"RolloutEvaluator(policy={self.policy}, max_options={self.max_options}, "
+            f"num_rollouts={self.num_rollouts}, bootstrap={self.bootstrap})"
+        )
+
+
+class MixedEvaluator:
+    r"""A mean of two evaluators, e.g. of a value network and rollouts.
+
+    .. math:: V(s) = (1 - \lambda)\, V_1(s) + \lambda\, V_2(s)
+
+    Args:
+        first: the evaluator :math:`V_1`.
+        second: the evaluator :math:`V_2`.
+        weight: :math:`\lambda`, in [0, 1]. Default 0.5.
+
+    Raises:
+        ValueError: if the weight is not in [0, 1].
+
+    Reference:
+        Silver et al., "Mastering the game of Go with deep neural networks and tree search", 2016.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.planners import MixedEvaluator
+        >>> mixed = MixedEvaluator(lambda td: td["a"], lambda td: td["b"], weight=0.25)
+        >>> mixed(TensorDict({"a": torch.zeros(2), "b": torch.ones(2)}, [2]))
+        tensor([0.2500, 0.2500])
+    """
+
+    def __init__(self, first: Evaluator, second: Evaluator, weight: float = 0.5) -> None:
+        if not 0.0 <= weight <= 1.0:
+            raise ValueError(
+                f"MixedEvaluator needs a weight of the second evaluator in [0, 1]; got {weight}."
+            )
+        self.first = first
+        self.second = second
+        self.weight = weight
+        self.in_keys = _joined_keys(first, second)
+        self.is_random = any(getattr(part, "is_random", False) for part in (first, second))
+
+    def bind(self, simulator: Simulator, gamma: float) -> None:
+        """Hand the simulator and the discount of a planner on to both evaluators."""
+        for part in (self.first, self.second):
+            _bind(part, simulator, gamma)
+
+    def __call__(self, td: TensorDictBase) -> Tensor:
+        first, second = _values(self.first, td, "first"), _values(self.second, td, "second")
+        return (1.0 - self.weight) * first + self.weight * second
+
+    def __repr__(self) -> str:
+        return f"MixedEvaluator({self.first}, {self.second}, weight={self.weight})"
+
+
+class _Network:
+    """One output of a TensorDictModule, without the cost of its bookkeeping where possible.
+
+    A call of a stock TensorDictModule costs 200 us, most of it for writing outputs; its network
+    alone 30 us.
+    """
+
+    def __init__(self, owner: str, module: TensorDictModuleBase, key: NestedKey) -> None:
+        if not isinstance(module, TensorDictModuleBase):
+            raise TypeError(
+                f"{owner} needs a TensorDictModule; got {type(module).__name__}. Wrap a network: "
+                f'TensorDictModule(net, in_keys=["observation"], out_keys=[{key!r}]).'
+            )
+        key = unravel_key(key)
+        out_keys = [unravel_key(k) for k in module.out_keys]
+        if key not in out_keys:
+            raise ValueError(f"{owner} reads {key!r}; its module writes {out_keys}. Name one.")
+        self.key = key
+        self.in_keys = [unravel_key(k) for k in module.in_keys]
+        self.module = module
+        if type(module) is TensorDictSequential and len(module) == 1:
+            module = module[0]
+        self._inner = module
+        self._index = out_keys.index(key)
+        self._num_outputs = len(out_keys)
+        self._direct = (
+            isinstance(module, TensorDictModule)
+            and type(module).forward is TensorDictModule.forward
+            and type(module)._call_module is TensorDictModule._call_module
+            and module._kwargs is None
+            and module.method is None
+            and not module.method_kwargs
+            and not module._get_kwargs
+            and self.in_keys == module.in_keys
+            and out_keys == module.out_keys
+        )
+
+    def __call__(self, td: TensorDictBase) -> Tensor:
+        inner = self._inner
+        if self._direct and not (inner._forward_hooks or inner._forward_pre_hooks):
+            out = inner.module(*(td.get(key) for key in self.in_keys))
+            outputs = out if isinstance(out, tuple) else (out,)
+            if len(outputs) == self._num_outputs and isinstance(outputs[self._index], Tensor):
+                return outputs[self._index]
+        return self.module(td.select(*self.in_keys)).get(self.key)
+
+    def __repr__(self) -> str:
+        return f"{self.in_keys} -> {self.key!r}"
+
+
+def _joined_keys(*parts: Evaluator | None) -> list[NestedKey]:
+    keys = (unravel_key(key) for part in parts for key in getattr(part, "in_keys", ()))
+    return list(dict.fromkeys(keys))
+
+
+def _bind(part: Evaluator | None, simulator: Simulator, gamma: float) -> None:
+    bind = getattr(part, "bind", None)
+    if bind is not None:
+        bind(simulator, gamma)
+
+
+def _rows(td: TensorDictBase, rows: np.ndarray) -> TensorDictBase:
+    return td if len(rows) == td.batch_size[0] else td[torch.from_numpy(rows)]
+
+
+def _values(evaluator: Evaluator, td: TensorDictBase, name: str) -> Tensor:
+    """The values of an evaluator, float32 ``[m]`` on the CPU, checked."""
+    values, num_states = evaluator(td), td.batch_size[0]
+    got = tuple(getattr(values, "shape", ()))
+    if not isinstance(values, Tensor) or got not in ((num_states,), (num_states, 1)):
+        raise ValueError(
+            f"The {name} evaluator returned a {type(values).__name__} {list(got)}; it must give "
+            f"one value per state, a tensor [{num_states}] or [{num_states}, 1]."
+        )
+    return values.reshape(-1).to("cpu", torch.float32)
+
+
+def _mix(bits: np.ndarray) -> np.ndarray:
+    """Hash 64 bits (the output function of SplitMix64), so that near seeds have nothing in common.
+
+    Reference: Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014.
+    """
+    bits = bits + np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
+
+
+def _uniform_bits(streams: np.ndarray, step: int) -> np.ndarray:
+    """Random bits number ``step`` of each stream, uint64 ``[w]``."""
+    return _mix(streams + np.uint64(step))

@@ -1,0 +1,453 @@
+"""A search tree in other forms: a networkx graph, TorchRL's ``Tree``, a text to read.
+
+Letters: ``N`` nodes, ``A`` options.
+"""
+
+from __future__ import annotations
+
+import heapq
+import textwrap
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_hmcts.planners.tree import (
+    CLOSED,
+    EXPANDED,
+    FORBIDDEN,
+    PRUNED,
+    REWARDED,
+    TERMINAL,
+    SearchTree,
+)
+
+if TYPE_CHECKING:
+    from torchrl.data.map.tree import Tree
+
+FLAGS = {
+    "expanded": EXPANDED,
+    "terminal": TERMINAL,
+    "pruned": PRUNED,
+    "closed": CLOSED,
+    "rewarded": REWARDED,
+}
+_MAX_OPTIONS = 24  # rows of the summary's table of options
+_MAX_STEPS = 40  # rows of its plan
+_LINE_WIDTH = 88
+_BAR = 12
+_NAME_WIDTH = 18
+
+
+def check_root(tree: SearchTree, root: int) -> int:
+    """Return the number of nodes of a root, or say why there is none."""
+    if not 0 <= root < tree.num_roots:
+        raise IndexError(
+            f"There is no root {root}: the search has {tree.num_roots}, counted from 0. Pass "
+            f"root=0 ... {tree.num_roots - 1}."
+        )
+    return int(tree.num_nodes[root])
+
+
+def children(tree: SearchTree, root: int, node: int) -> Iterator[int]:
+    """Yield the nodes that the options of a node led to, by option, in the order of their draw."""
+    for first in tree.edges["child"][root, node].tolist():
+        child = first
+        while child >= 0:
+            yield child
+            child = int(tree.nodes["sibling"][root, child])
+
+
+def best_plan(tree: SearchTree, root: int) -> list[int]:
+    """Return the nodes of the best plan from the root on, or none."""
+    best = int(tree.roots["best_node"][root])
+    return tree.path(root, best) if best > 0 else []
+
+
+def most_visited_path(tree: SearchTree, root: int) -> list[int]:
+    """Return the nodes from the root on along the options with most visits, then highest Q."""
+    path, node = [0], 0
+    while True:
+        edges = tree.edges[root, node]
+        visits = np.where(edges["child"] >= 0, edges["visits"], 0)
+        if not visits.any():
+            return path
+        most = np.flatnonzero(visits == visits.max())
+        option = most[edges["value"][most].argmax()]
+        outcomes = [
+            n
+            for n in children(tree, root, node)
+            if int(tree.nodes["option"][root, n]) == int(option)
+        ]
+        node = max(outcomes, key=lambda n: (int(tree.nodes["visits"][root, n]), -n))
+        path.append(node)
+
+
+def shown_nodes(tree: SearchTree, root: int, max_nodes: int | None) -> np.ndarray:
+    """Return the most visited nodes, in ascending order, each with the node above it.
+
+    The best plan is among them whatever its visits, as far as ``max_nodes`` allows.
+    """
+    count = check_root(tree, root)
+    if max_nodes is not None and max_nodes < 1:
+        raise ValueError(f"max_nodes must be at least 1, the root; got {max_nodes}.")
+    if max_nodes is None or max_nodes >= count:
+        return np.arange(count)
+    chosen = set(best_plan(tree, root)[:max_nodes]) | {0}
+    visits = tree.nodes["visits"][root]
+    border: list[tuple[int, int]] = []
+
+    def add_children(node: int) -> None:
+        for child in children(tree, root, node):
+            if child not in chosen:
+                heapq.heappush(border, (-int(visits[child]), child))
+
+    for node in sorted(chosen):
+        add_children(node)
+    while border and len(chosen) < max_nodes:
+        node = heapq.heappop(border)[1]
+        chosen.add(node)
+        add_children(node)
+    return np.array(sorted(chosen))
+
+
+def to_networkx(
+    tree: SearchTree, root: int = 0, *, max_nodes: int | None = None, states: bool = False
+) -> Any:
+    """Return the tree of one root as a directed graph of networkx, its nodes numbered as here.
+
+    Args:
+        tree: of a finished or interrupted search.
+        root: which of the ``B`` roots. Default 0.
+        max_nodes: how many nodes at most: those with most visits, and the best plan. Default: all.
+        states: whether the nodes also have their ``state``, a dict of lists. Default False.
+
+    Returns:
+        A ``networkx.DiGraph``. Nodes: ``visits``, ``value`` V, ``depth`` (options from the root),
+        ``base_steps`` and ``path_return`` (from the root), ``expanded``, ``terminal``, ``pruned``,
+        ``closed``, ``rewarded`` (bool), ``twin`` (node searched in its place, -1 for none). Edges:
+        ``option``, ``visits`` and ``value`` Q and ``prior`` of the option; ``reward`` R,
+        ``discount`` D and ``samples`` (times drawn) of the outcome. Graph: ``num_nodes`` of the
+        whole tree and ``best_node``, the end of the best plan, -1 without one.
+
+    Raises:
+        ImportError: if networkx is missing.
+        IndexError: if there is no such root.
+        ValueError: if ``max_nodes`` is below 1, or states are asked for that the tree has not.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=3)
+        >>> graph = MCTSPlanner(env, gamma=0.9).search(env.reset()).tree.to_networkx()
+        >>> graph.nodes[6]["terminal"], graph.edges[2, 6]["option"], graph.edges[2, 6]["reward"]
+        (True, 1, 1.0)
+    """
+    try:
+        import networkx
+    except ImportError as error:
+        raise ImportError(
+            "to_networkx needs networkx, which is missing here: pip install networkx."
+        ) from error
+    count = check_root(tree, root)
+    if states and tree.states is None:
+        raise ValueError(
+            "This tree keeps no states (tree_search leaves them to its caller): pass states=False."
+        )
+    shown = shown_nodes(tree, root, max_nodes)
+    nodes = tree.nodes[root, shown]
+    graph = networkx.DiGraph(num_nodes=count, best_node=int(tree.roots["best_node"][root]))
+    for index, node in zip(shown.tolist(), nodes, strict=True):
+        graph.add_node(
+            index,
+            visits=int(node["visits"]),
+            value=float(node["value"]),
+            depth=int(node["depth"]),
+            base_steps=int(node["base_steps"]),
+            path_return=float(node["path_return"]),
+            twin=int(node["twin"]),
+            **{name: bool(node["flags"] & bit) for name, bit in FLAGS.items()},
+        )
+        if states:
+            assert tree.states is not None
+            graph.nodes[index]["state"] = {
+                key: value.tolist() for key, value in tree.states[root, index].items(True, True)
+            }
+        if index == 0:
+            continue
+        edge = tree.edges[root, node["parent"], node["option"]]
+        graph.add_edge(
+            int(node["parent"]),
+            index,
+            option=int(node["option"]),
+            visits=int(edge["visits"]),
+            value=float(edge["value"]),
+            prior=float(edge["prior"]),
+            reward=float(node["reward"]),
+            discount=float(node["discount"]),
+            samples=int(node["samples"]),
+        )
+    return graph
+
+
+def to_torchrl(tree: SearchTree, root: int = 0) -> Tree:
+    """Return the tree of one root as TorchRL's ``Tree``; nothing is shared with this one.
+
+    A vertex is a node of this tree, and its fields hold:
+
+    - ``count``: visits, int32. ``wins``: visits times value V, float32, so that
+      ``wins / count`` is the value.
+    - ``node_id`` and ``hash``: the node's number here. Equal states are vertices of their own.
+    - ``node_data``: its state; ``node_observation`` works if that has an ``"observation"``.
+    - ``rollout``: the macro-step that led to it, batch ``[1]``; None at the root. The parent's
+      state, ``"action"`` (the option's index, int64) and ``"next"`` with the node's state,
+      ``"reward"`` R, ``"discount"`` D, ``"duration"`` in base steps, ``"done"`` and
+      ``"terminated"``.
+    - ``subtree``: a stack of its children, by option and then in the order they were drawn;
+      ``index``: their numbers, int64. Both None where there are none.
+
+    Args:
+        tree: of a finished or interrupted search.
+        root: which of the ``B`` roots. Default 0.
+
+    Raises:
+        IndexError: if there is no such root.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=3)
+        >>> tree = MCTSPlanner(env, gamma=0.9).search(env.reset()).tree.to_torchrl()
+        >>> tree.num_vertices(), tree.rollout_from_path((1, 1))["action"].tolist()
+        (7, [1, 1])
+    """
+    from torchrl.data.map.tree import Tree
+
+    count = check_root(tree, root)
+    nodes = tree.nodes[root, :count]
+    if tree.states is None:
+        states: TensorDictBase = TensorDict({}, batch_size=[count])
+    else:
+        states = tree.states[root, :count].clone()
+    parents = torch.from_numpy(np.maximum(nodes["parent"], 0).astype(np.int64))
+    steps = nodes["base_steps"]
+    done = (nodes["flags"] & TERMINAL) != 0
+
+    def column(array: np.ndarray, dtype: torch.dtype) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(states.device, dtype).view(-1, 1, 1)
+
+    transitions = states[parents].unsqueeze(1)
+    after = states.clone().unsqueeze(1)
+    # One number for each step, in the shape of the batch: as an env with a scalar action has it.
+    transitions.set("action", column(nodes["option"], torch.int64).squeeze(-1))
+    after.set("reward", column(nodes["reward"], torch.float32))
+    after.set("discount", column(nodes["discount"], torch.float32))
+    after.set("duration", column(steps - steps[parents.numpy()], torch.int64))
+    after.set("done", column(done, torch.bool))
+    after.set("terminated", column(done & (nodes["discount"] == 0.0), torch.bool))
+    transitions.set("next", after)
+
+    visits = torch.from_numpy(nodes["visits"].copy())
+    wins = visits * torch.from_numpy(nodes["value"].copy())
+    below: list[list[int]] = [list(children(tree, root, n)) for n in range(count)]
+    vertices: list[Any] = [
+        Tree(
+            count=visits[n],
+            wins=wins[n],
+            node_id=n,
+            hash=n,
+            node_data=state,
+            rollout=rollout if n else None,
+            index=torch.tensor(below[n]) if below[n] else None,
+        )
+        for n, (state, rollout) in enumerate(
+            zip(states.unbind(0), transitions.unbind(0), strict=True)
+        )
+    ]
+    for n in reversed(range(count)):  # children stand behind their parents
+        if below[n]:
+            vertices[n].subtree = TensorDict.lazy_stack([vertices[child] for child in below[n]])
+    return vertices[0]
+
+
+def summary(tree: SearchTree, root: int = 0, option_names: Sequence[str] | None = None) -> str:
+    """Return what a search found as text: its size, the root's options, and the principal plan.
+
+    The plan is the best one found, or else the path of most visits. Of its columns, ``steps`` and
+    ``return`` (discounted) are counted from the root, ``R`` is the reward of the option, ``Q`` its
+    value, ``V`` the value of the node it led to.
+
+    Args:
+        tree: of a finished or interrupted search.
+        root: which of the ``B`` roots. Default 0.
+        option_names: one for each of the ``A`` options. Default: none.
+
+    Returns:
+        Lines of at most 88 characters.
+
+    Raises:
+        IndexError: if there is no such root.
+        ValueError: if there are fewer names than options.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=3)
+        >>> tree = MCTSPlanner(env, gamma=0.9).search(env.reset()).tree
+        >>> print(tree.summary(option_names=["left", "right"]))
+        Search tree: 7 nodes, 3 expanded, 1 terminal; depth 2
+        Root: 7 visits, value V = 0.1286
+        <BLANKLINE>
+        option   visits                              Q  prior
+        1 right       3  50.0 % |######      |  0.3000  0.500
+        0 left        3  50.0 % |######      |  0.0000  0.500
+        <BLANKLINE>
+        Best plan: 2 options, 2 base steps, return 0.9000
+        <BLANKLINE>
+          #  option   steps       R  return       Q       V  visits
+          1  1 right      1  0.0000  0.0000  0.3000  0.3333       3
+          2  1 right      2  1.0000  0.9000  1.0000  0.0000       1
+    """
+    count = check_root(tree, root)
+    names = option_labels(tree.num_options, option_names, width=_NAME_WIDTH)
+    nodes = tree.nodes[root, :count]
+    counts = [f"{_plural(count, 'node')}"]
+    for name in ("expanded", "pruned", "terminal"):
+        number = int(((nodes["flags"] & FLAGS[name]) != 0).sum())
+        if name == "pruned":
+            known = int((nodes["twin"] >= 0).sum())
+            counts += [f"{known:,} of known states"] if known else []
+            number -= known
+        if number:
+            counts.append(f"{number:,} {name}")
+    size = f"Search tree: {', '.join(counts)}; depth {int(nodes['depth'].max()):,}"
+    lines = textwrap.wrap(size, _LINE_WIDTH, subsequent_indent="  ")
+    value = _numbers([nodes["value"][0]])[0].strip()
+    lines.append(f"Root: {_plural(int(nodes['visits'][0]), 'visit')}, value V = {value}")
+    lines += ["", *_table_of_options(tree, root, names)]
+    plan = best_plan(tree, root)
+    last = nodes[plan[-1]] if plan else None
+    if last is not None:
+        gained = _numbers([last["path_return"]])[0].strip()
+        title = (
+            f"Best plan: {_plural(len(plan) - 1, 'option')}, "
+            f"{_plural(int(last['base_steps']), 'base step')}, return {gained}"
+        )
+    else:
+        plan = most_visited_path(tree, root)
+        title = "No plan found yet. Most visited path:"
+    if len(plan) > 1:
+        lines += ["", title, "", *_table_of_steps(tree, root, plan, names)]
+    elif len(nodes) == 1:
+        lines += ["", "Nothing has been simulated."]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def option_labels(
+    num_options: int, option_names: Sequence[str] | None, *, width: int | None = None
+) -> list[str]:
+    """Return a label for each option: its number, and its name if there is one."""
+    if option_names is None:
+        return [str(option) for option in range(num_options)]
+    if isinstance(option_names, str) or len(option_names) < num_options:
+        raise ValueError(
+            f"option_names needs one name for each of the {num_options} options; got "
+            f"{option_names!r}."
+        )
+    labels = [f"{option} {option_names[option]}" for option in range(num_options)]
+    return [_clip(label, width or len(label)) for label in labels]
+
+
+def _table_of_options(tree: SearchTree, root: int, names: list[str]) -> list[str]:
+    edges = tree.edges[root, 0]
+    order = sorted(
+        range(tree.num_options),
+        key=lambda a: (
+            int(edges["closed"][a]) == FORBIDDEN,
+            -int(edges["visits"][a]),
+            -float(edges["value"][a]),
+        ),
+    )
+    values, total = _numbers(edges["value"]), max(int(edges["visits"].sum()), 1)
+    width = max(len("option"), *(len(names[a]) for a in order[:_MAX_OPTIONS]))
+    visits_width = max(len("visits"), len(f"{int(edges['visits'].max()):,}"))
+    value_width = max(map(len, values))
+    gap = " " * (_BAR + 11)
+    lines = [f"{'option':{width}}  {'visits':>{visits_width}}{gap}  {'Q':>{value_width}}  prior"]
+    for a in order[:_MAX_OPTIONS]:
+        visits = int(edges["visits"][a])
+        if int(edges["closed"][a]) == FORBIDDEN:
+            lines.append(f"{names[a]:{width}}  {'not allowed':>{visits_width}}")
+            continue
+        bar = "#" * round(_BAR * visits / total)
+        simulated = int(edges["child"][a]) >= 0
+        lines.append(
+            f"{names[a]:{width}}  {visits:>{visits_width},} {100 * visits / total:5.1f} % "
+            f"|{bar:{_BAR}}|  {values[a] if simulated else '-':>{value_width}}  "
+            f"{float(edges['prior'][a]):.3f}"
+        )
+    left_out = order[_MAX_OPTIONS:]
+    if left_out:
+        visits = int(edges["visits"][left_out].sum())
+        lines.append(f"... and {_plural(len(left_out), 'option')} with {_plural(visits, 'visit')}")
+    return lines
+
+
+def _table_of_steps(tree: SearchTree, root: int, plan: list[int], names: list[str]) -> list[str]:
+    nodes = tree.nodes[root, plan[1:]]
+    edges = tree.edges[root, nodes["parent"], nodes["option"]]
+    columns = {
+        "option": [names[a] for a in nodes["option"]],
+        "steps": [f"{int(n):,}" for n in nodes["base_steps"]],
+        "R": _numbers(nodes["reward"]),
+        "return": _numbers(nodes["path_return"]),
+        "Q": _numbers(edges["value"]),
+        "V": _numbers(nodes["value"]),
+        "visits": [f"{int(n):,}" for n in nodes["visits"]],
+    }
+    widths = {name: max(len(name), *map(len, column)) for name, column in columns.items()}
+    number_width = max(3, len(str(len(nodes))))
+    room = _LINE_WIDTH - number_width - sum(width + 2 for width in widths.values())
+    if room < 0:
+        widths["option"] = max(widths["option"] + room, len("option"))
+        columns["option"] = [_clip(name, widths["option"]) for name in columns["option"]]
+
+    def row(number: str, cells: Sequence[str]) -> str:
+        texts = [
+            f"{cell:{width}}" if name == "option" else f"{cell:>{width}}"
+            for (name, width), cell in zip(widths.items(), cells, strict=True)
+        ]
+        return "  ".join([f"{number:>{number_width}}", *texts])
+
+    lines = [row("#", list(columns))]
+    rows = [row(str(i + 1), cells) for i, cells in enumerate(zip(*columns.values(), strict=True))]
+    if len(rows) > _MAX_STEPS:
+        head, tail = rows[: _MAX_STEPS // 2], rows[-_MAX_STEPS // 2 + 1 :]
+        gap = f"... {_plural(len(rows) - len(head) - len(tail), 'option')} left out ..."
+        rows = [*head, f"{'':{number_width}}  {gap}", *tail]
+    lines += rows
+    twin = int(nodes["twin"][-1])
+    if twin >= 0:
+        where = ", ".join(names[a] for a in tree.options(root, twin))
+        lines.append(f"It goes on from the same state behind: {_clip(where, 48) or 'the root'}")
+    return lines
+
+
+def _numbers(values: Any) -> list[str]:
+    """Numbers of one column with the same decimals, at most 9 characters each."""
+    array = np.atleast_1d(np.asarray(values, np.float64)) + 0.0  # no negative zeros
+    largest = np.abs(array).max(initial=0.0)
+    if largest != 0.0 and not 1e-3 <= largest < 99_999.0:
+        return [f"{value:.2e}" for value in array]
+    decimals = 4 if largest < 99.0 else 3 if largest < 999.0 else 2 if largest < 9999.0 else 1
+    return [f"{value:.{decimals}f}" for value in array]
+
+
+def _plural(number: int, noun: str) -> str:
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
+def _clip(text: str, width: int) -> str:
+    return text if len(text) <= width else f"{text[: width - 3]}..."

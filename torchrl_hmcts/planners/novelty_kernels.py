@@ -1,0 +1,339 @@
+"""The inner loops of the novelty tests and of transpositions, compiled by numba.
+
+Imported when the first state is tested, since numba takes a second to load. Each kernel takes the
+states in order and stops where it needs more room than it has: it returns how far it came.
+
+Letters: ``B`` roots, ``m`` states to test, ``F`` features, ``K`` bytes of a state, ``C`` states a
+root has room for.
+"""
+
+# numba compiles these functions; it does not read annotations as strings.
+import math
+
+import numba
+import numpy as np
+
+# What the radius test knows of a root.
+RADIUS_ROOT = np.dtype(
+    [
+        ("count", np.int64),  # accepted states
+        ("radius", np.float64),
+        ("cell", np.float64),  # edge of the grid's cells, 0: there is no grid
+        ("axes", np.int64),  # features that span the grid, at most 3 ...
+        ("axis0", np.int64),  # ... and which
+        ("axis1", np.int64),
+        ("axis2", np.int64),
+    ],
+    align=True,
+)
+
+# Up to here a scan of all accepted states is faster than a grid.
+_SMALL = 48
+# Cells further out than this share one; it keeps products of the hash below 2 ** 63.
+_FURTHEST = 2**30
+# A ball reaches this much further, so that no rounding hides a state at its edge.
+_MARGIN = 1.0 + 1e-6
+
+
+# ------------------------------------------------------------------------------- distant states
+
+
+@numba.njit(cache=True)
+def _cell(x, edge):
+    return int(min(max(np.floor(x / edge), -_FURTHEST), _FURTHEST))
+
+
+@numba.njit(cache=True)
+def _bucket(i, j, k, num_buckets):
+    mixed = (i * 73856093) ^ (j * 19349663) ^ (k * 83492791)
+    return (((mixed & 0x7FFFFFFF) * 2654435761) >> 16) & (num_buckets - 1)
+
+
+@numba.njit(cache=True)
+def _is_finite(states, i):
+    for f in range(states.shape[1]):
+        if not math.isfinite(states[i, f]):
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def _link(seen, links, heads, root, b, j):
+    """Put accepted state ``j`` into its cell; one that is not finite is near none."""
+    if not _is_finite(seen[b], j):
+        return
+    edge = root["cell"]
+    bucket = _bucket(
+        _cell(seen[b, j, root["axis0"]], edge) if root["axes"] > 0 else 0,
+        _cell(seen[b, j, root["axis1"]], edge) if root["axes"] > 1 else 0,
+        _cell(seen[b, j, root["axis2"]], edge) if root["axes"] > 2 else 0,
+        heads.shape[1],
+    )
+    links[b, j] = heads[b, bucket]
+    heads[b, bucket] = j
+
+
+@numba.njit(cache=True)
+def _choose_axes(seen, root, b):
+    """Span the grid by the three features that vary most; a distance in them is a lower bound."""
+    num_features = seen.shape[2]
+    root["axes"] = min(num_features, 3)
+    root["axis0"], root["axis1"], root["axis2"] = 0, 1, 2
+    if num_features <= 3:
+        return
+    variance = np.zeros(num_features)
+    for f in range(num_features):
+        total, squares, count = 0.0, 0.0, 0
+        first = 0.0
+        for j in range(root["count"]):
+            value = float(seen[b, j, f])
+            if math.isfinite(value):
+                first = value if count == 0 else first
+                total += value - first
+                squares += (value - first) * (value - first)
+                count += 1
+        if count:
+            variance[f] = squares / count - (total / count) * (total / count)
+    order = np.argsort(-variance)
+    root["axis0"], root["axis1"], root["axis2"] = order[0], order[1], order[2]
+
+
+@numba.njit(cache=True)
+def _build_grid(seen, links, heads, root, b):
+    """Sort the accepted states of a root into cells twice as wide as its radius."""
+    root["cell"] = 2.0 * root["radius"]
+    _choose_axes(seen, root, b)
+    heads[b, :] = -1
+    for j in range(root["count"]):
+        _link(seen, links, heads, root, b, j)
+
+
+@numba.njit(cache=True)
+def _is_near(features, i, seen, b, j, limit):
+    distance = 0.0
+    for f in range(features.shape[1]):
+        delta = float(features[i, f]) - float(seen[b, j, f])
+        distance += delta * delta
+    return distance < limit
+
+
+@numba.njit(cache=True)
+def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_enough):
+    """The fewest base steps of the accepted states within the radius, -1 if there is none."""
+    limit = root["radius"] * root["radius"]
+    fewest = -1
+    if root["cell"] == 0.0:
+        count = root["count"]
+        for j in range(count):
+            if _is_near(features, i, seen, b, j, limit):
+                if fewest < 0 or seen_steps[b, j] < fewest:
+                    fewest = seen_steps[b, j]
+                if any_is_enough:
+                    return fewest
+        return fewest
+    if not _is_finite(features, i):
+        return fewest
+    reach, edge, axes = root["radius"] * _MARGIN, root["cell"], root["axes"]
+    low0 = low1 = low2 = high0 = high1 = high2 = 0
+    if axes > 0:
+        x = float(features[i, root["axis0"]])
+        low0, high0 = _cell(x - reach, edge), _cell(x + reach, edge)
+    if axes > 1:
+        x = float(features[i, root["axis1"]])
+        low1, high1 = _cell(x - reach, edge), _cell(x + reach, edge)
+    if axes > 2:
+        x = float(features[i, root["axis2"]])
+        low2, high2 = _cell(x - reach, edge), _cell(x + reach, edge)
+    for x0 in range(low0, high0 + 1):
+        for x1 in range(low1, high1 + 1):
+            for x2 in range(low2, high2 + 1):
+                j = heads[b, _bucket(x0, x1, x2, heads.shape[1])]
+                while j >= 0:
+                    if _is_near(features, i, seen, b, j, limit):
+                        if fewest < 0 or seen_steps[b, j] < fewest:
+                            fewest = seen_steps[b, j]
+                        if any_is_enough:
+                            return fewest
+                    j = links[b, j]
+    return fewest
+
+
+@numba.njit(cache=True)
+def accept_distant(
+    seen, seen_steps, links, heads, known, tally, roots, features, base_steps, shorter_by,
+    accepted, first,
+):  # fmt: skip
+    """Accept, in order, the states outside the radius of every accepted one; return how far.
+
+    A ``shorter_by`` above 0 also accepts a state that needs fewer base steps than that share of the
+    fewest within its radius. States of a root lie in a hash grid: ``heads [B, buckets]`` is the
+    last state of a bucket, ``links [B, C]`` the one before it. ``tally`` counts what was refused,
+    and what was accepted for a shorter path.
+    """
+    for i in range(first, roots.shape[0]):
+        b = roots[i]
+        root = known[b]
+        if root["count"] == seen.shape[1]:
+            return i
+        if root["count"] >= _SMALL and not 0.0 < root["cell"] <= 4.0 * root["radius"]:
+            _build_grid(seen, links, heads, root, b)
+        fewest = _fewest_nearby(
+            seen, seen_steps, links, heads, root, b, features, i, shorter_by == 0.0
+        )
+        novel = fewest < 0
+        if not novel and base_steps[i] < shorter_by * fewest:
+            novel = True
+            tally[1] += 1
+        accepted[i] = novel
+        if novel:
+            j = root["count"]
+            for f in range(features.shape[1]):
+                seen[b, j, f] = features[i, f]
+            seen_steps[b, j] = base_steps[i]
+            root["count"] += 1
+            if root["cell"] > 0.0:
+                _link(seen, links, heads, root, b, j)
+        else:
+            tally[0] += 1
+    return roots.shape[0]
+
+
+# ------------------------------------------------------------------------------------ new values
+
+
+@numba.njit(cache=True)
+def accept_new_bytes(counts, limits, tally, roots, features, accepted):
+    """Accept, in order, the states with a byte whose value ``counts [B, F, 256]`` has seldom."""
+    for i in range(roots.shape[0]):
+        b = roots[i]
+        novel = False
+        for f in range(features.shape[1]):
+            if counts[b, f, features[i, f]] < limits[b]:
+                novel = True
+                break
+        accepted[i] = novel
+        if novel:
+            for f in range(features.shape[1]):
+                if counts[b, f, features[i, f]] < 255:
+                    counts[b, f, features[i, f]] += 1
+        else:
+            tally[0] += 1
+
+
+@numba.njit(cache=True)
+def _slot(values, owners, b, f, value):
+    """The slot of feature ``f`` with this value in the hash table of a root, or a free one."""
+    last = owners.shape[1] - 1
+    mixed = (value & 0x7FFFFFFF) ^ ((value >> 31) & 0x7FFFFFFF) ^ (f * 19349663)
+    slot = (((mixed & 0x7FFFFFFF) * 2654435761) >> 16) & last
+    while owners[b, slot] >= 0 and (owners[b, slot] != f or values[b, slot] != value):
+        slot = (slot + 1) & last
+    return slot
+
+
+@numba.njit(cache=True)
+def accept_new_integers(
+    values, owners, counts, used, limits, tally, roots, features, accepted, slots, first
+):
+    """Accept, in order, the states with a value that was seldom seen; return how far it came.
+
+    Slots of ``values``, ``owners`` (the feature, -1 for none) and ``counts``, all ``[B, slots]``,
+    are a hash table of each root, at most half full; ``slots [F]`` is room to work in.
+    """
+    num_features = features.shape[1]
+    for i in range(first, roots.shape[0]):
+        b = roots[i]
+        if 2 * (used[b] + num_features) > owners.shape[1]:
+            return i
+        novel = False
+        for f in range(num_features):
+            slots[f] = _slot(values, owners, b, f, features[i, f])
+            free = owners[b, slots[f]] < 0
+            novel = novel or free or counts[b, slots[f]] < limits[b]
+        accepted[i] = novel
+        if novel:
+            for f in range(num_features):
+                slot = slots[f]
+                if owners[b, slot] >= 0 and owners[b, slot] != f:  # taken a moment ago
+                    slot = _slot(values, owners, b, f, features[i, f])
+                if owners[b, slot] < 0:
+                    owners[b, slot], values[b, slot] = f, features[i, f]
+                    counts[b, slot] = 0
+                    used[b] += 1
+                if counts[b, slot] < 255:
+                    counts[b, slot] += 1
+        else:
+            tally[0] += 1
+    return roots.shape[0]
+
+
+@numba.njit(cache=True)
+def move_values(values, owners, counts, to_values, to_owners, to_counts):
+    """Fill a larger hash table."""
+    for b in range(owners.shape[0]):
+        for slot in range(owners.shape[1]):
+            if owners[b, slot] >= 0:
+                to = _slot(to_values, to_owners, b, owners[b, slot], values[b, slot])
+                to_values[b, to] = values[b, slot]
+                to_owners[b, to] = owners[b, slot]
+                to_counts[b, to] = counts[b, slot]
+
+
+# ----------------------------------------------------------------------------------- equal states
+
+
+@numba.njit(cache=True)
+def _code_bucket(codes, i, num_buckets):
+    mixed = 0x11C9DC5
+    for k in range(codes.shape[1]):  # FNV-1a, cut to 31 bits
+        mixed = ((mixed ^ int(codes[i, k])) * 16777619) & 0x7FFFFFFF
+    return ((mixed * 2654435761) >> 16) & (num_buckets - 1)
+
+
+@numba.njit(cache=True)
+def _is_equal(codes, i, others, j):
+    for k in range(codes.shape[1]):
+        if codes[i, k] != others[j, k]:
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def find_equal(seen, seen_nodes, links, heads, counts, tally, roots, codes, nodes, twins, first):
+    """Write the node of the same state, or remember a new one under its node; return how far.
+
+    States ``seen [B, C, K]`` of a root are chained in buckets, as those of
+    :func:`accept_distant`; ``tally`` counts those that were found.
+    """
+    for i in range(first, roots.shape[0]):
+        b = roots[i]
+        bucket = _code_bucket(codes, i, heads.shape[1])
+        j = heads[b, bucket]
+        while j >= 0 and not _is_equal(codes, i, seen[b], j):
+            j = links[b, j]
+        twins[i] = -1
+        if j >= 0:
+            if seen_nodes[b, j] != nodes[i]:
+                twins[i] = seen_nodes[b, j]
+                tally[0] += 1
+            continue
+        j = counts[b]
+        if j == seen.shape[1]:
+            return i
+        seen[b, j] = codes[i]
+        seen_nodes[b, j] = nodes[i]
+        links[b, j] = heads[b, bucket]
+        heads[b, bucket] = j
+        counts[b] += 1
+    return roots.shape[0]
+
+
+@numba.njit(cache=True)
+def link_codes(seen, links, heads, counts):
+    """Sort all states into buckets anew."""
+    heads[:] = -1
+    for b in range(seen.shape[0]):
+        for j in range(counts[b]):
+            bucket = _code_bucket(seen[b], j, heads.shape[1])
+            links[b, j] = heads[b, bucket]
+            heads[b, bucket] = j
