@@ -147,7 +147,7 @@ class SearchTree:
         self.features = np.zeros((num_roots, capacity, num_features), np.float32)
         self.codes = np.zeros((num_roots, capacity, 0), np.uint8)  # states as bytes
         self.states: TensorDictBase | None = None
-        self._flat: tuple[TensorDictBase, dict[NestedKey, Tensor]] | None = None
+        self._flat: tuple[TensorDictBase, dict[NestedKey, Any]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:  # a copy of the columns would not share memory
         return {**self.__dict__, "_flat": None}
@@ -189,35 +189,47 @@ class SearchTree:
                 batch_size=shape,
                 device=states.device,
             )
-        where = self._rows(roots, nodes)
+        rows = roots * self.capacity + nodes
         for key, column in self._columns().items():
-            column.index_copy_(0, where, states.get(key))
+            # TensorDict.get unravels the key at several times the cost of the look-up
+            value = states._get_str(key, None) if isinstance(key, str) else states.get(key)
+            if isinstance(column, np.ndarray):
+                column[rows] = value.detach().numpy()
+            else:
+                column.index_copy_(0, torch.from_numpy(rows).to(column.device), value)
 
     def get_states(
         self, roots: np.ndarray, nodes: np.ndarray, keys: Sequence[NestedKey]
     ) -> TensorDict:
         """Return the states ``[m]`` of nodes ``[m]``."""
         assert self.states is not None
-        where, columns = self._rows(roots, nodes), self._columns()
-        entries = {key: columns[key].index_select(0, where) for key in keys}
+        rows, columns = roots * self.capacity + nodes, self._columns()
+        entries = {}
+        for key in keys:
+            column = columns[key]
+            if isinstance(column, np.ndarray):
+                entries[key] = torch.from_numpy(column[rows])
+            else:
+                entries[key] = column.index_select(0, torch.from_numpy(rows).to(column.device))
         size = torch.Size([len(roots)])
         if all(isinstance(key, str) for key in keys):  # the constructor's checks cost more
             return TensorDict._new_unsafe(entries, size, device=self.states.device)
         return TensorDict(entries, size, device=self.states.device)
 
-    def _columns(self) -> dict[NestedKey, Tensor]:
-        """The states' entries ``[B * N, ...]``, which share their memory."""
+    def _columns(self) -> dict[NestedKey, Tensor | np.ndarray]:
+        """The states' entries ``[B * N, ...]``, which share their memory.
+
+        As NumPy arrays where there is such a type: indexing one costs half as much for few rows.
+        """
         if self._flat is None or self._flat[0] is not self.states:
             assert self.states is not None
-            columns = {key: x.flatten(0, 1) for key, x in self.states.items(True, True)}
+            columns: dict[NestedKey, Tensor | np.ndarray] = {}
+            for key, entry in self.states.items(True, True):
+                flat = entry.flatten(0, 1)
+                plain = flat.device.type == "cpu" and flat.dtype != torch.bfloat16
+                columns[key] = flat.numpy() if plain else flat
             self._flat = (self.states, columns)
         return self._flat[1]
-
-    def _rows(self, roots: np.ndarray, nodes: np.ndarray) -> Tensor:
-        rows = torch.from_numpy(roots * self.capacity + nodes)
-        assert self.states is not None
-        device = self.states.device
-        return rows if device is None else rows.to(device)
 
     def path(self, root: int, node: int) -> list[int]:
         """Return the nodes from the root to ``node``, both included."""
