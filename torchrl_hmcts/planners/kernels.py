@@ -770,7 +770,8 @@ def handle(nodes, edges, roots, settings, gumbel, wave, masks, stored, states):
     arrays = (nodes, edges, roots, settings, gumbel, wave, masks, stored, states)
     sizes = (*edges.shape, gumbel.shape[0], gumbel.shape[1], len(wave), len(masks))
     sizes += (stored.shape[2], len(states))
-    return np.array([*(array.ctypes.data for array in arrays), *sizes], np.int64)
+    addresses = (array.__array_interface__["data"][0] for array in arrays)
+    return np.array([*addresses, *sizes], np.int64)
 
 
 @numba.njit(cache=True, error_model="numpy")
