@@ -442,3 +442,9 @@ def test_a_tree_policy_that_returns_nonsense_is_named() -> None:
         tree_search(root, table, 10, tree_policy=nan)
     with pytest.raises(ValueError, match=r"returned \[2\]; .*\[2, 3\]"):
         tree_search(root, table, 10, tree_policy=lambda statistics: statistics.node_values)
+
+
+def test_halving_with_several_leaves_per_wave_is_refused() -> None:
+    root = Root(np.full((1, 2), 0.5, np.float32), np.zeros(1, np.float32), np.zeros(1))
+    with pytest.raises(ValueError, match="leaves_per_wave=4"):
+        tree_search(root, lambda *_: None, 8, tree_policy=Gumbel(), leaves_per_wave=4)

@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.data import Binary, Composite
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_hmcts.planners import (
@@ -40,20 +39,6 @@ class CountingTable(TableEnv):
         pairs = zip(tensordict["state"].tolist(), tensordict["action"].tolist(), strict=True)
         self.calls.append(list(pairs))
         return super()._step(tensordict)
-
-
-class TruncatingTable(TableEnv):
-    """A table whose last states truncate the episode instead of terminating it."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        flags = ("done", "terminated", "truncated")
-        self.done_spec = Composite({k: Binary(1, dtype=torch.bool) for k in flags})
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        after = super()._step(tensordict)
-        truncated = after.get("terminated")
-        return after.set("truncated", truncated).set("terminated", torch.zeros_like(truncated))
 
 
 class DeadEndTable(TableEnv):
@@ -125,7 +110,7 @@ def test_a_terminal_state_is_worth_nothing_and_a_truncated_one_its_bootstrap() -
     terminal = env.step(at(env, [0]).set("action", torch.tensor([0])))["next"]
     env.calls.clear()
     assert rollout(terminal.set("_seed", torch.tensor([0]))).tolist() == [0.0]
-    truncating = TruncatingTable({(0, 0): (1, 5.0, 1)}, terminal=[1])
+    truncating = TableEnv({(0, 0): (1, 5.0, 1)}, truncated=[1])
     rollout = bound(truncating, RolloutEvaluator(bootstrap=constant(8.0)), gamma=0.5)
     truncated = truncating.step(at(truncating, [0]).set("action", torch.tensor([0])))["next"]
     assert rollout(truncated.set("_seed", torch.tensor([0]))).tolist() == [8.0]
@@ -133,13 +118,11 @@ def test_a_terminal_state_is_worth_nothing_and_a_truncated_one_its_bootstrap() -
     assert rollout.num_base_steps == 0
 
 
-@pytest.mark.parametrize(
-    ("env_class", "expected"), [(TableEnv, 1.0), (TruncatingTable, 1.0 + 0.25 * 8.0)]
-)
+@pytest.mark.parametrize(("end", "expected"), [("terminal", 1.0), ("truncated", 1.0 + 0.25 * 8.0)])
 def test_within_a_rollout_truncation_bootstraps_and_termination_does_not(
-    env_class: type[TableEnv], expected: float
+    end: str, expected: float
 ) -> None:
-    env = env_class({(0, 0): (1, 1.0, 2)}, terminal=[1])
+    env = TableEnv({(0, 0): (1, 1.0, 2)}, **{end: [1]})
     rollout = bound(env, RolloutEvaluator(bootstrap=constant(8.0)), gamma=0.5)
     assert rollout(at(env, [0])).tolist() == [expected]
 

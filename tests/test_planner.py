@@ -13,7 +13,6 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torchrl.data import Binary, Composite
 from torchrl.envs import ActionDiscretizer, Compose, PendulumEnv, StepCounter, TransformedEnv
 
 from torchrl_hmcts.planners import (
@@ -64,20 +63,6 @@ class CountingEnv(TableEnv):
         pairs = zip(tensordict["state"].tolist(), tensordict["action"].tolist(), strict=True)
         self.calls.append(list(pairs))
         return super()._step(tensordict)
-
-
-class TruncatingEnv(TableEnv):
-    """A table whose last states truncate the episode instead of terminating it."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        flags = ("done", "terminated", "truncated")
-        self.done_spec = Composite({k: Binary(1, dtype=torch.bool) for k in flags})
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        after = super()._step(tensordict)
-        truncated = after.get("terminated")
-        return after.set("truncated", truncated).set("terminated", torch.zeros_like(truncated))
 
 
 def at(env: TableEnv, states: Any) -> TensorDictBase:
@@ -235,7 +220,7 @@ def test_a_terminal_root_is_not_searched_and_is_worth_nothing() -> None:
 
 
 def test_a_truncated_root_is_not_searched_and_is_worth_its_evaluation() -> None:
-    env = TruncatingEnv(BINARY_TREE, terminal=LEAVES)
+    env = TableEnv(BINARY_TREE, truncated=LEAVES)
     planner = MCTSPlanner(env, leaf_evaluator=lambda td: torch.full((len(td),), 0.5))
     td = at(env, [7])
     td = planner(
@@ -249,8 +234,8 @@ def test_truncation_bootstraps_and_termination_does_not() -> None:
     # Two base steps that earn 1, then the end of the episode; the evaluator says 8 everywhere.
     table = {(0, 0): (1, 1.0, 2)}
     roots = {}
-    for env_class in (TableEnv, TruncatingEnv):
-        env = env_class(table, terminal=[1])
+    for end in ("terminal", "truncated"):
+        env = TableEnv(table, **{end: [1]})
         planner = MCTSPlanner(
             env,
             gamma=0.5,
@@ -259,9 +244,9 @@ def test_truncation_bootstraps_and_termination_does_not() -> None:
             budget=FOREVER,
         )
         td = planner(env.reset())
-        roots[env_class] = td["root_value"].item()
+        roots[end] = td["root_value"].item()
         assert td["num_expansions"].item() == 1
-    assert roots == {TableEnv: 1.0, TruncatingEnv: 1.0 + 0.25 * 8.0}
+    assert roots == {"terminal": 1.0, "truncated": 1.0 + 0.25 * 8.0}
 
 
 def test_options_that_the_mask_forbids_are_never_simulated() -> None:

@@ -471,6 +471,19 @@ def random_table(rng: np.random.Generator) -> tuple[TableEnv, int]:
     return TableEnv(table, terminal=terminal), num_options
 
 
+def test_the_range_of_values_is_that_of_the_kept_tree() -> None:
+    # Option 0 earns 1 and leads to a state whose options earn 3 and 4; option 1 earns 100.
+    table = {(0, 0): (1, 1.0, 1), (0, 1): (2, 100.0, 1), (1, 0): (2, 3.0, 1), (1, 1): (2, 4.0, 1)}
+    env = TableEnv(table, terminal=[2])
+    planner = MCTSPlanner(env, gamma=1.0, tree_policy=PUCT(normalize="tree"), budget=FOREVER)
+    td = env.reset()
+    search = planner.search(td)
+    assert search.roots["highest"][0] == 100.0
+    td = env.step(td.set("action", torch.tensor(0)))["next"]
+    assert planner.advance(search, torch.tensor(0), td)
+    assert (search.roots["lowest"][0], search.roots["highest"][0]) == (3.0, 4.0)
+
+
 def check_invariants(search: Search, b: int, revisits: bool) -> None:
     """``revisits``: whether known leaves were backed up more than once."""
     tree = search.tree

@@ -26,6 +26,8 @@ class TableEnv(EnvBase):
         transitions: ``{(state, action): (next_state, reward, duration)}``; all states and actions
             from 0 up. A pair that is missing is an action that may not be taken there.
         terminal: states that end an episode.
+        truncated: states that cut an episode off, as a time limit does. With them the env also
+            writes ``"truncated"``.
         start: state after a reset. Default 0.
         device: of all tensors. Default: CPU.
 
@@ -47,6 +49,7 @@ class TableEnv(EnvBase):
         transitions: Mapping[tuple[int, int], tuple[int, float, int]],
         *,
         terminal: Sequence[int] = (),
+        truncated: Sequence[int] = (),
         start: int = 0,
         device: torch.device | str | None = None,
     ) -> None:
@@ -54,7 +57,7 @@ class TableEnv(EnvBase):
             raise ValueError("TableEnv needs at least one transition; the table is empty.")
         super().__init__(device=device, batch_size=[])
         num_states = 1 + max(max(s, row[0]) for (s, _), row in transitions.items())
-        num_states = max(num_states, 1 + max(terminal, default=0), 1 + start)
+        num_states = max(num_states, 1 + max([*terminal, *truncated], default=0), 1 + start)
         num_actions = 1 + max(a for _, a in transitions)
         self.start = start
         self._next_state = torch.zeros(num_states, num_actions, dtype=torch.int64, device=device)
@@ -68,7 +71,11 @@ class TableEnv(EnvBase):
             self._allowed[state, action] = True
         self._terminal = torch.zeros(num_states, dtype=torch.bool, device=device)
         self._terminal[list(terminal)] = True
-        stuck = ~self._allowed.any(-1) & ~self._terminal
+        self._truncated = torch.zeros(num_states, dtype=torch.bool, device=device)
+        self._truncated[list(truncated)] = True
+        self._ends = self._terminal | self._truncated
+        self._writes_truncated = bool(truncated)
+        stuck = ~self._allowed.any(-1) & ~self._ends
         if stuck.any():
             raise ValueError(
                 f"State {int(stuck.nonzero()[0])} has no transition and is not terminal. Add one, "
@@ -83,25 +90,27 @@ class TableEnv(EnvBase):
         self.action_spec = Categorical(num_actions, shape=(), device=device)
         self.reward_spec = Unbounded((1,), device=device)
         self.done_spec = Composite(
-            {k: Binary(1, dtype=torch.bool, device=device) for k in ("done", "terminated")}
+            {
+                key: Binary(1, dtype=torch.bool, device=device)
+                for key in ("done", "terminated", *(["truncated"] if truncated else []))
+            }
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         state, action = tensordict.get("state"), tensordict.get("action")
         next_state = self._next_state[state, action]
-        terminated = self._terminal[next_state].unsqueeze(-1)
-        return TensorDict(
-            {
-                "state": next_state,
-                "action_mask": self._allowed[next_state] | terminated,
-                "duration": self._duration[state, action].unsqueeze(-1),
-                "reward": self._reward[state, action].unsqueeze(-1),
-                "terminated": terminated,
-                "done": terminated.clone(),
-            },
-            batch_size=tensordict.batch_size,
-            device=self.device,
-        )
+        done = self._ends[next_state].unsqueeze(-1)
+        entries = {
+            "state": next_state,
+            "action_mask": self._allowed[next_state] | done,
+            "duration": self._duration[state, action].unsqueeze(-1),
+            "reward": self._reward[state, action].unsqueeze(-1),
+            "terminated": self._terminal[next_state].unsqueeze(-1),
+            "done": done,
+        }
+        if self._writes_truncated:
+            entries["truncated"] = self._truncated[next_state].unsqueeze(-1)
+        return TensorDict(entries, batch_size=tensordict.batch_size, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         shape = self.batch_size if tensordict is None else tensordict.batch_size
@@ -112,7 +121,7 @@ class TableEnv(EnvBase):
         return TensorDict(
             {
                 "state": state.clone(),
-                "action_mask": self._allowed[state] | self._terminal[state].unsqueeze(-1),
+                "action_mask": self._allowed[state] | self._ends[state].unsqueeze(-1),
                 "duration": torch.zeros((*shape, 1), dtype=torch.int64, device=self.device),
             },
             batch_size=shape,

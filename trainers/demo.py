@@ -48,11 +48,10 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     begin = time.perf_counter()
 
     print(f"Learning {config.num_skills} skills in {config.train_base_steps:,} base steps ...")
-    trainer, loss = _train(config)
+    trainer, loss = train_worker(config)
     train_seconds = time.perf_counter() - begin
     policy = SkillPolicy(loss.actor_network, deterministic=True)
 
-    print(f"Solving {config.mazes} test mazes that the worker has never seen ...")
     options: dict[str, Any] = {
         "num_skills": config.num_skills,
         "option_steps": config.option_steps,
@@ -67,9 +66,11 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
         leaves_per_wave=config.leaves_per_wave,
     )
     starts = make_starts(real.base_env, config.mazes, config.seed)
+    print("Compiling the search (a moment; about half a minute the first time) ...", flush=True)
     compile_begin = time.perf_counter()
     planner.plan(starts[:1])  # compiles the kernels, so that the times below are of planning
     compile_seconds = time.perf_counter() - compile_begin
+    print(f"Solving {config.mazes} test mazes that the worker has never seen ...", flush=True)
     episodes = _solve(planner, real, starts)
     batch_begin = time.perf_counter()
     planner.plan(starts)
@@ -145,7 +146,12 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
     return env.make_state(torch.arange(num_mazes), centers[:, 0], centers[:, 1])
 
 
-def _train(config: DemoConfig) -> tuple[DIAYNTrainer, Any]:
+def train_worker(config: DemoConfig) -> tuple[DIAYNTrainer, Any]:
+    """Train the demo's worker; return the trainer with its history, and the loss with its networks.
+
+    Args:
+        config: see :class:`~torchrl_hmcts.trainers.config.DemoConfig`.
+    """
     env = make_training_env(num_skills=config.num_skills, skill_steps=config.skill_steps)
     loss = DIAYNTrainer.make_loss(env, config.num_skills, seed=config.seed)
     trainer = DIAYNTrainer(

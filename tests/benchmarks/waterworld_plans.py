@@ -33,7 +33,7 @@ from torchrl_hmcts.planners import (
     extract_plans,
 )
 from torchrl_hmcts.trainers.config import DemoConfig
-from torchrl_hmcts.trainers.demo import _train, make_starts
+from torchrl_hmcts.trainers.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.worker import make_option_env
 
 OPTION_STEPS, RADIUS, GAMMA = 25, 0.7, 0.99  # those of the demo
@@ -92,7 +92,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
 
-    _, loss = _train(DemoConfig(seed=args.seed))
+    _, loss = train_worker(DemoConfig(seed=args.seed))
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     env = make_option_env(worker, maze_pool("test"), option_steps=OPTION_STEPS, gamma=GAMMA)
     starts = make_starts(env.base_env, args.mazes, args.seed)

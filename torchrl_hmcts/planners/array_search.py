@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrl_hmcts.planners.backups import Backup, MeanBackup
-from torchrl_hmcts.planners.search import Outcomes, RootStates, Search
+from torchrl_hmcts.planners.search import Outcomes, RootStates, Search, check_search
 from torchrl_hmcts.planners.tree_policies import PUCT, Gumbel, TreePolicy
 
 Array = np.ndarray | Tensor
@@ -79,7 +79,12 @@ def tree_search(
         are the visits of the roots' options. States of nodes are not kept in the tree.
 
     Raises:
-        ValueError: if shapes do not fit, or a number is out of range.
+        ValueError: if shapes do not fit, a number is out of range or not finite, or ``Gumbel``
+            comes with several leaves per wave.
+        TypeError: if the transition function returns another kind of array than it was given.
+
+    Reference:
+        The interface: mctx, in "The DeepMind JAX Ecosystem", 2020.
 
     Example:
         A chain of five states, of which the last ends the episode with reward 1:
@@ -102,10 +107,14 @@ def tree_search(
     num_roots, num_options = prior.shape
     if num_simulations < 1:
         raise ValueError(f"tree_search needs num_simulations >= 1; got {num_simulations}.")
-    if not 1 <= leaves_per_wave <= 255:
-        raise ValueError(f"tree_search needs leaves_per_wave from 1 to 255; got {leaves_per_wave}.")
-    if exhausted not in ("skip", "revisit"):
-        raise ValueError(f"tree_search: exhausted is 'skip' or 'revisit'; got {exhausted!r}.")
+    check_search(
+        "tree_search",
+        tree_policy=tree_policy,
+        num_simulations=num_simulations,
+        expand="one",
+        leaves_per_wave=leaves_per_wave,
+        exhausted=exhausted,
+    )
     search = Search(
         num_roots,
         num_options,

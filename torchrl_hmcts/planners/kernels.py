@@ -4,6 +4,9 @@ All of them work in place on the records of :mod:`torchrl_hmcts.planners.tree` a
 simulation. This module is imported when the first search starts, since numba takes a second to
 load. Fields are read as ``record["field"]``, not ``record.field``, so that the kernels also run as
 plain Python under ``NUMBA_DISABLE_JIT=1``, for a debugger.
+
+They share one file, long as it is, because numba's cache looks at the file of the compiled function
+only: an inner function kept elsewhere could change and its callers would not notice.
 """
 
 # numba compiles these functions; it does not read annotations as strings.
@@ -568,7 +571,7 @@ def _close(nodes, edges, n):
 
 @numba.njit(forceinline=True, error_model="numpy")
 def _append(nodes, edges, root, n, a, reward, discount, duration, done, value, priors, masks, i):
-    """Write a new node behind option ``a`` of node ``n`` and back it up; return it."""
+    """Write a new node behind option ``a`` of node ``n``; return it."""
     new = root["num_nodes"]
     root["num_nodes"] += 1
     _write_node(nodes, edges, new, n, a, value, priors, masks, i)
@@ -870,6 +873,12 @@ def reroot(trees, links, roots, b, root, kept):
     roots[b]["num_nodes"] = count
     roots[b]["best_node"] = best
     roots[b]["best_return"] = best_return
+    roots[b]["lowest"], roots[b]["highest"] = np.inf, -np.inf
+    for n in range(count):
+        for a in range(num_options):
+            if edges[n, a]["visits"] > 0:
+                roots[b]["lowest"] = min(roots[b]["lowest"], edges[n, a]["value"])
+                roots[b]["highest"] = max(roots[b]["highest"], edges[n, a]["value"])
     return count
 
 

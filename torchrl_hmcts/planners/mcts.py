@@ -25,11 +25,18 @@ from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, MostVisited
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.search import NO_LIMIT, Outcomes, RootStates, Search, Wave
+from torchrl_hmcts.planners.search import (
+    NO_LIMIT,
+    Outcomes,
+    RootStates,
+    Search,
+    Wave,
+    check_search,
+)
 from torchrl_hmcts.planners.simulator import Simulator
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import TERMINAL
-from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, TreePolicy
+from torchrl_hmcts.planners.tree_policies import UCT, Gumbel, TreePolicy
 
 Evaluator = Callable[[TensorDictBase], Tensor]
 
@@ -160,23 +167,20 @@ class MCTSPlanner(TensorDictModuleBase):
         progress: Callable[[SearchProgress], None] | None = None,
     ) -> None:
         super().__init__()
-        for name, value, names in (
-            ("expand", expand, ("all", "one")),
-            ("exhausted", exhausted, ("skip", "revisit")),
-        ):
-            if value not in names:
-                raise ValueError(f"MCTSPlanner: {name} is {_or(names)}; got {value!r}.")
-        if not 1 <= leaves_per_wave <= 255:
-            raise ValueError(
-                f"MCTSPlanner needs leaves_per_wave from 1 to 255; got {leaves_per_wave}."
-            )
         if gamma is None:
             gamma = _option_gamma(env)
         if not 0.0 < gamma <= 1.0:
             raise ValueError(f"MCTSPlanner needs a discount gamma in (0, 1]; got {gamma}.")
         tree_policy = UCT() if tree_policy is None else tree_policy
         budget = SearchBudget() if budget is None else budget
-        _check_tree_policy(tree_policy, budget, expand, leaves_per_wave)
+        check_search(
+            "MCTSPlanner",
+            tree_policy=tree_policy,
+            num_simulations=budget.simulations,
+            expand=expand,
+            leaves_per_wave=leaves_per_wave,
+            exhausted=exhausted,
+        )
         if chance is not None and transpositions is not None:
             raise ValueError(
                 "MCTSPlanner: transpositions share what follows a state, which chance redraws; "
@@ -445,6 +449,8 @@ class MCTSPlanner(TensorDictModuleBase):
             search.halve(budget.simulations)
             # There is one schedule per search: after an interruption it goes on where it stood.
             search.roots["simulations"] = search.tree.edges["visits"][:, 0].sum(-1)
+        # Without a limit of simulations a root may revisit what it knows for ever.
+        endless = budget.simulations is None and bool(search.settings["revisit"][0])
         since = search.roots["revisits"].copy()  # at the last outcome of each root
         active = self._still_active(search, rows)
         while len(active):
@@ -470,7 +476,7 @@ class MCTSPlanner(TensorDictModuleBase):
                 )
             if budget.seconds is not None and seconds >= budget.seconds:
                 break
-            if budget.simulations is None:  # a root may revisit what it knows for ever
+            if endless:
                 revisits = search.roots["revisits"]
                 since[wave.roots] = revisits[wave.roots]
                 active = active[revisits[active] - since[active] < _MAX_FRUITLESS_REVISITS]
@@ -614,30 +620,6 @@ def _rows(search: Search, where: Tensor | None) -> np.ndarray:
             f"{list(where.shape)}."
         )
     return np.flatnonzero(where.reshape(-1).cpu().numpy())
-
-
-def _or(names: tuple[str, ...]) -> str:
-    return " or ".join(map(repr, names))
-
-
-def _check_tree_policy(
-    tree_policy: TreePolicy, budget: SearchBudget, expand: str, leaves_per_wave: int
-) -> None:
-    if not callable(tree_policy) and not isinstance(tree_policy, (UCT, PUCT, Gumbel)):
-        raise TypeError(
-            f"MCTSPlanner needs a tree policy: UCT(), PUCT(), Gumbel(), TorchRLScore(...) or a "
-            f"callable over NodeStatistics; got {tree_policy!r}."
-        )
-    if isinstance(tree_policy, Gumbel) and (
-        budget.simulations is None or expand != "one" or leaves_per_wave != 1
-    ):
-        raise ValueError(
-            f"Gumbel halves a known number of simulations of one option each; got "
-            f"budget.simulations={budget.simulations}, expand={expand!r}, "
-            f"leaves_per_wave={leaves_per_wave}. Pass "
-            f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
-            f"leaves_per_wave=1."
-        )
 
 
 def _row_seeds(search: Search, wave: Wave) -> np.ndarray:

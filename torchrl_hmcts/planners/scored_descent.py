@@ -63,14 +63,11 @@ def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) ->
                 nodes["flags"][b[leaves], n[leaves]] |= PENDING
                 which, options = np.nonzero(edges["closed"][b[leaves], n[leaves]] != FORBIDDEN)
                 schedule(b[leaves][which], n[leaves][which], options)
-            if search.stochastic:  # what is in flight keeps options above from being drawn again
-                early = known & (scheduled[b] > 0)
-                give_up(b[early], n[early])
-                kernels.revisit_all(
-                    nodes, edges, roots, search.settings, b[known & ~early], n[known & ~early]
-                )
-            else:
-                kernels.revisit_all(nodes, edges, roots, search.settings, b[known], n[known])
+            # With chance, what is in flight keeps options above from being drawn again.
+            early = known & search.stochastic & (scheduled[b] > 0)
+            give_up(b[early], n[early])
+            late = known & ~early
+            kernels.revisit_all(nodes, edges, roots, search.settings, b[late], n[late])
             stays = known | fresh
             b, n = b[~stays], n[~stays]
             if not len(b):

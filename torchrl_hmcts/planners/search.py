@@ -70,6 +70,46 @@ class RootStates(NamedTuple):
     codes: np.ndarray | None = None  # [m, K] uint8
 
 
+def check_search(
+    owner: str,
+    *,
+    tree_policy: TreePolicy,
+    num_simulations: int | None,
+    expand: str,
+    leaves_per_wave: int,
+    exhausted: str,
+) -> None:
+    """Refuse arguments that make no search, with a message in the name of ``owner``.
+
+    Raises:
+        ValueError: if an argument is out of range, or does not go with ``Gumbel``.
+        TypeError: if ``tree_policy`` is none.
+    """
+    for name, value, names in (
+        ("expand", expand, ("all", "one")),
+        ("exhausted", exhausted, ("skip", "revisit")),
+    ):
+        if value not in names:
+            raise ValueError(f"{owner}: {name} is {names[0]!r} or {names[1]!r}; got {value!r}.")
+    if not 1 <= leaves_per_wave <= 255:
+        raise ValueError(f"{owner} needs leaves_per_wave from 1 to 255; got {leaves_per_wave}.")
+    if not callable(tree_policy) and not isinstance(tree_policy, (UCT, PUCT, Gumbel)):
+        raise TypeError(
+            f"{owner} needs a tree policy: UCT(), PUCT(), Gumbel(), TorchRLScore(...) or a "
+            f"callable over NodeStatistics; got {tree_policy!r}."
+        )
+    if isinstance(tree_policy, Gumbel) and (
+        num_simulations is None or expand != "one" or leaves_per_wave != 1
+    ):
+        raise ValueError(
+            f"Gumbel halves a known number of simulations of one option each; got "
+            f"budget.simulations={num_simulations}, expand={expand!r}, "
+            f"leaves_per_wave={leaves_per_wave}. Pass "
+            f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
+            f"leaves_per_wave=1."
+        )
+
+
 class Search:
     """The trees of ``B`` roots under one tree policy, backup and novelty test.
 
@@ -294,7 +334,7 @@ class Search:
         -1; only in a stochastic simulator.
         """
         tree, m = self.tree, len(wave)
-        self.reserve_wave()
+        self._reserve_wave()
         novel = np.ones(m, np.bool_)
         nothing = np.empty(0, np.int64)
         twins = nothing
@@ -379,7 +419,7 @@ class Search:
         choice: np.ndarray = np.where(allowed, scores, -np.inf).argmax(-1)
         return choice
 
-    def reserve_wave(self) -> None:
+    def _reserve_wave(self) -> None:
         """Make room for the nodes of one wave."""
         per_root = len(self._wave) // max(self.num_roots, 1)
         if self._room + per_root > self.tree.capacity:

@@ -131,21 +131,19 @@ class SearchTree:
     Args:
         num_roots: B.
         num_options: A.
-        num_features: F, 0 without a novelty test.
         capacity: nodes per root to make room for at first.
     """
 
-    def __init__(
-        self, num_roots: int, num_options: int, num_features: int = 0, capacity: int = 64
-    ) -> None:
+    def __init__(self, num_roots: int, num_options: int, capacity: int = 64) -> None:
         self.num_roots = num_roots
         self.num_options = num_options
         self.capacity = capacity
         self.nodes = np.zeros((num_roots, capacity), NODE)
         self.edges = np.zeros((num_roots, capacity, num_options), EDGE)
         self.roots = np.zeros(num_roots, ROOT)
-        self.features = np.zeros((num_roots, capacity, num_features), np.float32)
-        self.codes = np.zeros((num_roots, capacity, 0), np.uint8)  # states as bytes
+        # [B, N, F] of the novelty test, and [B, N, K] states as bytes; empty without their reader
+        self.features = np.zeros((num_roots, capacity, 0), np.float32)
+        self.codes = np.zeros((num_roots, capacity, 0), np.uint8)
         self.states: TensorDictBase | None = None
         self._flat: tuple[TensorDictBase, dict[NestedKey, Any]] | None = None
 
