@@ -18,6 +18,7 @@ from torchrl_hmcts.planners.export import (
     best_plan,
     check_root,
     option_labels,
+    plural,
     shown_nodes,
 )
 from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, SearchTree
@@ -397,20 +398,19 @@ _HOLLOW = {"facecolors": "white", "edgecolors": [(0.6, 0.6, 0.6)]}
 def _title(tree: SearchTree, root: int, shown: _Shown) -> list[str]:
     nodes = tree.nodes[root, : tree.num_nodes[root]]
     lines = [
-        f"{_plural(len(nodes), 'node')}, depth {int(nodes['depth'].max()):,}, "
-        f"{_plural(int(nodes['visits'][0]), 'visit')}, root value {nodes['value'][0]:.4g}"
+        f"{plural(len(nodes), 'node')}, depth {int(nodes['depth'].max()):,}, "
+        f"{plural(int(nodes['visits'][0]), 'visit')}, root value {nodes['value'][0]:.4g}"
     ]
     plan = best_plan(tree, root)
     if plan:
         end = nodes[plan[-1]]
         lines.append(
-            f"best plan: {_plural(len(plan) - 1, 'option')}, "
-            f"{_plural(int(end['base_steps']), 'base step')}, return {end['path_return']:.4g}"
+            f"best plan: {plural(len(plan) - 1, 'option')}, "
+            f"{plural(int(end['base_steps']), 'base step')}, return {end['path_return']:.4g}"
         )
     if shown.left_out:
         lines.append(
-            f"shown: the {len(shown.ids):,} most visited; "
-            f"{_plural(shown.left_out, 'node')} left out"
+            f"shown: the {len(shown.ids):,} most visited; {plural(shown.left_out, 'node')} left out"
         )
     return lines
 
@@ -457,7 +457,7 @@ def _node_handles(shown: _Shown, diameter: Any, fewest: int, most: int) -> list[
         handles.append(dot("known state", marker="D", color="white", markeredgecolor="0.6"))
     for number in dict.fromkeys([fewest, round((fewest * most) ** 0.5), most]):
         handles.append(
-            dot(_plural(number, "visit"), markersize=diameter(number), markeredgewidth=0.5)
+            dot(plural(number, "visit"), markersize=diameter(number), markeredgewidth=0.5)
         )
     return handles
 
@@ -541,7 +541,3 @@ def _pyplot() -> Any:
             "Pictures need matplotlib, which is missing here: pip install torchrl_hmcts[train]."
         ) from error
     return pyplot
-
-
-def _plural(number: int, noun: str) -> str:
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

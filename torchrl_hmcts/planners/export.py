@@ -313,7 +313,7 @@ def summary(tree: SearchTree, root: int = 0, option_names: Sequence[str] | None 
     count = check_root(tree, root)
     names = option_labels(tree.num_options, option_names, width=_NAME_WIDTH)
     nodes = tree.nodes[root, :count]
-    counts = [f"{_plural(count, 'node')}"]
+    counts = [f"{plural(count, 'node')}"]
     for name in ("expanded", "pruned", "terminal"):
         number = int(((nodes["flags"] & FLAGS[name]) != 0).sum())
         if name == "pruned":
@@ -325,15 +325,15 @@ def summary(tree: SearchTree, root: int = 0, option_names: Sequence[str] | None 
     size = f"Search tree: {', '.join(counts)}; depth {int(nodes['depth'].max()):,}"
     lines = textwrap.wrap(size, _LINE_WIDTH, subsequent_indent="  ")
     value = _numbers([nodes["value"][0]])[0].strip()
-    lines.append(f"Root: {_plural(int(nodes['visits'][0]), 'visit')}, value V = {value}")
+    lines.append(f"Root: {plural(int(nodes['visits'][0]), 'visit')}, value V = {value}")
     lines += ["", *_table_of_options(tree, root, names)]
     plan = best_plan(tree, root)
     last = nodes[plan[-1]] if plan else None
     if last is not None:
         gained = _numbers([last["path_return"]])[0].strip()
         title = (
-            f"Best plan: {_plural(len(plan) - 1, 'option')}, "
-            f"{_plural(int(last['base_steps']), 'base step')}, return {gained}"
+            f"Best plan: {plural(len(plan) - 1, 'option')}, "
+            f"{plural(int(last['base_steps']), 'base step')}, return {gained}"
         )
     else:
         plan = most_visited_path(tree, root)
@@ -391,7 +391,7 @@ def _table_of_options(tree: SearchTree, root: int, names: list[str]) -> list[str
     left_out = order[_MAX_OPTIONS:]
     if left_out:
         visits = int(edges["visits"][left_out].sum())
-        lines.append(f"... and {_plural(len(left_out), 'option')} with {_plural(visits, 'visit')}")
+        lines.append(f"... and {plural(len(left_out), 'option')} with {plural(visits, 'visit')}")
     return lines
 
 
@@ -425,7 +425,7 @@ def _table_of_steps(tree: SearchTree, root: int, plan: list[int], names: list[st
     rows = [row(str(i + 1), cells) for i, cells in enumerate(zip(*columns.values(), strict=True))]
     if len(rows) > _MAX_STEPS:
         head, tail = rows[: _MAX_STEPS // 2], rows[-_MAX_STEPS // 2 + 1 :]
-        gap = f"... {_plural(len(rows) - len(head) - len(tail), 'option')} left out ..."
+        gap = f"... {plural(len(rows) - len(head) - len(tail), 'option')} left out ..."
         rows = [*head, f"{'':{number_width}}  {gap}", *tail]
     lines += rows
     twin = int(nodes["twin"][-1])
@@ -445,7 +445,8 @@ def _numbers(values: Any) -> list[str]:
     return [f"{value:.{decimals}f}" for value in array]
 
 
-def _plural(number: int, noun: str) -> str:
+def plural(number: int, noun: str) -> str:
+    """Return "1 node", "2 nodes"."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
