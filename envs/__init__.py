@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from torchrl_hmcts.envs.deepmind_lab import DeepMindLabEnv
 from torchrl_hmcts.envs.gridworld import GridworldMazeEnv
 from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
+from torchrl_hmcts.envs.lab_actions import LAB_ACTIONS
+from torchrl_hmcts.envs.lab_maze import LabMazeEnv
+from torchrl_hmcts.envs.lab_mazes import lab_maze
+from torchrl_hmcts.envs.lab_recordings import replay_recording
 from torchrl_hmcts.envs.mazes import (
     check_mazes,
     free_tiles,
@@ -19,17 +24,22 @@ from torchrl_hmcts.envs.rendering import draw_maze
 from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 
 __all__ = [
+    "DeepMindLabEnv",
     "GridworldMazeEnv",
+    "LAB_ACTIONS",
+    "LabMazeEnv",
     "TorchRLGymnasiumEnv",
     "WaterworldMazeEnv",
     "check_mazes",
     "draw_maze",
     "free_tiles",
     "generate_mazes",
+    "lab_maze",
     "maze_from_text",
     "maze_pool",
     "maze_to_text",
     "register_envs",
+    "replay_recording",
     "shortest_path",
     "shortest_path_lengths",
     "wall_centers",

@@ -13,9 +13,14 @@ from torchrl.data import Bounded, Categorical
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.envs.gridworld import GridworldMazeEnv
+from torchrl_hmcts.envs.lab_maze import LabMazeEnv
 from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 
-ENV_IDS = ("torchrl_hmcts/WaterworldMaze-v0", "torchrl_hmcts/GridworldMaze-v0")
+ENV_IDS = (
+    "torchrl_hmcts/WaterworldMaze-v0",
+    "torchrl_hmcts/GridworldMaze-v0",
+    "torchrl_hmcts/LabMaze-v0",
+)
 
 
 class TorchRLGymnasiumEnv(gymnasium.Env):
@@ -138,6 +143,15 @@ def make_waterworld(render_mode: str | None = None, **kwargs: Any) -> TorchRLGym
     return TorchRLGymnasiumEnv(WaterworldMazeEnv(**kwargs), render_mode)
 
 
+def make_lab_maze(render_mode: str | None = None, **kwargs: Any) -> TorchRLGymnasiumEnv:
+    """Make ``torchrl_hmcts/LabMaze-v0``; keywords go to :class:`LabMazeEnv`.
+
+    The read-outs are ``"observation"`` and those asked for.
+    """
+    read_outs = dict.fromkeys([*kwargs.pop("read_outs", ()), "observation"])
+    return TorchRLGymnasiumEnv(LabMazeEnv(read_outs=tuple(read_outs), **kwargs), render_mode)
+
+
 def register_envs() -> None:
     """Register the maze environments with Gymnasium; again and again does no harm.
 
@@ -152,7 +166,11 @@ def register_envs() -> None:
         >>> env.reset(seed=1)[0].shape
         (66,)
     """
-    entry_points: tuple[Callable[..., Any], ...] = (make_waterworld, make_gridworld)
+    entry_points: tuple[Callable[..., Any], ...] = (
+        make_waterworld,
+        make_gridworld,
+        make_lab_maze,
+    )
     for env_id, entry_point in zip(ENV_IDS, entry_points, strict=True):
         if env_id not in gymnasium.registry:
             # A string, so that the spec can be written to JSON and sent to other processes.
