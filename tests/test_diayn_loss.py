@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl.data import Categorical, OneHot
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
-from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator
+from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillCritic, SkillDiscriminator
 from torchrl_hmcts.objectives import DIAYNLoss, SkillDiscriminatorLoss
 
 GROUPS = {
@@ -117,6 +117,56 @@ def test_stacked_critics_agree_with_torchrls_vmap_and_loop() -> None:
         outs.append(loss(td.clone()))
     for out in outs[1:]:
         torch.testing.assert_close(outs[0].to_dict(), out.to_dict())
+
+
+def test_the_short_cuts_agree_with_torchrls_own_losses() -> None:
+    loss, td = make_loss(), make_data()
+    torch.testing.assert_close(
+        loss._compute_target(td), DiscreteSACLoss._compute_target(loss, td.clone())
+    )
+    ours, theirs = loss.actor_loss(td), DiscreteSACLoss.actor_loss(loss, td.clone())
+    torch.testing.assert_close(ours, theirs)
+    # The parent's own forward calls the same methods, one after the other.
+    parents = DiscreteSACLoss.forward(loss, td.clone())
+    out = loss(td)
+    for key in ("loss_actor", "loss_qvalue", "loss_alpha", "entropy"):
+        torch.testing.assert_close(out[key], parents[key])
+
+
+@pytest.mark.parametrize("one_hot", [False, True])
+def test_an_actor_of_another_kind_is_asked_for_its_distribution(one_hot: bool) -> None:
+    td = make_data(one_hot=one_hot)
+    expected = make_loss(one_hot=one_hot)(td.clone())
+    loss = make_loss(one_hot=one_hot)
+    loss._only_logits = False
+    torch.testing.assert_close(loss(td).to_dict(), expected.to_dict())
+
+
+def test_done_states_are_skipped_on_request() -> None:
+    # The one done state is terminated: it has no value, whether it is skipped or not.
+    expected = make_loss()(make_data())
+    out = make_loss(skip_done_states=True)(make_data())
+    torch.testing.assert_close(out.to_dict(), expected.to_dict())
+
+
+def test_without_target_critics_the_critics_themselves_bootstrap() -> None:
+    expected = make_loss()(make_data())  # targets are still copies
+    out = make_loss(delay_qvalue=False)(make_data())
+    torch.testing.assert_close(out["loss_qvalue"], expected["loss_qvalue"])
+
+
+def test_concatenated_skills_run_as_stacked_critics_too() -> None:
+    torch.manual_seed(0)
+    sizes = {"hidden": (8, 8), "network": ConcatSkillMLP}
+    loss = DIAYNLoss(
+        SkillActor(2, Categorical(4), 3, in_keys=["velocity"], **sizes),
+        SkillCritic(4, 4, 3, in_keys=["velocity", "displacement"], **sizes),
+        SkillDiscriminator(2, 3),
+        action_space="categorical",
+    )
+    out = loss(make_data())
+    DiscreteSACLoss._make_vmap(loss)
+    torch.testing.assert_close(loss(make_data()).to_dict(), out.to_dict())
 
 
 @pytest.mark.parametrize("name", GROUPS)

@@ -8,12 +8,18 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot
 
 from torchrl_hmcts.modules import (
+    ConcatSkillMLP,
     SkillActor,
     SkillCritic,
     SkillDiscriminator,
+    SkillDynamics,
+    SkillEncoder,
     SkillMLP,
     SkillPolicy,
+    SpectralLinear,
 )
+
+NETWORKS = [SkillMLP, ConcatSkillMLP]
 
 
 def features(*batch: int, skills: int = 3) -> TensorDict:
@@ -41,23 +47,106 @@ def test_a_gradient_reaches_only_the_head_that_was_used() -> None:
     assert used.tolist() == [False, True, False]
 
 
-def test_stacked_parameters_give_each_copys_output() -> None:
-    nets = [SkillMLP(2, 4, num_skills=3) for _ in range(2)]
-    x, skill = torch.randn(5, 2), torch.randint(3, (5,))
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_the_concatenated_skill_is_an_input_of_the_first_layer(batch: tuple[int, ...]) -> None:
+    net = ConcatSkillMLP(2, 4, num_skills=3)
+    x, skill = torch.randn(*batch, 2), torch.randint(3, batch)
+    one_hot = torch.nn.functional.one_hot(skill, 3).float()
+    by_hand = net.last(net.trunk(torch.cat((x, one_hot), -1)))
+    torch.testing.assert_close(net(x, skill), by_hand)
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_all_skills_are_what_each_skill_gives_alone(network: type) -> None:
+    net = network(3, 4, num_skills=3)
+    x, y = torch.randn(2, 5, 2), torch.randn(2, 5, 1)
+    alone = [net(x, y, torch.full((2, 5), z)) for z in range(3)]
+    torch.testing.assert_close(net.all_skills(x, y), torch.stack(alone, -2))
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_stacked_parameters_give_each_copys_output(network: type, batch: tuple[int, ...]) -> None:
+    nets = [network(2, 4, num_skills=3) for _ in range(2)]
+    x, skill = torch.randn(*batch, 2), torch.randint(3, batch)
+    expected = torch.stack([net(x, skill) for net in nets])
     stacked = TensorDict.from_modules(*nets, as_module=True)
+    torch.testing.assert_close(nets[0].run(list(stacked.parameters()), x, skill), expected)
     with stacked.to_module(nets[0], preserve_module_state=False):
         both = nets[0](x, skill)
-    torch.testing.assert_close(both, torch.stack([net(x, skill) for net in nets]))
+    torch.testing.assert_close(both, expected)
     assert nets[0].stackable
-    assert not SkillMLP(2, 4, 3, activation=torch.nn.PReLU).stackable
+    assert not network(2, 4, 3, activation=torch.nn.PReLU).stackable
 
 
-def test_the_mlp_can_be_vmapped_over_parameters() -> None:
-    nets = [SkillMLP(2, 4, num_skills=3) for _ in range(2)]
+@pytest.mark.parametrize("network", NETWORKS)
+def test_the_mlp_can_be_vmapped_over_parameters(network: type) -> None:
+    nets = [network(2, 4, num_skills=3) for _ in range(2)]
     x, skill = torch.randn(5, 2), torch.randint(3, (5,))
     params, _ = torch.func.stack_module_state(nets)
     out = torch.vmap(lambda p: torch.func.functional_call(nets[0], p, (x, skill)))(params)
     torch.testing.assert_close(out, torch.stack([net(x, skill) for net in nets]))
+
+
+@pytest.mark.parametrize("hidden", [(), (8,), (8, 8)])
+def test_a_discriminator_can_be_handed_its_weights(hidden: tuple[int, ...]) -> None:
+    network = SkillDiscriminator(3, 4, in_keys=["velocity", "extra"], hidden=hidden).network
+    x, y = torch.randn(2, 5, 2), torch.randn(2, 5, 1)
+    torch.testing.assert_close(network.run(list(network.parameters()), x, y), network(x, y))
+
+
+def test_a_spectral_layer_has_the_singular_value_one_before_and_after_training() -> None:
+    layer = SpectralLinear(6, 4)
+
+    def largest() -> float:
+        return float(torch.linalg.matrix_norm(layer.normalized_weight().detach(), 2))
+
+    assert largest() == pytest.approx(1.0, abs=1e-5)
+    optimizer = torch.optim.SGD(layer.parameters(), lr=0.1)
+    x, y = torch.randn(20, 6), torch.randn(20, 4)
+    for _ in range(50):
+        optimizer.zero_grad()
+        (layer(x) - y).square().mean().backward()
+        optimizer.step()
+    assert largest() == pytest.approx(1.0, abs=0.1)  # one power iteration per step lags behind
+    for _ in range(200):
+        layer(x)
+    assert largest() == pytest.approx(1.0, abs=1e-3)
+    u = layer.u.clone()
+    layer.eval()(x)
+    with torch.no_grad():
+        layer.train()(x)
+    assert torch.equal(layer.u, u)
+
+
+def test_a_spectral_encoder_never_stretches_a_distance() -> None:
+    encoder = SkillEncoder(2, 4, linear=SpectralLinear)
+    x, y = torch.randn(200, 2), torch.randn(200, 2)
+    a, b = (encoder(TensorDict(position=p, batch_size=[200]))["representation"] for p in (x, y))
+    assert ((a - b).norm(dim=-1) <= (x - y).norm(dim=-1) * (1 + 1e-4)).all()
+
+
+def test_the_dynamics_predict_every_skills_change_with_a_bounded_deviation() -> None:
+    dynamics = SkillDynamics(2, 3, 4, in_keys=["velocity"], target_key="x", std=0.5, min_std=0.2)
+    td = dynamics(features(5))
+    skill = torch.full((5,), 2)
+    torch.testing.assert_close(td["skill_loc"][:, 2], dynamics.network(td["velocity"], skill))
+    torch.testing.assert_close(td["skill_scale"], torch.full((5, 4, 3), 0.5))
+    torch.nn.init.constant_(dynamics.log_std, -100.0)
+    torch.testing.assert_close(dynamics(td)["skill_scale"], torch.full((5, 4, 3), 0.2))
+    assert [n for n, _ in SkillDynamics(2, 3, 4, learned_std=False).named_buffers()] == ["log_std"]
+    with pytest.raises(ValueError, match=r"min_std=0.5 and std=0.1"):
+        SkillDynamics(2, 2, 4, min_std=0.5)
+
+
+def test_actor_and_critic_take_another_network_by_its_class() -> None:
+    keys = {"in_keys": ["velocity"], "network": ConcatSkillMLP}
+    actor = SkillActor(2, Categorical(4), num_skills=3, **keys)
+    critic = SkillCritic(2, 4, num_skills=3, **keys)
+    assert type(actor.network) is type(critic.network) is ConcatSkillMLP
+    td = features(50)
+    action = SkillPolicy(actor, deterministic=True)(td)["action"]
+    assert torch.equal(action, actor.get_dist(td).probs.argmax(-1))
 
 
 @pytest.mark.parametrize("spec", [Categorical(4), OneHot(4)], ids=["categorical", "one-hot"])

@@ -37,6 +37,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from torchrl.modules import ProbabilisticActor
 
 from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_from_text, maze_pool
+from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -640,6 +641,25 @@ class TestOtherTransforms:
 
 
 KEYS = ["state", "action", ("next", "state"), ("next", "reward"), ("next", "done")]
+
+
+def test_what_the_worker_reads_is_part_of_the_macro_state_so_that_search_can_start_there():
+    # "observation" is a read-out of Waterworld, not of its state; a stored node needs it all the
+    # same, since the first base step of an option is the worker's.
+    towards_target = TensorDictModule(
+        lambda seen, skill: torch.where(skill == 0, skill, 3 * (seen[..., 2] > seen[..., 0])),
+        ["observation", "skill"],
+        ["action"],
+    )
+    maze, _, _ = maze_from_text("....\n####")
+    base = WaterworldMazeEnv(maze[None], seed=0)
+    env = TransformedEnv(base, OptionTransform(towards_target, 2, 30))
+    assert "observation" in env.full_state_spec.keys()
+    assert "observation" not in base.full_state_spec.keys()
+    start = base.make_state(0, (0.5, 0.5), (3.5, 0.5))
+    plan = MCTSPlanner(env, novelty=RadiusNovelty("position", 0.4)).plan(start)
+    assert plan.found
+    assert (plan.options[: int(plan.lengths)] == 1).all()
 
 
 def check_trajectories(base, td, after, worker, max_steps, keys=KEYS):

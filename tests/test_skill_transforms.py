@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, Rep
 from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_hmcts.modules import SkillDiscriminator
+from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior, SkillDiscriminator
 from torchrl_hmcts.transforms import DIAYNReward, DisplacementTransform, SkillTransform
 
 
@@ -88,6 +88,8 @@ def test_inside_a_worker_the_transforms_are_refused() -> None:
         with pytest.raises(RuntimeError, match="Put it outside"):
             transform._check_batched_worker_compat()
     SkillTransform(4)._check_batched_worker_compat()
+    with pytest.raises(RuntimeError, match="Put it outside"):
+        SkillTransform(4, prior=FixedSkillPrior(4))._check_batched_worker_compat()
 
 
 def test_a_mini_episode_keeps_its_skill_and_the_next_root_has_a_new_one() -> None:
@@ -150,6 +152,35 @@ def test_samples_follow_the_prior_and_the_seed() -> None:
     third = SkillTransform(9, seed=4)
     third.load_state_dict(first.state_dict())
     assert torch.equal(first.sample([30]), third.sample([30]))
+
+
+def test_a_skill_prior_is_read_at_every_draw_and_stays_its_owners() -> None:
+    prior = GrowingSkillPrior(50, num_active=1)
+    env = make_env((8,), prior=prior)
+    check_env_specs(env)
+    assert not env.rollout(9)["skill"].any()
+    prior.set_num_active(2)
+    assert env.rollout(30)["skill"].unique().tolist() == [0, 1]
+    transform = SkillTransform(50, prior=prior)
+    assert list(transform.state_dict()) == ["_extra_state"]
+    assert list(transform.buffers()) == []
+
+
+def test_a_skill_that_is_switched_off_ends_its_mini_episode_at_the_next_step() -> None:
+    prior = GrowingSkillPrior(50, num_active=50)
+    for limit in (1000, None):
+        prior.set_num_active(50)
+        env = make_env((16,), max_skill_steps=limit, prior=prior)
+        td = env.reset(TensorDict(skill=torch.arange(16), batch_size=[16]))
+        after, root = env.step_and_maybe_reset(td.set("action", torch.ones(16, dtype=torch.int64)))
+        assert torch.equal(root["skill"], torch.arange(16))
+        prior.set_num_active(4)
+        root.set("action", torch.ones(16, dtype=torch.int64))
+        after, root = env.step_and_maybe_reset(root)
+        assert torch.equal(after["next", "skill"], torch.arange(16))
+        assert root["skill"][:4].tolist() == [0, 1, 2, 3]
+        assert int(root["skill"].max()) < 4
+        assert root["skill_step"].flatten().tolist() == [2] * 4 + [0] * 12
 
 
 def test_nested_keys() -> None:
@@ -230,6 +261,8 @@ def test_bad_arguments_are_refused_with_their_value() -> None:
         SkillTransform(2, prior=[0.2, 0.3, 0.5])
     with pytest.raises(ValueError, match="positive"):
         SkillTransform(2, prior=[0.0, 1.0])
+    with pytest.raises(ValueError, match="SkillTransform has 2 skills.*over 4"):
+        SkillTransform(2, prior=FixedSkillPrior(4))
     with pytest.raises(ValueError, match="2 skills.*tells 4"):
         DIAYNReward(SkillDiscriminator(2, 4), 2)
     with pytest.raises(RuntimeError, match="replay buffer"):

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Categorical, Composite, OneHot, TensorSpec
 from torchrl.modules import OneHotCategorical, ProbabilisticActor
 
@@ -33,6 +33,8 @@ class SkillActor(ProbabilisticActor):
         action_key (NestedKey): entry the action is written to. Default ``"action"``.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
         activation (callable): builds the activations. Default ``torch.nn.ReLU``.
+        network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
+            :class:`SkillMLP`; e.g. :class:`ConcatSkillMLP` for a skill that is concatenated.
 
     Raises:
         ValueError: if the action spec is neither ``Categorical`` nor ``OneHot``.
@@ -63,15 +65,16 @@ class SkillActor(ProbabilisticActor):
         action_key: NestedKey = "action",
         hidden: Sequence[int] = (64, 64),
         activation: Callable[[], nn.Module] = nn.ReLU,
+        network: Callable[..., nn.Module] = SkillMLP,
     ) -> None:
         spec, one_hot = _leaf_spec(action_spec, action_key)
         num_actions = int(spec.space.n)
         action_key = unravel_key(action_key)
         logits_key = "logits" if isinstance(action_key, str) else (*action_key[:-1], "logits")
-        network = SkillMLP(in_features, num_actions, num_skills, hidden, activation)
+        net = network(in_features, num_actions, num_skills, hidden, activation)
         keys = [*key_list("SkillActor", in_keys), skill_key]
         super().__init__(
-            SkillNetwork(network, keys, logits_key),
+            SkillNetwork(net, keys, logits_key),
             in_keys={"logits": logits_key},
             out_keys=[action_key],
             spec=Composite({action_key: spec}),
@@ -81,25 +84,41 @@ class SkillActor(ProbabilisticActor):
         self.num_skills = num_skills
         self.num_actions = num_actions
         self.one_hot = one_hot
+        self.action_dtype = spec.dtype
         self.skill_key = unravel_key(skill_key)
         self.action_key = action_key
 
     @property
-    def network(self) -> SkillMLP:
-        """The shared trunk and heads that compute the action logits."""
+    def network(self) -> nn.Module:
+        """The network that computes the action logits from the features and the skill."""
         return self.module[0].network
+
+    def choose(
+        self, logits: Tensor, deterministic: bool, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Returns actions for the network's outputs ``[*B, A]``: the best ones, or samples."""
+        if not deterministic:
+            # Gumbel-max: argmax(logits - log E) with E exponential is a draw from softmax(logits).
+            noise = torch.empty_like(logits).exponential_(generator=generator)
+            logits = logits - noise.log_()
+        action = logits.argmax(-1)
+        if self.one_hot:
+            action = nn.functional.one_hot(action, self.num_actions).to(self.action_dtype)
+        return action
 
 
 class SkillPolicy(TensorDictModuleBase):
-    """Acts like a :class:`SkillActor` at a fraction of its cost, sharing its parameters.
+    """Acts like a skill actor at a fraction of its cost, sharing its parameters.
 
     No distribution objects, no spec checks, no gradients: it reads the features and the skill and
     writes the action. That makes it the worker to run inside options and the collection policy of
-    the trainer.
+    the trainer, for discrete and for continuous actions.
 
     Args:
-        actor (SkillActor): the actor whose parameters are used; later updates are seen.
-        deterministic (bool): take the most probable action instead of sampling. Default ``False``.
+        actor (SkillActor or GaussianSkillActor): the actor whose parameters are used; later updates
+            are seen.
+        deterministic (bool): take the most probable action (of a Gaussian: its mean, squashed)
+            instead of sampling. Default ``False``.
         generator (torch.Generator, optional): source of the samples. Default ``None``: torch's
             global one.
 
@@ -118,38 +137,31 @@ class SkillPolicy(TensorDictModuleBase):
 
     def __init__(
         self,
-        actor: SkillActor,
+        actor: ProbabilisticActor,
         *,
         deterministic: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(actor, SkillActor):
+        if not (hasattr(actor, "choose") and hasattr(actor, "network")):
             raise TypeError(
-                "SkillPolicy runs the network of a SkillActor without its distribution; got "
-                f"{type(actor).__name__}. Pass a SkillActor, or use your module itself as policy."
+                "SkillPolicy runs the network of a SkillActor or GaussianSkillActor without its "
+                f"distribution; got {type(actor).__name__}. Pass one of these, or use your module "
+                "itself as policy."
             )
         self.network = actor.network
         self.num_skills = actor.num_skills
-        self.num_actions = actor.num_actions
         self.in_keys = list(actor.module[0].in_keys)
         self.out_keys = [actor.action_key]
         self.action_key = actor.action_key
-        self.one_hot = actor.one_hot
-        self.action_dtype = actor.spec[actor.action_key].dtype
         self.deterministic = bool(deterministic)
         self.generator = generator
+        self._choose = actor.choose
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        scores = self.network.forward(*[tensordict.get(key) for key in self.in_keys])
-        if not self.deterministic:
-            # Gumbel-max: argmax(logits - log E) with E exponential is a draw from softmax(logits).
-            noise = torch.empty_like(scores).exponential_(generator=self.generator)
-            scores -= noise.log_()
-        action = scores.argmax(-1)
-        if self.one_hot:
-            action = nn.functional.one_hot(action, self.num_actions).to(self.action_dtype)
+        outputs = self.network.forward(*[tensordict.get(key) for key in self.in_keys])
+        action = self._choose(outputs, self.deterministic, self.generator)
         return tensordict.set(self.action_key, action)
 
 
@@ -163,5 +175,6 @@ def _leaf_spec(action_spec: TensorSpec, action_key: NestedKey) -> tuple[TensorSp
         return Categorical(int(action_spec.space.n)), False
     raise ValueError(
         "SkillActor chooses among a fixed number of actions, so it needs a Categorical or OneHot "
-        f"action spec; got {type(action_spec).__name__}. Pass env.action_spec of a discrete env."
+        f"action spec; got {type(action_spec).__name__}. Pass env.action_spec of a discrete env; "
+        "for continuous actions use GaussianSkillActor."
     )

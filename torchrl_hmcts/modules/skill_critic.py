@@ -1,4 +1,4 @@
-"""The skill-conditioned critic."""
+"""The skill-conditioned critics, of states and of states with an action."""
 
 from __future__ import annotations
 
@@ -7,11 +7,16 @@ from collections.abc import Callable, Sequence
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
+from torchrl_hmcts.modules.skill_mlp import (
+    SkillMLP,
+    SkillNetwork,
+    check_positive,
+    key_list,
+)
 
 
 class SkillCritic(SkillNetwork):
-    r"""Action values Q(s, z, .) with shared layers and one head per skill.
+    r"""Values Q(s, z, .) of discrete actions with shared layers and one head per skill.
 
     .. math:: Q(s, z, \cdot) = \mathrm{SkillMLP}(s, z) \in \mathbb{R}^A
 
@@ -26,6 +31,8 @@ class SkillCritic(SkillNetwork):
         action_value_key (NestedKey): entry written, ``[*B, A]``. Default ``"action_value"``.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
         activation (callable): builds the activations. Default ``torch.nn.ReLU``.
+        network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
+            :class:`SkillMLP`; e.g. :class:`ConcatSkillMLP` for a skill that is concatenated.
 
     Examples:
         >>> import torch
@@ -49,9 +56,65 @@ class SkillCritic(SkillNetwork):
         action_value_key: NestedKey = "action_value",
         hidden: Sequence[int] = (64, 64),
         activation: Callable[[], nn.Module] = nn.ReLU,
+        network: Callable[..., nn.Module] = SkillMLP,
     ) -> None:
-        network = SkillMLP(in_features, num_actions, num_skills, hidden, activation)
+        net = network(in_features, num_actions, num_skills, hidden, activation)
         keys = [*key_list("SkillCritic", in_keys), skill_key]
-        super().__init__(network, keys, action_value_key)
+        super().__init__(net, keys, action_value_key)
         self.num_actions = num_actions
+        self.num_skills = num_skills
+
+
+class SkillActionCritic(SkillNetwork):
+    r"""The value Q(s, z, a) of a continuous action with shared layers and one head per skill.
+
+    .. math:: Q(s, z, a) = \mathrm{SkillMLP}([s; a], z) \in \mathbb{R}
+
+    Pass one to a loss; TorchRL makes the twin (and the targets) from it.
+
+    Args:
+        in_features (int): summed sizes of the entries ``in_keys``, without the action.
+        action_features (int): size of the action, ``D``.
+        num_skills (int): number of skills.
+        in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
+        skill_key (NestedKey): entry of the skill, int64 ``[*B]``. Default ``"skill"``.
+        action_key (NestedKey): entry of the action, ``[*B, D]``. Default ``"action"``.
+        state_action_value_key (NestedKey): entry written, ``[*B, 1]``. Default
+            ``"state_action_value"``.
+        hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
+        activation (callable): builds the activations. Default ``torch.nn.ReLU``.
+        network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
+            :class:`SkillMLP`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.modules import SkillActionCritic
+        >>> critic = SkillActionCritic(3, action_features=2, num_skills=4, in_keys=["velocity"])
+        >>> td = TensorDict(velocity=torch.randn(5, 3), action=torch.randn(5, 2),
+        ...                 skill=torch.zeros(5, dtype=torch.int64), batch_size=[5])
+        >>> critic(td)["state_action_value"].shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        action_features: int,
+        num_skills: int,
+        *,
+        in_keys: Sequence[NestedKey],
+        skill_key: NestedKey = "skill",
+        action_key: NestedKey = "action",
+        state_action_value_key: NestedKey = "state_action_value",
+        hidden: Sequence[int] = (64, 64),
+        activation: Callable[[], nn.Module] = nn.ReLU,
+        network: Callable[..., nn.Module] = SkillMLP,
+    ) -> None:
+        check_positive(
+            "SkillActionCritic", in_features=in_features, action_features=action_features
+        )
+        net = network(in_features + action_features, 1, num_skills, hidden, activation)
+        keys = [*key_list("SkillActionCritic", in_keys), action_key, skill_key]
+        super().__init__(net, keys, state_action_value_key)
         self.num_skills = num_skills

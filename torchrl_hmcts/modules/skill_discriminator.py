@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import torch
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 
-from torchrl_hmcts.modules.skill_mlp import SkillNetwork, check_positive, key_list, shared_layers
+from torchrl_hmcts.modules.skill_mlp import FeatureMLP, SkillNetwork, check_positive, key_list
 
 
 class SkillDiscriminator(SkillNetwork):
@@ -56,16 +55,7 @@ class SkillDiscriminator(SkillNetwork):
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
         check_positive("SkillDiscriminator", in_features=in_features, num_skills=num_skills)
-        hidden = tuple(hidden)
-        layers = list(shared_layers("SkillDiscriminator", in_features, hidden, activation))
-        network = _Concat(*layers, nn.Linear((in_features, *hidden)[-1], num_skills))
+        sizes = [in_features, *hidden, num_skills]
+        network = FeatureMLP("SkillDiscriminator", sizes, activation)
         super().__init__(network, key_list("SkillDiscriminator", in_keys), skill_logits_key)
         self.num_skills = num_skills
-
-
-class _Concat(nn.Sequential):
-    """A Sequential that concatenates its inputs first."""
-
-    def forward(self, *features: Tensor) -> Tensor:
-        x = features[0] if len(features) == 1 else torch.cat(features, -1)
-        return super().forward(x)

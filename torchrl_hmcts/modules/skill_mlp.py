@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -78,37 +78,207 @@ class SkillMLP(nn.Module):
         self.heads = nn.Linear(hidden[-1], num_skills * out_features)
 
     def forward(self, *inputs: Tensor) -> Tensor:
+        return self.run(own_weights(self.trunk, self.heads), *inputs)
+
+    def run(self, weights: Sequence[Tensor], *inputs: Tensor) -> Tensor:
+        """Does what ``forward`` does, with weights in place of the network's own.
+
+        They are in the order of ``parameters()``; of N copies, stacked.
+        """
         *features, skill = inputs
-        x = features[0] if len(features) == 1 else torch.cat(features, -1)
-        num_nets = self.heads.weight.shape[:-2]  # () or, stacked, (N,)
-        if num_nets:
-            x = x.reshape(1, -1, x.shape[-1]).expand(*num_nets, -1, -1)
-        # Layers are applied here, not called as modules: their parameters may be stacked, and
-        # calling a small module costs as much as what it computes.
-        for layer in self.trunk._modules.values():
-            if type(layer) is nn.Linear:
-                x = _linear(layer, x)
-            else:
-                x = x.relu() if type(layer) is nn.ReLU else layer(x)
-        y = _linear(self.heads, x)
-        shape = (*num_nets, *skill.shape)
-        y = y.view(*shape, self.num_skills, self.out_features)
-        index = skill.unsqueeze(-1).unsqueeze(-1).expand(*shape, 1, self.out_features)
+        y = self._all_skills(weights, features)  # [*B, Z, O], of stacked weights [N, *B, Z, O]
+        index = skill.unsqueeze(-1).unsqueeze(-1).expand(*y.shape[:-2], 1, self.out_features)
         return y.gather(-2, index).squeeze(-2)
+
+    def all_skills(self, *features: Tensor) -> Tensor:
+        """Returns the outputs for every skill, ``[*B, Z, O]``."""
+        return self._all_skills(own_weights(self.trunk, self.heads), features)
+
+    def _all_skills(self, weights: Sequence[Tensor], features: Sequence[Tensor]) -> Tensor:
+        x = _concatenate(features)
+        y = run_layers(self.trunk._modules.values(), weights, x)
+        return y.view(*y.shape[:-1], self.num_skills, self.out_features)
 
     @property
     def stackable(self) -> bool:
         """Whether the parameters of N copies may be put in stacked, to run all copies at once."""
-        layers = [layer for layer in self.trunk if type(layer) is not nn.Linear]
-        return not any(True for layer in layers for _ in layer.state_dict())
+        return can_stack(self.trunk)
 
     def extra_repr(self) -> str:
         return f"num_skills={self.num_skills}, out_features={self.out_features}"
 
 
-def _linear(layer: nn.Linear, x: Tensor) -> Tensor:
+class ConcatSkillMLP(nn.Module):
+    r"""Maps features and a skill to outputs by a network that reads the skill beside the features.
+
+    .. math:: y = B h(x, e_z) + b, \qquad h = \sigma(A_2 \sigma(A_1 [x; e_z] + a_1) + a_2)
+
+    with :math:`e_z` the one-hot skill. A drop-in replacement of :class:`SkillMLP`: pass it as
+    ``network=ConcatSkillMLP`` to an actor or critic. All layers are shared by all skills, as in the
+    paper on DIAYN; its number of weights hardly grows with the number of skills.
+
+    Args:
+        in_features (int): number of input features ``F``, after concatenation, without the skill.
+        out_features (int): number of outputs ``O``.
+        num_skills (int): number of skills ``Z``.
+        hidden (sequence of int): widths of the hidden layers. Default ``(64, 64)``.
+        activation (callable): builds the activation after each hidden layer. Default
+            ``torch.nn.ReLU``.
+
+    Returns:
+        From ``forward(*features, skill)``: Tensor ``[*B, O]``, as :class:`SkillMLP`.
+
+    Raises:
+        ValueError: if a size is not positive.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor
+        >>> net = ConcatSkillMLP(in_features=3, out_features=2, num_skills=4)
+        >>> net(torch.randn(5, 3), torch.tensor([0, 1, 2, 3, 0])).shape
+        torch.Size([5, 2])
+        >>> actor = SkillActor(3, Categorical(2), 4, in_keys=["velocity"], network=ConcatSkillMLP)
+        >>> type(actor.network).__name__
+        'ConcatSkillMLP'
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        num_skills: int,
+        hidden: Sequence[int] = (64, 64),
+        activation: Callable[[], nn.Module] = nn.ReLU,
+    ) -> None:
+        super().__init__()
+        name = "ConcatSkillMLP"
+        check_positive(
+            name, in_features=in_features, out_features=out_features, num_skills=num_skills
+        )
+        self.in_features = int(in_features)
+        self.out_features = int(out_features)
+        self.num_skills = int(num_skills)
+        width = self.in_features + self.num_skills
+        self.trunk = shared_layers(name, width, hidden, activation)
+        self.last = nn.Linear((width, *hidden)[-1], out_features)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.run(own_weights(self.trunk, self.last), *inputs)
+
+    def run(self, weights: Sequence[Tensor], *inputs: Tensor) -> Tensor:
+        """Does what ``forward`` does, with weights in place of the network's own.
+
+        They are in the order of ``parameters()``; of N copies, stacked.
+        """
+        *features, skill = inputs
+        x = torch.cat((*features, self._one_hot(skill, features[0])), -1)
+        return run_layers(self.trunk._modules.values(), weights, x)
+
+    def all_skills(self, *features: Tensor) -> Tensor:
+        """Returns the outputs for every skill, ``[*B, Z, O]``."""
+        x = torch.cat(features, -1).unsqueeze(-2)
+        x = x.expand(*x.shape[:-2], self.num_skills, -1)
+        skill = torch.arange(self.num_skills, device=x.device)
+        one_hot = self._one_hot(skill, x).expand(*x.shape[:-1], -1)
+        weights = own_weights(self.trunk, self.last)
+        return run_layers(self.trunk, weights, torch.cat((x, one_hot), -1))
+
+    def _one_hot(self, skill: Tensor, like: Tensor) -> Tensor:
+        skills = torch.arange(self.num_skills, device=like.device)
+        return (skill.unsqueeze(-1) == skills).to(like.dtype)
+
+    @property
+    def stackable(self) -> bool:
+        """Whether the parameters of N copies may be put in stacked, to run all copies at once."""
+        return can_stack(self.trunk)
+
+    def extra_repr(self) -> str:
+        return f"num_skills={self.num_skills}, out_features={self.out_features}"
+
+
+class FeatureMLP(nn.Sequential):
+    """A multi-layer perceptron that concatenates its inputs first; its layers are its items.
+
+    Args:
+        owner (str): who builds it, for errors.
+        sizes (sequence of int): of input, hidden layers and output.
+        activation (callable): builds the activation after each hidden layer. Default
+            ``torch.nn.ReLU``.
+        linear (callable): builds a linear layer from its two sizes. Default ``torch.nn.Linear``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_hmcts.modules.skill_mlp import FeatureMLP
+        >>> FeatureMLP("Example", [3, 8, 4])(torch.zeros(5, 2), torch.zeros(5, 1)).shape
+        torch.Size([5, 4])
+    """
+
+    def __init__(
+        self,
+        owner: str,
+        sizes: Sequence[int],
+        activation: Callable[[], nn.Module] = nn.ReLU,
+        linear: Callable[[int, int], nn.Module] = nn.Linear,
+    ) -> None:
+        hidden = shared_layers(owner, sizes[0], sizes[1:-1], activation, linear)
+        super().__init__(*hidden, linear(sizes[-2], sizes[-1]))
+
+    def forward(self, *features: Tensor) -> Tensor:
+        return super().forward(_concatenate(features))
+
+    def run(self, weights: Sequence[Tensor], *features: Tensor) -> Tensor:
+        """Does what ``forward`` does, with weights in place of its own, as :meth:`SkillMLP.run`."""
+        return run_layers(list(self)[:-1], weights, _concatenate(features))
+
+    @property
+    def stackable(self) -> bool:
+        """Whether :meth:`run` can be used: only plain linear layers have parameters."""
+        return can_stack(self)
+
+
+def _concatenate(features: Sequence[Tensor]) -> Tensor:
+    return features[0] if len(features) == 1 else torch.cat(tuple(features), -1)
+
+
+def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor) -> Tensor:
+    """Runs x ``[*B, F]`` through hidden layers and a last one; of N stacked copies, ``[N, *B, O]``.
+
+    Layers are applied here, not called as modules: their weights may be stacked, and calling a
+    small module costs as much as what it computes.
+    """
+    num_nets = weights[-1].shape[:-1]  # () or, stacked, (N,)
+    batch = x.shape[:-1]
+    if num_nets:
+        x = x.reshape(1, -1, x.shape[-1]).expand(*num_nets, -1, -1)
+    i = 0
+    for layer in hidden:
+        if type(layer) is nn.Linear:
+            x = _linear(weights[i], weights[i + 1], x)
+            i += 2
+        else:
+            x = x.relu() if type(layer) is nn.ReLU else layer(x)
+    y = _linear(weights[i], weights[i + 1], x)
+    return y.view(*num_nets, *batch, y.shape[-1]) if num_nets else y
+
+
+def own_weights(hidden: nn.Sequential, last: nn.Linear) -> list[Tensor]:
+    """Returns the weights and biases that :func:`run_layers` takes."""
+    layers = [layer for layer in hidden._modules.values() if type(layer) is nn.Linear]
+    return [tensor for layer in (*layers, last) for tensor in (layer.weight, layer.bias)]
+
+
+def can_stack(layers: Iterable[nn.Module]) -> bool:
+    """Returns whether stacked parameters can be run: none but linear layers may have any."""
+    others = [layer for layer in layers if type(layer) is not nn.Linear]
+    return not any(True for layer in others for _ in layer.state_dict())
+
+
+def _linear(weight: Tensor, bias: Tensor, x: Tensor) -> Tensor:
     """Applies a linear layer, or N stacked ones (weight ``[N, O, I]``) to x ``[N, b, I]``."""
-    weight, bias = layer.weight, layer.bias
     if weight.ndim == 2:
         return F.linear(x, weight, bias)
     return torch.baddbmm(bias.unsqueeze(-2), x, weight.transpose(-2, -1))
@@ -153,7 +323,11 @@ class SkillNetwork(TensorDictModuleBase):
 
 
 def shared_layers(
-    owner: str, in_features: int, hidden: Sequence[int], activation: Callable[[], nn.Module]
+    owner: str,
+    in_features: int,
+    hidden: Sequence[int],
+    activation: Callable[[], nn.Module],
+    linear: Callable[[int, int], nn.Module] = nn.Linear,
 ) -> nn.Sequential:
     """Builds the hidden layers of a network, each a linear map and an activation."""
     hidden = tuple(hidden)
@@ -164,7 +338,7 @@ def shared_layers(
         )
     layers: list[nn.Module] = []
     for fan_in, fan_out in zip((in_features, *hidden), hidden, strict=False):
-        layers += [nn.Linear(fan_in, fan_out), activation()]
+        layers += [linear(fan_in, fan_out), activation()]
     return nn.Sequential(*layers)
 
 

@@ -1,28 +1,50 @@
-"""Skill discovery by discriminability, on TorchRL's discrete soft actor-critic."""
+"""Diversity is all you need: skills that can be told apart, on soft actor-critic."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
     TensorDictParams,
-    dispatch,
 )
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec
-from torchrl.objectives import DiscreteSACLoss
-from torchrl.objectives.utils import ValueEstimators, distance_loss
 
-from torchrl_hmcts.objectives.discriminator import SkillDiscriminatorLoss, check_reduction
+from torchrl_hmcts.modules.skill_prior import SkillPrior
+from torchrl_hmcts.objectives.discrete_skill_sac import DiscreteSkillSACLoss
+from torchrl_hmcts.objectives.discriminator import SkillDiscriminatorLoss
+from torchrl_hmcts.objectives.skill_sac import SkillSACLoss
+
+_Base: Any = DiscreteSkillSACLoss if TYPE_CHECKING else object
 
 
-class DIAYNLoss(DiscreteSACLoss):
+class _WithDiscriminator(_Base):
+    """What both kinds of DIAYN share: names for the parts of their objective."""
+
+    objective: SkillDiscriminatorLoss
+
+    @property
+    def discriminator(self) -> TensorDictModuleBase:
+        """The discriminator module; its live parameters are those this loss trains."""
+        return self.objective.discriminator
+
+    @property
+    def discriminator_params(self) -> TensorDictParams:
+        """The discriminator's parameters."""
+        return self.objective.discriminator_params
+
+    def discriminator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Returns the discriminator's cross-entropy and its accuracy."""
+        return self.objective.discriminator_loss(tensordict)
+
+
+class DIAYNLoss(_WithDiscriminator, DiscreteSkillSACLoss):
     r"""Discrete soft actor-critic with twin critics, conditioned on skills, plus a discriminator.
 
     .. math::
@@ -34,9 +56,10 @@ class DIAYNLoss(DiscreteSACLoss):
         - \min_i Q_i(s, z, a)\bigr] \\
         L_\phi &= -\log q_\phi(z \mid s')
 
-    The reward :math:`r` is the entry ``("next", "reward")``: for DIAYN put a
-    :class:`~torchrl_hmcts.transforms.DIAYNReward` on the replay buffer, for another skill objective
-    another transform. Being a :class:`torchrl.objectives.DiscreteSACLoss`, it runs with
+    It is a :class:`DiscreteSkillSACLoss` with a :class:`SkillDiscriminatorLoss`. The reward
+    :math:`r` is the entry ``("next", "reward")``: put a
+    :class:`~torchrl_hmcts.transforms.SkillReward` with ``loss.objective`` (or a
+    :class:`~torchrl_hmcts.transforms.DIAYNReward`) on the replay buffer. It runs with
     ``SoftUpdate``, ``Trainer`` and ``SACTrainer`` unchanged. No loss sends gradients into the
     parameters of another.
 
@@ -48,6 +71,9 @@ class DIAYNLoss(DiscreteSACLoss):
         discriminator (TensorDictModuleBase): writes ``skill_logits`` ``[*B, Z]`` from its
             ``in_keys`` in the ``"next"`` part of a transition.
         action_space (str or TensorSpec): ``"categorical"``, ``"one-hot"`` or the action spec.
+        num_skills (int, optional): number of skills. Default: that of the discriminator.
+        prior (SkillPrior, sequence of float or Tensor, optional): p(z). Default ``None``: uniform.
+            See :class:`SkillDiscriminatorLoss`.
         num_actions (int, optional): number of actions ``A``. Default: that of the actor; needed
             only for ``target_entropy="auto"``.
         gamma (float): discount per base step. Default ``0.95``: a horizon of twenty steps, about
@@ -112,19 +138,11 @@ class DIAYNLoss(DiscreteSACLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(DiscreteSACLoss._AcceptedKeys):
-        skill: NestedKey = "skill"
+    class _AcceptedKeys(DiscreteSkillSACLoss._AcceptedKeys):
         skill_logits: NestedKey = "skill_logits"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-
-    actor_network: ProbabilisticTensorDictSequential
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-    qvalue_network: TensorDictModuleBase
-    qvalue_network_params: TensorDictParams
-    target_qvalue_network_params: TensorDictParams
 
     def __init__(
         self,
@@ -133,6 +151,8 @@ class DIAYNLoss(DiscreteSACLoss):
         discriminator: TensorDictModuleBase,
         *,
         action_space: str | TensorSpec,
+        num_skills: int | None = None,
+        prior: SkillPrior | Sequence[float] | Tensor | None = None,
         num_actions: int | None = None,
         gamma: float = 0.95,
         alpha_init: float = 0.3,
@@ -148,147 +168,106 @@ class DIAYNLoss(DiscreteSACLoss):
         skip_done_states: bool = False,
         deactivate_vmap: bool = False,
     ) -> None:
-        check_reduction(type(self).__name__, reduction)
-        if not 0.0 <= gamma <= 1.0:
-            raise ValueError(f"DIAYNLoss needs a discount gamma between 0 and 1; got {gamma}.")
-        if alpha_init <= 0.0:
-            raise ValueError(
-                "DIAYNLoss keeps the logarithm of alpha, so alpha_init must be positive; got "
-                f"{alpha_init}. Pass e.g. alpha_init=1e-3 for next to no entropy bonus."
-            )
-        if num_actions is None:
-            num_actions = getattr(actor_network, "num_actions", None)
         super().__init__(
             actor_network,
             qvalue_network,
+            SkillDiscriminatorLoss(
+                discriminator, num_skills=num_skills, prior=prior, reduction=reduction
+            ),
             action_space=action_space,
             num_actions=num_actions,
-            num_qvalue_nets=num_qvalue_nets,
-            loss_function=loss_function,
+            gamma=gamma,
             alpha_init=alpha_init,
+            fixed_alpha=fixed_alpha,
             min_alpha=min_alpha,
             max_alpha=max_alpha,
-            fixed_alpha=fixed_alpha,
             target_entropy_weight=target_entropy_weight,
             target_entropy=target_entropy,
+            num_qvalue_nets=num_qvalue_nets,
+            loss_function=loss_function,
             delay_qvalue=delay_qvalue,
-            reduction=reduction,
             skip_done_states=skip_done_states,
             deactivate_vmap=deactivate_vmap,
-            # With "none" TorchRL would warn that the scalars alpha and entropy are left out.
-            scalar_output_mode="exclude" if reduction == "none" else None,
         )
-        self.discriminator_objective = SkillDiscriminatorLoss(discriminator, reduction=reduction)
-        # Eagerly: a value estimator built at the first call would add entries to the state dict.
-        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-        diagnostics = [f"qvalue_loss_{i}" for i in range(num_qvalue_nets)]
-        diagnostics += ["discriminator_accuracy"]
-        if reduction != "none":
-            diagnostics += ["alpha", "entropy"]
-        losses = ["loss_actor", "loss_qvalue", "loss_alpha", "loss_discriminator"]
-        self.out_keys = [*losses, *diagnostics]
+        self.register_load_state_dict_pre_hook(_rename_discriminator_objective)
 
-    @property
-    def discriminator(self) -> TensorDictModuleBase:
-        """The discriminator module; its live parameters are those this loss trains."""
-        return self.discriminator_objective.discriminator
 
-    @property
-    def discriminator_params(self) -> TensorDictParams:
-        """The discriminator's parameters."""
-        return self.discriminator_objective.discriminator_params
+class ContinuousDIAYNLoss(_WithDiscriminator, SkillSACLoss):
+    r"""Soft actor-critic for continuous actions, conditioned on skills, plus a discriminator.
 
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        keys = SkillDiscriminatorLoss._AcceptedKeys.__dataclass_fields__
-        self.discriminator_objective.set_keys(**{k: getattr(self.tensor_keys, k) for k in keys})
-        super()._forward_value_estimator_keys(**kwargs)
+    .. math:: L = L_{\text{SAC}}(\theta, \pi) + L_\phi, \qquad L_\phi = -\log q_\phi(z \mid s')
 
-    _in_keys: Any  # list of keys, or None until it is known
+    :class:`DIAYNLoss` for continuous actions: a :class:`SkillSACLoss` with a
+    :class:`SkillDiscriminatorLoss`.
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        # The parent forgets what the critics read of the next state, and nests tuples in tuples.
-        critic = [("next", key) for key in self.qvalue_network.in_keys]
-        keys = [*self._in_keys, *critic, *self.discriminator_objective.in_keys]
-        self._in_keys = sorted({unravel_key(key) for key in keys}, key=str)
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): the policy pi(a | s, z), e.g. a
+            :class:`~torchrl_hmcts.modules.GaussianSkillActor`.
+        qvalue_network (TensorDictModuleBase): writes ``state_action_value`` ``[*B, 1]``, e.g. a
+            :class:`~torchrl_hmcts.modules.SkillActionCritic`; copied for the twins.
+        discriminator (TensorDictModuleBase): writes ``skill_logits`` ``[*B, Z]`` from its
+            ``in_keys`` in the ``"next"`` part of a transition.
+        num_skills (int, optional): number of skills. Default: that of the discriminator.
+        prior (SkillPrior, sequence of float or Tensor, optional): p(z). Default ``None``: uniform.
+            See :class:`SkillDiscriminatorLoss`.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        **sac_kwargs: passed to :class:`SkillSACLoss`.
 
-    def _make_vmap(self) -> None:
-        super()._make_vmap()
-        network = getattr(self.qvalue_network, "network", None)
-        if getattr(network, "stackable", False):
-            # Such a critic runs on the stacked parameters of all copies at once: a vmap or a loop
-            # over them takes twice as long.
-            self._vmap_qnetworkN0 = self._stacked_qnetwork
+    Returns:
+        TensorDict with the entries of :class:`DIAYNLoss`.
 
-    def _stacked_qnetwork(
-        self, tensordict: TensorDictBase, params: TensorDictParams
-    ) -> TensorDictBase:
-        """Returns the action values ``[N, *B, A]`` of N critics."""
-        critic = self.qvalue_network
-        with params.to_module(critic, preserve_module_state=False):
-            value = critic.network(*[tensordict.get(key) for key in critic.in_keys])
-        return TensorDict({critic.out_key: value}, batch_size=value.shape[:-1])
+    Raises:
+        ValueError: as :class:`SkillSACLoss`.
 
-    def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the critics' summed loss, ``td_error`` and each critic's own loss."""
-        weights = self._maybe_get_priority_weight(tensordict)
-        target = self._compute_target(tensordict)  # [*B]
-        action_value = self._vmap_qnetworkN0(
-            tensordict.select(*self.qvalue_network.in_keys, strict=False),
-            self.qvalue_network_params,
-        ).get(self.tensor_keys.action_value)  # [N, *B, A] with N critics
-        action = tensordict.get(self.tensor_keys.action)
-        if self.action_space == "categorical":
-            index = action if action.ndim == action_value.ndim - 1 else action.unsqueeze(-1)
-            index = index.expand(*action_value.shape[:-1], 1)
-            chosen = action_value.gather(-1, index).squeeze(-1)  # [N, *B]
-        else:
-            chosen = (action_value * action.to(action_value.dtype)).sum(-1)
-        losses = distance_loss(chosen, target.expand_as(chosen), self.loss_function)
-        reduced = [
-            self._reduce_loss(loss, tensordict=tensordict, weights=weights)
-            for loss in losses.unbind(0)
-        ]
-        metadata = {f"qvalue_loss_{i}": loss.detach() for i, loss in enumerate(reduced)}
-        metadata["td_error"] = (chosen.detach() - target).abs().amax(0)
-        return torch.stack(reduced).sum(0), metadata
+    Keys (``set_keys``): those of ``SACLoss`` and of :class:`SkillDiscriminatorLoss` (``skill``,
+    ``skill_logits``).
 
-    def discriminator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the discriminator's cross-entropy and its accuracy."""
-        return self.discriminator_objective.discriminator_loss(tensordict)
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070.
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        loss_qvalue, critics = self.qvalue_loss(tensordict)
-        loss_actor, policy = self.actor_loss(tensordict)
-        loss_discriminator, skills = self.discriminator_loss(tensordict)
-        weights = self._maybe_get_priority_weight(tensordict)
-        log_prob = policy["log_prob"]
-        loss_alpha = self._reduce_loss(
-            self._alpha_loss(log_prob), tensordict=tensordict, weights=weights
+    Examples:
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_hmcts.modules import (
+        ...     GaussianSkillActor, SkillActionCritic, SkillDiscriminator)
+        >>> from torchrl_hmcts.objectives import ContinuousDIAYNLoss
+        >>> spec = Bounded(-1.0, 1.0, shape=(2,))
+        >>> loss = ContinuousDIAYNLoss(
+        ...     GaussianSkillActor(2, spec, num_skills=3, in_keys=["velocity"]),
+        ...     SkillActionCritic(2, 2, num_skills=3, in_keys=["velocity"]),
+        ...     SkillDiscriminator(2, num_skills=3),
+        ... )
+        >>> loss.objective.num_skills
+        3
+    """
+
+    @dataclass
+    class _AcceptedKeys(SkillSACLoss._AcceptedKeys):
+        skill_logits: NestedKey = "skill_logits"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModuleBase,
+        discriminator: TensorDictModuleBase,
+        *,
+        num_skills: int | None = None,
+        prior: SkillPrior | Sequence[float] | Tensor | None = None,
+        reduction: str = "mean",
+        **sac_kwargs: Any,
+    ) -> None:
+        objective = SkillDiscriminatorLoss(
+            discriminator, num_skills=num_skills, prior=prior, reduction=reduction
         )
-        tensordict.set(self.tensor_keys.priority, critics.pop("td_error"))
-        out = {
-            "loss_actor": loss_actor,
-            "loss_qvalue": loss_qvalue,
-            "loss_alpha": loss_alpha,
-            "loss_discriminator": loss_discriminator,
-            **critics,
-            **skills,
-        }
-        if self.reduction == "none":
-            result = TensorDict(out, batch_size=tensordict.batch_size)
-        else:
-            out["alpha"] = self._alpha
-            out["entropy"] = -log_prob.mean()
-            result = TensorDict(out, batch_size=[])
-        self._clear_weakrefs(
-            tensordict,
-            result,
-            "actor_network_params",
-            "qvalue_network_params",
-            "target_actor_network_params",
-            "target_qvalue_network_params",
-            "discriminator_params",
-        )
-        return result
+        super().__init__(actor_network, qvalue_network, objective, **sac_kwargs)
+
+
+def _rename_discriminator_objective(
+    module: DIAYNLoss, state_dict: dict[str, Any], prefix: str, *_: Any
+) -> None:
+    """Reads state dicts of the time when the objective was called discriminator_objective."""
+    old = prefix + "discriminator_objective."
+    for key in [key for key in state_dict if key.startswith(old)]:
+        state_dict[prefix + "objective." + key[len(old) :]] = state_dict.pop(key)

@@ -13,10 +13,13 @@ from torchrl_hmcts.planners.evaluators import (
     ValueEvaluator,
 )
 from torchrl_hmcts.planners.mcts import MCTSPlanner, SearchProgress
+from torchrl_hmcts.planners.model_control import ModelBasedControl
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.planners.plan import Plan, extract_plans
+from torchrl_hmcts.planners.policy_value import PolicyValueEvaluator
 from torchrl_hmcts.planners.search import Search
+from torchrl_hmcts.planners.search_data import best_plans_below, search_examples
 from torchrl_hmcts.planners.torchrl_scores import TorchRLScore
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import SearchTree, TreeView
@@ -34,11 +37,13 @@ __all__ = [
     "MaxBackup",
     "MeanBackup",
     "MixedEvaluator",
+    "ModelBasedControl",
     "ModulePrior",
     "MostVisited",
     "NodeStatistics",
     "NoveltyTest",
     "Plan",
+    "PolicyValueEvaluator",
     "ProgressiveWidening",
     "RadiusNovelty",
     "RolloutEvaluator",
@@ -54,6 +59,8 @@ __all__ = [
     "TreeView",
     "ValueEvaluator",
     "WidthNovelty",
+    "best_plans_below",
     "extract_plans",
+    "search_examples",
     "tree_search",
 ]

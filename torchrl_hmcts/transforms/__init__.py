@@ -1,8 +1,20 @@
 """Transforms: skills, their displacement and reward, and options."""
 
 from torchrl_hmcts.transforms.displacement import DisplacementTransform
-from torchrl_hmcts.transforms.intrinsic_reward import DIAYNReward
+from torchrl_hmcts.transforms.intrinsic_reward import DIAYNReward, SkillReward
 from torchrl_hmcts.transforms.option import OptionTransform
+from torchrl_hmcts.transforms.recorder import OptionRecorder
 from torchrl_hmcts.transforms.skill import SkillTransform
+from torchrl_hmcts.transforms.skill_mask import SkillMaskTransform
+from torchrl_hmcts.transforms.stall import StallTransform
 
-__all__ = ["DIAYNReward", "DisplacementTransform", "OptionTransform", "SkillTransform"]
+__all__ = [
+    "DIAYNReward",
+    "DisplacementTransform",
+    "OptionRecorder",
+    "OptionTransform",
+    "SkillMaskTransform",
+    "SkillReward",
+    "SkillTransform",
+    "StallTransform",
+]

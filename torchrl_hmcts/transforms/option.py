@@ -346,6 +346,13 @@ class OptionTransform(Transform):
         spec = Composite(shape=shape, device=device)
         spec[self.option_key] = option
         input_spec["full_action_spec"] = spec
+        state = input_spec.get("full_state_spec", None)
+        if not self._fitted().batch_locked and state is not None and not state.is_empty():
+            # The worker's first step reads what the env showed: a stored state needs it.
+            observed = self.parent.full_observation_spec
+            for key in map(unravel_key, getattr(self.worker, "in_keys", ())):
+                if key in observed.keys(True, True) and key not in state.keys(True, True):
+                    state[key] = observed[key].clone()
         return input_spec
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:

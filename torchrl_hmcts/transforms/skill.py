@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
+
 
 class SkillTransform(Transform):
     r"""Samples a skill at reset and, mini-episode after mini-episode, again every few steps.
@@ -36,9 +38,11 @@ class SkillTransform(Transform):
             per episode.
         skill_key (NestedKey): entry of the skill. Default ``"skill"``.
         skill_step_key (NestedKey): entry of the steps taken. Default ``"skill_step"``.
-        prior (sequence of float or Tensor, optional): probabilities ``[Z]`` of the skills,
-            normalised. Default ``None``: uniform. Kept as the buffer ``prior``; write to it to move
-            it during training.
+        prior (sequence of float, Tensor or SkillPrior, optional): probabilities ``[Z]`` of the
+            skills, normalised. Default ``None``: uniform. Numbers are kept as the buffer ``prior``.
+            A :class:`~torchrl_hmcts.modules.SkillPrior` is asked at every draw, so that what it has
+            become by then counts, and once a step whether the skill in use was switched off, which
+            ends its mini-episode; it stays its owner's, and is no sub-module of the transform.
         seed (int, optional): seed of an own generator, whose state is saved in the state dict.
             Default ``None``: torch's global generator.
 
@@ -58,6 +62,7 @@ class SkillTransform(Transform):
     """
 
     prior: Tensor | None
+    skill_prior: SkillPrior | None
 
     def __init__(
         self,
@@ -66,7 +71,7 @@ class SkillTransform(Transform):
         *,
         skill_key: NestedKey = "skill",
         skill_step_key: NestedKey = "skill_step",
-        prior: Sequence[float] | Tensor | None = None,
+        prior: SkillPrior | Sequence[float] | Tensor | None = None,
         seed: int | None = None,
     ) -> None:
         if num_skills < 1:
@@ -83,7 +88,14 @@ class SkillTransform(Transform):
         super().__init__(in_keys=[], out_keys=[self.skill_key, self.skill_step_key])
         self.num_skills = int(num_skills)
         self.max_skill_steps = None if max_skill_steps is None else int(max_skill_steps)
-        self.register_buffer("prior", check_prior("SkillTransform", prior, num_skills))
+        live, fixed = None, None
+        if isinstance(prior, SkillPrior):
+            live = as_skill_prior("SkillTransform", prior, num_skills)
+        else:
+            fixed = check_prior("SkillTransform", prior, num_skills)
+        # Past nn.Module.__setattr__: a sub-module would be saved and moved with the env.
+        self.__dict__["skill_prior"] = live
+        self.register_buffer("prior", fixed)
         self.generator: torch.Generator | None = None
         if seed is not None:
             self.set_seed(seed)
@@ -95,12 +107,16 @@ class SkillTransform(Transform):
 
     def sample(self, shape: Sequence[int], device: torch.device | None = None) -> Tensor:
         """Returns skills drawn from p(z), int64 of the given shape."""
-        if self.prior is None:
+        prior = self.prior
+        if self.skill_prior is not None:
+            prior = self.skill_prior.probs().detach()
+        if prior is None:
             skill = torch.randint(self.num_skills, tuple(shape), generator=self.generator)
         else:
             count = torch.Size(shape).numel()
-            prior = self.prior.to("cpu")
-            skill = torch.multinomial(prior, count, replacement=True, generator=self.generator)
+            skill = torch.multinomial(
+                prior.to("cpu"), count, replacement=True, generator=self.generator
+            )
             skill = skill.view(tuple(shape))
         return skill if device is None else skill.to(device)
 
@@ -134,13 +150,19 @@ class SkillTransform(Transform):
     def _post_step_mdp_hooks(
         self, tensordict: TensorDictBase, tensordict_: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        if self.max_skill_steps is None:
+        if self.max_skill_steps is None and self.skill_prior is None:
             return tensordict, tensordict_
         step = tensordict_.get(self.skill_step_key)
-        ended = step >= self.max_skill_steps  # [*B, 1]
+        skill = tensordict_.get(self.skill_key)
+        if self.max_skill_steps is None:
+            ended = torch.zeros_like(step, dtype=torch.bool)
+        else:
+            ended = step >= self.max_skill_steps  # [*B, 1]
+        if self.skill_prior is not None:
+            off = ~self.skill_prior.active().to(skill.device)
+            ended = ended | off[skill].unsqueeze(-1)
         if ended.any():
             # New tensors: the old ones are also the ("next", ...) entries of the transition.
-            skill = tensordict_.get(self.skill_key)
             fresh = self.sample(skill.shape, skill.device)
             tensordict_.set(self.skill_key, torch.where(ended.squeeze(-1), fresh, skill))
             tensordict_.set(self.skill_step_key, step.masked_fill(ended, 0))
@@ -174,7 +196,7 @@ class SkillTransform(Transform):
         return self._add_specs(state_spec)
 
     def _check_batched_worker_compat(self) -> None:
-        if self.max_skill_steps is not None:
+        if self.max_skill_steps is not None or self.skill_prior is not None:
             raise RuntimeError(
                 "SkillTransform draws new skills between two steps, which the workers of a "
                 "SerialEnv or ParallelEnv do not do. Put it outside: "

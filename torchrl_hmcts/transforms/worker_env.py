@@ -102,6 +102,7 @@ class WorkerEnv:
                     f"worker's in_keys, or add a transform that writes {key!r} before "
                     f"OptionTransform."
                 )
+        self._check_termination(parent, transform)
         with torch.no_grad(), torch.random.fork_rng(devices=[]):  # the check draws no numbers
             worker(td)
         for key in self.action_keys:
@@ -117,6 +118,20 @@ class WorkerEnv:
                     f"The worker {name} wrote {key!r} = {action.dtype} {list(action.shape)} with "
                     f"values up to {action.max().item():g}, which does not fit the env's action "
                     f"spec {spec}. Build the worker from env.action_spec."
+                )
+
+    def _check_termination(self, parent: EnvBase, transform: OptionTransform) -> None:
+        """Refuse a termination that says it reads what no base step writes."""
+        written = {*parent.full_observation_spec.keys(True, True), *parent.state_keys}
+        written |= {*parent.done_keys, self.reward_key, transform.skill_key, transform.duration_key}
+        available = {unravel_key(key) for key in written}
+        for key in getattr(transform.termination, "in_keys", ()):
+            if unravel_key(key) not in available:
+                raise ValueError(
+                    f"The termination {type(transform.termination).__name__} reads {key!r}, which "
+                    f"a base step of {type(parent.base_env).__name__} does not write: it writes "
+                    f"{sorted(map(str, available))}. Put a transform that writes {key!r} before "
+                    f"OptionTransform."
                 )
 
 

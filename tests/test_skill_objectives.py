@@ -1,0 +1,645 @@
+"""METRA, LSD and DADS beside DIAYN: rewards, losses, priors, and swapping one for another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+from torchrl.objectives import SoftUpdate
+from torchrl.trainers.algorithms import SACTrainer
+
+from torchrl_hmcts.modules import (
+    FixedSkillPrior,
+    GrowingSkillPrior,
+    SkillActor,
+    SkillCritic,
+    SkillDiscriminator,
+    SkillDynamics,
+    SkillEncoder,
+    SkillNetwork,
+    SkillPolicy,
+    SpectralLinear,
+)
+from torchrl_hmcts.objectives import (
+    DIAYNLoss,
+    DiscreteSkillSACLoss,
+    LSDEncoderLoss,
+    METRAEncoderLoss,
+    SkillDiscriminatorLoss,
+    SkillDynamicsLoss,
+    SkillObjective,
+)
+from torchrl_hmcts.transforms import DisplacementTransform, SkillReward, SkillTransform
+
+OBJECTIVES = ["diayn", "metra", "lsd", "dads"]
+LOSSES = {
+    "diayn": {"loss_discriminator": "discriminator_params"},
+    "metra": {"loss_encoder": "encoder_params", "loss_dual": None},
+    "lsd": {"loss_encoder": "encoder_params"},
+    "dads": {"loss_dynamics": "dynamics_params"},
+}
+
+
+def make_objective(
+    name: str, num_skills: int = 3, *, key: Any = "position", seed: int = 0, **kwargs: Any
+) -> SkillObjective:
+    """Returns an objective with small smooth networks that read one entry of two numbers."""
+    torch.manual_seed(seed)
+    sizes: dict[str, Any] = {"in_keys": [key], "hidden": (8,), "activation": torch.nn.Tanh}
+    if name == "diayn":
+        return SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills, **sizes), **kwargs)
+    if name == "metra":
+        return METRAEncoderLoss(SkillEncoder(2, num_skills, **sizes), **kwargs)
+    if name == "lsd":
+        return LSDEncoderLoss(SkillEncoder(2, num_skills, linear=SpectralLinear, **sizes), **kwargs)
+    return SkillDynamicsLoss(SkillDynamics(2, 2, num_skills, target_key=key, **sizes), **kwargs)
+
+
+def make_data(n: int = 6, *, seed: int = 0) -> TensorDict:
+    g = torch.Generator().manual_seed(seed)
+    position = torch.randn(n, 2, generator=g)
+    after = {"position": position + torch.randn(n, 2, generator=g)}
+    return TensorDict(
+        position=position,
+        skill=torch.randint(3, (n,), generator=g),
+        next=TensorDict(after, batch_size=[n]),
+        batch_size=[n],
+    )
+
+
+def identity_encoder(size: int) -> SkillNetwork:
+    """Returns an encoder phi(x) = x."""
+    encoder = SkillNetwork(torch.nn.Identity(), ["x"], "representation")
+    encoder.num_skills = size
+    return encoder
+
+
+def steps(*rows: tuple[float, ...], skills: Sequence[int]) -> TensorDict:
+    """Returns transitions with the given steps of x, from an arbitrary point."""
+    change = torch.tensor(rows)
+    root = torch.full_like(change, 0.3)
+    return TensorDict(
+        x=root,
+        skill=torch.tensor(skills),
+        next=TensorDict(x=root + change, batch_size=[len(rows)]),
+        batch_size=[len(rows)],
+    )
+
+
+def test_the_vectors_of_the_skills_are_those_of_the_papers_and_centred_under_any_prior() -> None:
+    vectors = METRAEncoderLoss(identity_encoder(4)).skill_vectors()
+    third = -1.0 / 3.0
+    torch.testing.assert_close(vectors, torch.eye(4) * (1.0 - third) + third)
+    prior = torch.tensor([0.5, 0.3, 0.2, 0.0])
+    vectors = METRAEncoderLoss(identity_encoder(4), prior=prior).skill_vectors()
+    torch.testing.assert_close(prior @ vectors, torch.zeros(4))
+    assert METRAEncoderLoss(identity_encoder(1)).skill_vectors().item() == 0.0
+
+
+def test_metra_has_its_closed_form() -> None:
+    # Vectors of three skills: 1 at the skill, -1/2 elsewhere.
+    td = steps((0.6, 0.0, 0.2), (1.0, 1.0, 0.0), skills=[0, 2])
+    objective = METRAEncoderLoss(identity_encoder(3), dual_init=2.0, slack=0.25, reduction="none")
+    travel = [0.6 - 0.1, -1.0]
+    torch.testing.assert_close(objective.reward(td), torch.tensor(travel)[:, None])
+    out = objective(td)
+    # ||step||^2 is 0.4 and 2: the first leaves 0.6, which counts as the slack of 0.25.
+    room = [0.25, -1.0]
+    expected = torch.tensor([-(t + 2.0 * c) for t, c in zip(travel, room, strict=True)])
+    torch.testing.assert_close(out["loss_encoder"], expected)
+    torch.testing.assert_close(out["loss_dual"], math.log(2.0) * torch.tensor(room))
+    torch.testing.assert_close(out["latent_distance"], torch.tensor([0.4, 2.0]).sqrt())
+    torch.testing.assert_close(out["dual"], torch.tensor([2.0, 2.0]))
+
+
+def test_metras_dual_rises_when_steps_are_too_long_and_falls_when_they_are_not() -> None:
+    for step, sign in ((2.0, -1.0), (0.1, 1.0)):
+        objective = METRAEncoderLoss(identity_encoder(2))
+        objective(steps((step, 0.0), skills=[0]))["loss_dual"].backward()
+        assert torch.sign(objective.log_dual.grad) == sign  # descent moves against the gradient
+
+
+def test_lsd_has_its_closed_form() -> None:
+    td = steps((0.6, 0.0, 0.8), skills=[1])
+    objective = LSDEncoderLoss(identity_encoder(3))
+    torch.testing.assert_close(objective.reward(td), torch.tensor([[-0.7]]))
+    out = objective(td)
+    torch.testing.assert_close(out["loss_encoder"], torch.tensor(0.7))
+    torch.testing.assert_close(out["latent_distance"], torch.tensor(1.0))
+
+
+def test_lsd_refuses_an_encoder_that_can_stretch_distances() -> None:
+    with pytest.raises(ValueError, match=r"network\.0.*SpectralLinear"):
+        LSDEncoderLoss(SkillEncoder(2, 3))
+    encoder = SkillEncoder(2, 3)
+    for layer in list(encoder.network):
+        if isinstance(layer, torch.nn.Linear):
+            torch.nn.utils.parametrizations.spectral_norm(layer)
+    LSDEncoderLoss(encoder)
+
+
+def test_dads_has_its_closed_form() -> None:
+    dynamics = SkillDynamics(1, 1, 2, in_keys=["x"], target_key="x", std=0.5, learned_std=False)
+    for p in dynamics.parameters():
+        torch.nn.init.zeros_(p)
+    with torch.no_grad():
+        dynamics.network.heads.bias.copy_(torch.tensor([1.0, 0.0]))  # skill 0 moves by 1
+    td = steps((1.0,), (0.5,), (0.0,), skills=[0, 0, 0])
+    objective = SkillDynamicsLoss(dynamics, reduction="none")
+
+    def density(x: float, mean: float) -> float:
+        return math.exp(-0.5 * ((x - mean) / 0.5) ** 2) / (0.5 * math.sqrt(2.0 * math.pi))
+
+    changes = (1.0, 0.5, 0.0)
+    loss = torch.tensor([-math.log(density(x, 1.0)) for x in changes])
+    torch.testing.assert_close(objective(td)["loss_dynamics"], loss)
+    for prior in (None, [0.25, 0.75]):
+        p = [0.5, 0.5] if prior is None else prior
+        reward = [
+            math.log(density(x, 1.0) / (p[0] * density(x, 1.0) + p[1] * density(x, 0.0)))
+            for x in changes
+        ]
+        out = SkillDynamicsLoss(dynamics, prior=prior).reward(td)
+        torch.testing.assert_close(out, torch.tensor(reward)[:, None])
+    # With the change of 1 skill 0 is the more probable one; with none, skill 1.
+    assert objective(td[[0, 2]])["dynamics_accuracy"].tolist() == [1.0, 0.0]
+
+
+def test_dads_learns_the_standard_deviation_of_the_changes() -> None:
+    dynamics = SkillDynamics(2, 2, 3, std=1.0)
+    objective = SkillDynamicsLoss(dynamics)
+    optimizer = torch.optim.Adam(objective.parameters(), lr=0.05)
+    td = make_data(256)
+    td["next", "position"] = td["position"] + 0.05 * torch.randn(256, 2)
+    for _ in range(120):
+        optimizer.zero_grad()
+        objective(td)["loss_dynamics"].backward()
+        optimizer.step()
+    scale = dynamics(td.copy())["skill_scale"]
+    torch.testing.assert_close(scale.mean(), torch.tensor(0.05), atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_the_gradient_of_each_loss_matches_finite_differences(name: str) -> None:
+    objective = make_objective(name).double()
+    td = make_data().apply(lambda x: x.double() if x.is_floating_point() else x)
+    if name == "lsd":
+        objective.encoder.eval()  # no more power iterations
+    for key in LOSSES[name]:
+        objective.zero_grad()
+        objective(td)[key].backward()
+        parameters = [p for p in objective.parameters() if p.grad is not None]
+        g = torch.Generator().manual_seed(0)
+        direction = [torch.randn(p.shape, generator=g, dtype=p.dtype) for p in parameters]
+        slope = sum((p.grad * d).sum() for p, d in zip(parameters, direction, strict=True))
+
+        @torch.no_grad()
+        def moved(
+            step: float, key: str = key, parameters: Any = parameters, direction: Any = direction
+        ) -> torch.Tensor:
+            for p, d in zip(parameters, direction, strict=True):
+                p += step * d
+            value = objective(td)[key].detach()
+            for p, d in zip(parameters, direction, strict=True):
+                p -= step * d
+            return value
+
+        difference = (moved(1e-6) - moved(-1e-6)) / 2e-6
+        # A spectral norm follows its matrix only with the next power iterations.
+        rtol = 1e-4 if name == "lsd" else 1e-6
+        torch.testing.assert_close(slope, difference, rtol=rtol, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_a_loss_moves_its_own_parameters_and_a_reward_none(name: str) -> None:
+    for key, group in LOSSES[name].items():
+        objective = make_objective(name)
+        objective(make_data())[key].backward()
+        own = list(getattr(objective, group).parameters()) if group else [objective.log_dual]
+        moved = [p for p in objective.parameters() if p.grad is not None and p.grad.any()]
+        assert {id(p) for p in moved} <= {id(p) for p in own}
+        assert moved
+    assert not make_objective(name).reward(make_data()).requires_grad
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_mean_and_sum_are_those_of_the_unreduced_losses(name: str) -> None:
+    td = make_data()
+    none, mean, total = (make_objective(name, reduction=r)(td) for r in ("none", "mean", "sum"))
+    assert set(none.keys()) == set(make_objective(name).out_keys)
+    for key in none.keys():
+        assert none[key].shape == (6,)
+        torch.testing.assert_close(none[key].mean(), mean[key])
+        if key.startswith("loss"):
+            torch.testing.assert_close(none[key].sum(), total[key])
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_priority_weights_weigh_the_losses(name: str) -> None:
+    td = make_data().set("priority_weight", torch.tensor([1.0, 0, 0, 0, 0, 0]))
+    alone, all_of_them = make_objective(name)(td), make_objective(name, reduction="none")(td)
+    for key in LOSSES[name]:
+        torch.testing.assert_close(alone[key], all_of_them[key][0])
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_the_loss_takes_keyword_tensors_and_announces_what_it_reads(name: str) -> None:
+    objective, td = make_objective(name), make_data()
+    keywords = {"_".join(k) if isinstance(k, tuple) else k: td[k] for k in objective.in_keys}
+    by_name = dict(zip(objective.out_keys, objective(**keywords), strict=True))
+    expected = make_objective(name)(td.select(*objective.in_keys)).to_dict()
+    torch.testing.assert_close(by_name, expected)
+    assert objective.reward(td.select(*objective.in_keys)).shape == (6, 1)
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_set_keys_moves_every_key_flat_or_nested(name: str) -> None:
+    td = make_data()
+    expected = make_objective(name)
+    key = ("agent", "where")
+    objective = make_objective(name, key=key)
+    networks = ("discriminator", "encoder", "dynamics")
+    module = next(getattr(objective, n) for n in networks if hasattr(objective, n))
+    written = {"skill_logits": "a", "representation": "b", "skill_loc": "c", "skill_scale": "d"}
+    own = {k: ("agent", v) for k, v in written.items() if hasattr(objective.tensor_keys, k)}
+    module.out_keys = list(own.values())
+    if hasattr(module, "out_key"):
+        module.out_key = module.out_keys[0]
+    objective.set_keys(skill=("agent", "z"), **own)
+    moved = TensorDict(
+        agent={"where": td["position"], "z": td["skill"]},
+        next={"agent": {"where": td["next", "position"]}},
+        batch_size=[6],
+    )
+    assert set(objective.in_keys) <= set(moved.keys(True, True))
+    before = set(moved.keys(True))
+    torch.testing.assert_close(objective(moved).to_dict(), expected(td).to_dict())
+    torch.testing.assert_close(objective.reward(moved), expected.reward(td))
+    assert set(moved.keys(True)) == before  # nothing is written into the transitions
+    with pytest.raises(ValueError, match="not an accepted"):
+        objective.set_keys(nonsense="x")
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_the_state_dict_round_trips(name: str) -> None:
+    first, second = make_objective(name, seed=0), make_objective(name, seed=1)
+    second.load_state_dict(first.state_dict())
+    torch.testing.assert_close(first.reward(make_data()), second.reward(make_data()))
+    torch.testing.assert_close(first(make_data()).to_dict(), second(make_data()).to_dict())
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_any_batch_shape_will_do(name: str) -> None:
+    td = make_data(6)
+    flat, shaped = make_objective(name), make_objective(name)
+    torch.testing.assert_close(flat(td).to_dict(), shaped(td.view(2, 3)).to_dict())
+    torch.testing.assert_close(flat.reward(td).view(2, 3, 1), shaped.reward(td.view(2, 3)))
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_skills_that_are_switched_off_count_for_nothing(name: str) -> None:
+    prior = GrowingSkillPrior(3, num_active=2)
+    objective = make_objective(name, prior=prior)
+    td = make_data(60)
+    on = td["skill"] < 2
+    reward = objective.reward(td)
+    assert torch.isfinite(reward).all()
+    assert not reward[~on].any()
+    out = objective(td)
+    sum(out[key] for key in LOSSES[name]).backward()
+    assert all(torch.isfinite(p.grad).all() for p in objective.parameters() if p.grad is not None)
+    if name != "metra":  # whose constraint holds on all transitions
+        none = make_objective(name, prior=prior, reduction="none")(td)
+        assert not any(none[key][~on].any() for key in LOSSES[name])
+    if name in ("diayn", "dads"):
+        # Two skills that cannot be told apart are worth nothing; with log 3 they would be.
+        assert reward.max() <= math.log(2.0) + 1e-6
+    assert "prior" not in "".join(objective.state_dict())
+    prior.set_num_active(3)  # read live
+    assert objective.reward(td)[~on].any()
+
+
+def test_a_discriminator_shares_all_its_belief_among_the_skills_that_are_on() -> None:
+    td = make_data()
+    td["skill"].zero_()
+    net = make_objective("diayn").discriminator
+    masked = SkillDiscriminatorLoss(net, prior=[0.5, 0.5, 0.0], reduction="none")
+    logits = masked.discriminator(td["next"].copy())["skill_logits"]
+    expected = -logits[:, :2].log_softmax(-1)[:, 0]
+    torch.testing.assert_close(masked(td)["loss_discriminator"], expected)
+    torch.testing.assert_close(masked.reward(td).squeeze(-1), math.log(2.0) - expected)
+
+
+def test_a_prior_is_a_sequence_or_an_object_of_the_right_size() -> None:
+    td = make_data()
+    by_sequence = make_objective("diayn", prior=[2.0, 1.0, 1.0]).reward(td)
+    by_object = make_objective("diayn", prior=FixedSkillPrior(3, [2.0, 1.0, 1.0])).reward(td)
+    torch.testing.assert_close(by_sequence, by_object)
+    with pytest.raises(ValueError, match="3 skills.*over 4"):
+        make_objective("diayn", prior=FixedSkillPrior(4))
+    with pytest.raises(ValueError, match="median"):
+        make_objective("metra", reduction="median")
+    with pytest.raises(ValueError, match=r"dual_init.*-1"):
+        make_objective("metra", dual_init=-1.0)
+    with pytest.raises(ValueError, match="num_skills="):
+        METRAEncoderLoss(SkillNetwork(torch.nn.Identity(), ["x"], "representation"))
+    with pytest.raises(ValueError, match="5 skills.*3"):
+        METRAEncoderLoss(SkillEncoder(2, 3), num_skills=5)
+    with pytest.raises(ValueError, match="target_key"):
+        SkillDynamicsLoss(identity_encoder(3))
+
+
+# The reward transform
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_a_replay_buffer_scores_with_the_objective_of_today(name: str) -> None:
+    objective = make_objective(name)
+    transform = SkillReward(objective, intrinsic_coeff=2.0)
+    data = make_data()
+    buffer = ReplayBuffer(storage=LazyTensorStorage(6), transform=transform, batch_size=20)
+    buffer.extend(data.clone())
+    for _ in range(2):
+        sample = buffer.sample()
+        expected = objective.reward(sample.exclude(("next", "reward")))
+        torch.testing.assert_close(sample["next", "reward"], 2.0 * expected)
+        with torch.no_grad():
+            for p in objective.parameters():
+                p.add_(0.1)
+    assert list(transform.parameters()) == []
+    assert not transform.state_dict()
+
+
+def test_the_reward_of_the_env_is_mixed_in_on_request() -> None:
+    objective, td = make_objective("metra"), make_data()
+    td["next", "reward"] = torch.ones(6, 1)
+    out = SkillReward(objective, extrinsic_coeff=3.0)(td.clone())
+    torch.testing.assert_close(out["next", "reward"], objective.reward(td) + 3.0)
+    out = SkillReward(objective, reward_key=("agent", "bonus"))(td.clone())
+    torch.testing.assert_close(out["next", "agent", "bonus"], objective.reward(td))
+    assert out["next", "reward"].eq(1.0).all()
+    with pytest.raises(KeyError, match="SkillReward.*extrinsic_coeff=3"):
+        SkillReward(objective, extrinsic_coeff=3.0)(make_data())
+    with pytest.raises(TypeError, match="Linear"):
+        SkillReward(torch.nn.Linear(2, 2))
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_an_env_scores_each_step(name: str) -> None:
+    env = make_env(5)
+    objective = make_objective(name, num_skills=4)
+    env.append_transform(SkillReward(objective))
+    check_env_specs(env)
+    data = env.rollout(3)
+    torch.testing.assert_close(data["next", "reward"], objective.reward(data), atol=1e-6, rtol=1e-5)
+
+
+# Swapping
+
+
+class PointMass(EnvBase):
+    """Four thrusts push a point in a box of 9 x 9 tiles; walls stop it dead."""
+
+    batch_locked = False
+    directions = torch.tensor([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]])
+
+    def __init__(self, batch_size: Sequence[int] = ()) -> None:
+        super().__init__(batch_size=torch.Size(batch_size))
+        shape = self.batch_size
+        spec = {
+            "position": Bounded(0.0, 9.0, shape=(*shape, 2)),
+            "velocity": Unbounded((*shape, 2)),
+        }
+        self.observation_spec = Composite(spec, shape=shape)
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Categorical(4, shape=shape)
+        self.reward_spec = Unbounded((*shape, 1))
+        self.generator = torch.Generator()
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator.manual_seed(seed)
+
+    def _reset(self, td: TensorDictBase | None, **kwargs: Any) -> TensorDict:
+        shape = self.batch_size if td is None else td.batch_size
+        position = 9.0 * torch.rand((*shape, 2), generator=self.generator)
+        velocity = torch.zeros_like(position)
+        return TensorDict({"position": position, "velocity": velocity}, batch_size=shape)
+
+    def _step(self, td: TensorDictBase) -> TensorDict:
+        velocity = td["velocity"]
+        velocity = velocity + 0.05 * (4.0 * self.directions[td["action"]] - 2.0 * velocity)
+        free = td["position"] + 0.05 * velocity
+        position = free.clamp(0.0, 9.0)
+        never = torch.zeros((*td.batch_size, 1), dtype=torch.bool)
+        return TensorDict(
+            {
+                "position": position,
+                "velocity": torch.where(position == free, velocity, 0.0),
+                "reward": never.float(),
+                "done": never,
+                "terminated": never.clone(),
+            },
+            batch_size=td.batch_size,
+        )
+
+
+def make_env(copies: int = 16) -> TransformedEnv:
+    return TransformedEnv(
+        PointMass([copies]), Compose(SkillTransform(4, 50), DisplacementTransform())
+    )
+
+
+def make_loss(objective: SkillObjective, **kwargs: Any) -> DiscreteSkillSACLoss:
+    torch.manual_seed(0)
+    spec = Categorical(4)
+    return DiscreteSkillSACLoss(
+        SkillActor(2, spec, 4, in_keys=["velocity"]),
+        SkillCritic(4, 4, 4, in_keys=["velocity", "displacement"]),
+        objective,
+        action_space=spec,
+        **kwargs,
+    )
+
+
+@pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")
+@pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
+@pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_torchrls_sac_trainer_runs_with_another_objective_by_changing_one_object(name: str) -> None:
+    objective = make_objective(name, num_skills=4)  # the one object
+    loss = make_loss(objective)
+    collector = Collector(
+        make_env(16),
+        loss.actor_network,
+        frames_per_batch=64,
+        total_frames=192,
+        auto_register_policy_transforms=False,
+    )
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(1000), transform=SkillReward(loss.objective), batch_size=32
+    )
+    before = [p.detach().clone() for p in loss.parameters()]
+    SACTrainer(
+        collector=collector,
+        total_frames=192,
+        frame_skip=1,
+        optim_steps_per_batch=2,
+        loss_module=loss,
+        optimizer=torch.optim.Adam(loss.parameters()),
+        replay_buffer=buffer,
+        batch_size=32,
+        target_net_updater=SoftUpdate(loss, tau=0.05),
+        progress_bar=False,
+        enable_logging=False,
+    ).train()
+    still = [
+        k
+        for (k, p), old in zip(loss.named_parameters(), before, strict=True)
+        if torch.equal(p, old)
+    ]
+    assert still in ([], ["objective.encoder_params.network.2.bias"])  # phi(s') - phi(s) has none
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_no_loss_sends_gradients_into_the_parameters_of_another(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchrl.objectives.common.rl_warnings", lambda: False)
+    loss = make_loss(make_objective(name, num_skills=4), fixed_alpha=False)
+    env = make_env(16)
+    data = env.rollout(4, loss.actor_network).reshape(-1)
+    data = SkillReward(loss.objective)(data)
+    owners = {
+        "loss_actor": "actor_network_params.",
+        "loss_qvalue": "qvalue_network_params.",
+        "loss_alpha": "log_alpha",
+        **dict.fromkeys(LOSSES[name], "objective."),
+    }
+    out = loss(data)
+    assert set(out.keys()) == set(loss.out_keys)
+    assert {key for key in out.keys() if key.startswith("loss")} == set(owners)
+    for key, owner in owners.items():
+        loss.zero_grad()
+        loss(data.clone())[key].backward()
+        moved = [k for k, p in loss.named_parameters() if p.grad is not None and p.grad.any()]
+        assert moved
+        assert all(k.startswith(owner) for k in moved)
+    assert not any(out[key].requires_grad for key in out.keys() if not key.startswith("loss"))
+
+
+def test_the_loss_hands_its_skill_key_and_reduction_down_and_takes_them_over() -> None:
+    objective = make_objective("metra", num_skills=4, reduction="sum")
+    objective.set_keys(skill="z")
+    loss = make_loss(objective)
+    assert loss.tensor_keys.skill == "z"
+    assert loss.reduction == "sum"
+    loss.set_keys(skill=("agent", "z"))
+    assert objective.in_keys[0] == ("agent", "z")
+    assert ("agent", "z") in loss.in_keys
+    with pytest.raises(ValueError, match="'mean'.*'sum'"):
+        make_loss(objective, reduction="mean")
+    with pytest.raises(TypeError, match="SkillDiscriminator"):
+        make_loss(SkillDiscriminator(2, 4))
+
+
+def test_a_stranger_of_an_objective_swaps_in_too() -> None:
+    class Rightwards(SkillObjective):
+        """Skill 1 is paid for going right, skill 0 for going left; nothing to learn."""
+
+        root_features = next_features = ("position",)
+        out_keys = ["mean_step"]
+
+        def losses(self, tensordict: TensorDictBase) -> dict[str, torch.Tensor]:
+            step = tensordict["next", "position"] - tensordict["position"]
+            return {"mean_step": self._average(step.norm(dim=-1))}
+
+        def reward(self, tensordict: TensorDictBase) -> torch.Tensor:
+            step = tensordict["next", "position"] - tensordict["position"]
+            return (2.0 * tensordict["skill"].unsqueeze(-1) - 1.0) * step[..., :1]
+
+    loss = make_loss(Rightwards(2))
+    SoftUpdate(loss, tau=0.1)
+    data = SkillReward(loss.objective)(make_env(8).rollout(2, loss.actor_network).reshape(-1))
+    assert set(loss(data).keys()) == set(loss.out_keys)
+    assert "mean_step" in loss.out_keys
+
+
+def test_a_state_dict_of_the_time_before_objectives_still_loads() -> None:
+    def make(seed: int) -> DIAYNLoss:
+        torch.manual_seed(seed)
+        return DIAYNLoss(
+            SkillActor(2, Categorical(4), 3, in_keys=["velocity"]),
+            SkillCritic(2, 4, 3, in_keys=["velocity"]),
+            SkillDiscriminator(2, 3),
+            action_space="categorical",
+        )
+
+    first, second = make(0), make(1)
+    old = {
+        k.replace("objective.", "discriminator_objective.", 1): v
+        for k, v in first.state_dict().items()
+    }
+    assert any(k.startswith("discriminator_objective.") for k in old)
+    second.load_state_dict(old)
+    weight = second.discriminator.network[0].weight
+    assert torch.equal(weight, first.discriminator.network[0].weight)
+
+
+@torch.no_grad()
+def displacements(loss: DiscreteSkillSACLoss, per_skill: int = 64) -> torch.Tensor:
+    """Returns the skills' mean displacements ``[4, 2]`` after 50 steps."""
+    env, policy = make_env(4 * per_skill), SkillPolicy(loss.actor_network)
+    env.set_seed(123)
+    skill = torch.arange(4).repeat_interleave(per_skill)
+    td = env.reset(TensorDict(skill=skill, batch_size=[4 * per_skill]))
+    end = env.rollout(50, policy, auto_reset=False, tensordict=td)[:, -1]["next"]
+    return end["displacement"].view(4, per_skill, 2).mean(1)
+
+
+def train(loss: DiscreteSkillSACLoss, make: Callable[[int], EnvBase], batches: int) -> None:
+    """Trains a loss the plain way: 64 base steps, then two updates."""
+    env = make(32)
+    env.set_seed(0)
+    torch.manual_seed(0)
+    reward = SkillReward(loss.objective, intrinsic_coeff=2.0)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(20_000), transform=reward, batch_size=128)
+    policy, updater = SkillPolicy(loss.actor_network), SoftUpdate(loss, tau=0.05)
+    optimizer = torch.optim.Adam(
+        [
+            {"params": list(loss.actor_network_params.parameters()), "lr": 2e-3},
+            {"params": list(loss.qvalue_network_params.parameters()), "lr": 3e-3},
+            {"params": list(loss.objective.parameters()), "lr": 1e-2},
+        ],
+        fused=True,
+    )
+    td = env.reset()
+    for _ in range(batches):
+        for _ in range(2):
+            with torch.no_grad():
+                stepped, td = env.step_and_maybe_reset(policy(td))
+            buffer.extend(stepped.select(*loss.in_keys, strict=False))
+        for _ in range(2):
+            out = loss(buffer.sample())
+            optimizer.zero_grad()
+            sum(value for key, value in out.items() if key.startswith("loss")).backward()
+            optimizer.step()
+            updater.step()
+
+
+def test_metra_makes_skills_travel_apart_within_a_short_run() -> None:
+    torch.manual_seed(0)
+    loss = make_loss(METRAEncoderLoss(SkillEncoder(2, 4)))
+    before = displacements(loss)
+    train(loss, make_env, batches=100)
+    after = displacements(loss)
+    spread = (after - after.mean(0)).norm(dim=-1).mean()
+    assert spread > 3.0 * (before - before.mean(0)).norm(dim=-1).mean()
+    assert spread > 1.0

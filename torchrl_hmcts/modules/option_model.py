@@ -1,0 +1,276 @@
+"""A learned model of options: where an option leads, what it earns and how long it takes.
+
+Letters: *B batch of the tensordict, K members of the ensemble, D predicted state numbers in all.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor, nn
+
+from torchrl_hmcts.modules.skill_mlp import check_positive, key_list
+
+
+class OptionModel(TensorDictModuleBase):
+    r"""Predicts the outcome of an option: the model of an SMDP, as an ensemble of networks.
+
+    From state :math:`s` and option :math:`o`, each member predicts the change of some state
+    entries, the discounted reward, the base steps taken, and how likely the episode ends by itself:
+
+    .. math:: \hat s' = s + \mu + \sigma f_s(s, o), \quad \hat R(s, o), \quad \hat k(s, o), \quad
+        \hat p(s, o) = \operatorname{sigmoid} f_p(s, o)
+
+    with :math:`\mu, \sigma` mean and standard deviation in the data (:meth:`fit_normalization`),
+    so that all outputs are of order 1. What is written is the mean over the members; their
+    disagreement about :math:`s'` tells where data were missing. Entries that are not named in
+    ``delta_keys`` are not predicted: an :class:`OptionModelEnv` carries them over.
+
+    Args:
+        make_network (callable): ``make_network(out_features) -> nn.Module``, called once for each
+            member. The module is called with the entries ``in_keys`` in order and returns ``[*B,
+            out_features]``, with ``out_features`` = D + 3. All members must be built alike; their
+            parameters are stacked and they run as one.
+        in_keys (sequence of NestedKey): entries the networks read, the option among them if it is
+            one of their inputs.
+        delta_keys (mapping): the state entries that are predicted, and the shape of each without
+            the batch (an int for one dimension), e.g. ``{"position": 2, "velocity": 2}``. Integer
+            entries are predicted as real numbers.
+        max_duration (int): base steps an option takes at most; predictions lie in 1 to this.
+        num_models (int): members of the ensemble, K. Default 1: no disagreement is known.
+        features (TensorDictModuleBase, optional): run before the networks, once for all members;
+            what it writes can be named in ``in_keys``. It has no part in the ensemble, but is a
+            sub-module. Default: none.
+        reward_key, duration_key, terminated_key (NestedKey): names of the outcomes, under
+            ``"next"``. Defaults ``"reward"``, ``"duration"``, ``"terminated"``.
+        probability_key, disagreement_key (NestedKey): names of two further outputs. Defaults
+            ``"terminated_probability"`` and ``"disagreement"``.
+
+    Writes (under ``"next"``): the predicted state entries; the reward and the duration (float
+    ``[*B, 1]``, base steps); terminated (bool ``[*B, 1]``, probability above one half); the
+    probability (float ``[*B, 1]``) and the disagreement (float ``[*B, 1]``: standard deviation
+    over the members, in units of :math:`\sigma`, root of the mean square over the D numbers).
+
+    Raises:
+        ValueError: if a number is not positive, no key is given, or the members differ in their
+            parameters.
+
+    Reference:
+        Models of options: Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999, section 3.
+        Ensembles: Chua et al., "Deep Reinforcement Learning in a Handful of Trials using
+        Probabilistic Dynamics Models", 2018, arXiv 1805.12114.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.modules import OptionModel, SkillMLP
+        >>> model = OptionModel(lambda n: SkillMLP(2, n, num_skills=4), ["position", "option"],
+        ...                     {"position": 2}, max_duration=25, num_models=3)
+        >>> td = TensorDict(position=torch.zeros(5, 2), option=torch.zeros(5, dtype=torch.int64),
+        ...                 batch_size=[5])
+        >>> td = model(td)
+        >>> td["next", "position"].shape, td["next", "duration"].shape
+        (torch.Size([5, 2]), torch.Size([5, 1]))
+    """
+
+    output_mean: Tensor
+    output_scale: Tensor
+
+    def __init__(
+        self,
+        make_network: Callable[[int], nn.Module],
+        in_keys: Sequence[NestedKey],
+        delta_keys: Mapping[NestedKey, int | Sequence[int]],
+        *,
+        max_duration: int,
+        num_models: int = 1,
+        features: TensorDictModuleBase | None = None,
+        reward_key: NestedKey = "reward",
+        duration_key: NestedKey = "duration",
+        terminated_key: NestedKey = "terminated",
+        probability_key: NestedKey = "terminated_probability",
+        disagreement_key: NestedKey = "disagreement",
+    ) -> None:
+        super().__init__()
+        check_positive("OptionModel", max_duration=max_duration, num_models=num_models)
+        if not delta_keys:
+            raise ValueError(
+                "OptionModel needs the state entries that an option changes; delta_keys is empty. "
+                'Pass e.g. delta_keys={"position": 2}.'
+            )
+        self.network_keys = key_list("OptionModel", in_keys)
+        self.delta_keys: dict[NestedKey, tuple[int, ...]] = {
+            unravel_key(key): (shape,) if isinstance(shape, int) else tuple(shape)
+            for key, shape in delta_keys.items()
+        }
+        self.num_deltas = sum(math.prod(shape) for shape in self.delta_keys.values())
+        self.num_models = num_models
+        self.max_duration = max_duration
+        self.reward_key = unravel_key(reward_key)
+        self.duration_key = unravel_key(duration_key)
+        self.terminated_key = unravel_key(terminated_key)
+        self.probability_key = unravel_key(probability_key)
+        self.disagreement_key = unravel_key(disagreement_key)
+        self.features = features
+        read = [] if features is None else list(features.in_keys)
+        made = [] if features is None else [unravel_key(key) for key in features.out_keys]
+        read += [key for key in self.network_keys if key not in made]
+        self.in_keys = list(dict.fromkeys([*map(unravel_key, read), *self.delta_keys]))
+        self.out_keys = [
+            ("next", *((key,) if isinstance(key, str) else key))
+            for key in (
+                *self.delta_keys,
+                self.reward_key,
+                self.duration_key,
+                self.terminated_key,
+                self.probability_key,
+                self.disagreement_key,
+            )
+        ]
+        networks = [make_network(self.num_deltas + 3) for _ in range(num_models)]
+        if len({id(network) for network in networks}) < num_models:
+            raise ValueError(
+                "OptionModel calls make_network once for each member of the ensemble; it returned "
+                "the same module twice. Build a new one at each call."
+            )
+        try:
+            self.network_params = TensorDictParams(TensorDict.from_modules(*networks))
+        except (RuntimeError, KeyError) as error:
+            raise ValueError(
+                "OptionModel stacks the parameters of its members, so make_network must build them "
+                f"alike: {error}"
+            ) from error
+        # Not a sub-module: it lends its structure, the parameters are put in stacked.
+        self.__dict__["network"] = networks[0]
+        # Of changes, reward and duration; the change of nothing is known until there are data.
+        self.register_buffer("output_mean", torch.zeros(self.num_deltas + 2))
+        self.register_buffer("output_scale", torch.ones(self.num_deltas + 2))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        predicted = self.predict(tensordict)
+        after = tensordict.get("next", None)
+        return tensordict.set("next", predicted if after is None else after.update(predicted))
+
+    def predict(self, tensordict: TensorDictBase) -> TensorDict:
+        """Predict outcomes as :meth:`forward` writes them, without its ``"next"``."""
+        members = self.outputs(tensordict)  # [K, *B, D + 3]
+        mean, size = members.mean(0), self.num_deltas
+        probability = members[..., -1:].sigmoid().mean(0)
+        values = mean[..., :-1] * self.output_scale + self.output_mean
+        if self.num_models > 1:
+            spread = members[..., :size].std(0, correction=0)
+            disagreement = spread.square().mean(-1, keepdim=True).sqrt()
+        else:
+            disagreement = torch.zeros_like(probability)
+        out = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
+        shape, begin = tensordict.batch_size, 0
+        for key, event in self.delta_keys.items():
+            end = begin + math.prod(event)
+            out.set(key, tensordict.get(key) + values[..., begin:end].reshape((*shape, *event)))
+            begin = end
+        out.set(self.reward_key, values[..., size : size + 1])
+        out.set(self.duration_key, values[..., size + 1 :].clamp(1.0, float(self.max_duration)))
+        out.set(self.terminated_key, probability > 0.5)
+        out.set(self.probability_key, probability)
+        out.set(self.disagreement_key, disagreement)
+        return out
+
+    def outputs(self, tensordict: TensorDictBase) -> Tensor:
+        """Return what the networks say, ``[K, *B, D + 3]``.
+
+        Normalised changes, reward and duration, then the logit of an end of the episode.
+        """
+        td = tensordict
+        if self.features is not None:
+            td = self.features(td.select(*self.features.in_keys))
+        inputs = []
+        for key in self.network_keys:
+            value = td.get(key, None)
+            inputs.append(tensordict.get(key) if value is None else value)
+        if self.num_models == 1:
+            outputs: Tensor = self._run(self.network_params[0], *inputs).unsqueeze(0)
+        else:
+            in_dims = (0, *[None] * len(inputs))
+            outputs = torch.vmap(self._run, in_dims, randomness="different")(
+                self.network_params, *inputs
+            )
+        shape = (self.num_models, *tensordict.batch_size, self.num_deltas + 3)
+        if outputs.shape != torch.Size(shape):
+            raise ValueError(
+                f"The networks of OptionModel must return {list(shape[1:])} for a batch "
+                f"{list(tensordict.batch_size)}; got {list(outputs.shape[1:])}. Their last layer "
+                f"needs the out_features that make_network is called with."
+            )
+        return outputs
+
+    def _run(self, params: TensorDictBase, *inputs: Tensor) -> Tensor:
+        with params.to_module(self.network):
+            out: Tensor = self.network(*inputs)
+        return out
+
+    def targets(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        reward_key: NestedKey | None = None,
+        duration_key: NestedKey | None = None,
+        terminated_key: NestedKey | None = None,
+        normalized: bool = True,
+    ) -> Tensor:
+        """Return what :meth:`outputs` should be for recorded transitions, ``[*B, D + 3]``.
+
+        Args:
+            tensordict: macro transitions: root entries and ``"next"``.
+            reward_key, duration_key, terminated_key: where the outcomes are, under ``"next"``.
+                Default: the model's names.
+            normalized: subtract the mean and divide by the scale. Default ``True``.
+        """
+        after, shape = tensordict.get("next"), tensordict.batch_size
+        parts = [
+            (after.get(key) - tensordict.get(key)).reshape((*shape, -1)) for key in self.delta_keys
+        ]
+        parts.append(after.get(reward_key or self.reward_key).reshape((*shape, 1)))
+        parts.append(after.get(duration_key or self.duration_key).reshape((*shape, 1)))
+        dtype = self.output_mean.dtype
+        values = torch.cat([part.to(dtype) for part in parts], -1)
+        if normalized:
+            values = (values - self.output_mean) / self.output_scale
+        terminated = after.get(terminated_key or self.terminated_key)
+        return torch.cat((values, terminated.reshape((*shape, 1)).to(dtype)), -1)
+
+    @torch.no_grad()
+    def fit_normalization(self, tensordict: TensorDictBase) -> OptionModel:
+        """Take mean and standard deviation of the outputs from recorded transitions ``[*B]``.
+
+        An output that never varies (the duration of options of a fixed length) keeps scale 1: what
+        it always was is then what an untrained network predicts. Call it before training; the
+        meaning of the networks' outputs changes with it.
+        """
+        values = self.targets(tensordict, normalized=False).flatten(0, -2)[:, :-1]
+        if len(values) < 2:
+            raise ValueError(
+                f"fit_normalization needs at least 2 transitions; got {len(values)}. Record some "
+                f"with a TorchRL collector over the macro env."
+            )
+        scale = values.std(0)
+        self.output_mean.copy_(values.mean(0))
+        self.output_scale.copy_(torch.where(scale > 1e-6, scale, 1.0))
+        return self
+
+    def member(self, index: int) -> OptionModel:
+        """Return a copy with one member only, to see what the ensemble is good for."""
+        if not 0 <= index < self.num_models:
+            raise ValueError(
+                f"OptionModel has the members 0 to {self.num_models - 1}; got index {index}."
+            )
+        model = copy.deepcopy(self)
+        model.num_models = 1
+        params = self.network_params[index : index + 1].detach().clone()
+        model.network_params = TensorDictParams(params)
+        return model

@@ -1,0 +1,208 @@
+"""The loss that trains a model of options from recorded macro transitions.
+
+Letters: *B batch of the tensordict, K members of the ensemble, D predicted state numbers in all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torch.nn import functional as F
+from torchrl.objectives import LossModule, distance_loss
+
+from torchrl_hmcts.modules.option_model import OptionModel
+from torchrl_hmcts.objectives.skill_objective import check_reduction
+
+
+class OptionModelLoss(LossModule):
+    r"""Regression of an option's outcome on recorded macro transitions, for every member.
+
+    With normalised targets :math:`y` (see :meth:`OptionModel.targets`), predictions
+    :math:`f^j` of member j, and the member's share :math:`m_j` of the transition,
+
+    .. math:: L = \frac 1 K \sum_j m_j \big[ \tfrac{c_s}{D} \sum_{d \le D} \ell_s(f^j_d, y_d)
+        + c_R\, \ell_R(f^j_R, y_R) + c_k\, \ell_k(f^j_k, y_k)
+        + c_p\, \mathrm{BCE}(f^j_p, y_p) \big]
+
+    Members differ by their first weights and, if the data hold ``bootstrap_mask``, by which
+    transitions each of them learns from; store such a mask with the data, so that a member never
+    sees what it is to be surprised by.
+
+    An option that the time limit cut short has no true outcome: leave such transitions out (those
+    with ``truncated`` and fewer base steps than the option would have taken).
+
+    Args:
+        model (OptionModel): what is trained; it stays a sub-module as it is.
+        delta_loss, reward_loss, duration_loss (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``
+            (Huber). Defaults ``"smooth_l1"``, ``"l2"`` and ``"smooth_l1"``: the outcome at a
+            corner is one of two, of which Huber's loss favours the likelier while the square
+            prefers a place between them; a sparse reward is to be met in the mean.
+        delta_coeff, reward_coeff, duration_coeff, terminated_coeff (float): :math:`c_s, c_R, c_k,
+            c_p`, the weights of the parts. Default 1 each.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` over the batch.
+
+    Returns:
+        TensorDict with ``loss_delta``, ``loss_reward``, ``loss_duration``, ``loss_terminated``,
+        and detached ``delta_error`` (mean absolute error of the normalised changes, over members)
+        and ``terminated_accuracy``; with ``reduction="none"`` all ``[*B]``.
+
+    Raises:
+        ValueError: if the reduction, a loss or a weight is not usable.
+
+    Keys (``set_keys``): ``reward``, ``duration``, ``terminated`` (under ``"next"``; defaults: the
+    model's), ``bootstrap_mask`` (``[*B, K]``, any number >= 0, read if it is there; default
+    ``"bootstrap_mask"``), ``priority_weight``.
+
+    Reference:
+        Bootstrapped ensembles: Chua et al. 2018, arXiv 1805.12114; masks: Osband et al., "Deep
+        Exploration via Bootstrapped DQN", 2016, arXiv 1602.04621.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.modules import OptionModel, SkillMLP
+        >>> from torchrl_hmcts.objectives import OptionModelLoss
+        >>> model = OptionModel(lambda n: SkillMLP(2, n, num_skills=4), ["position", "option"],
+        ...                     {"position": 2}, max_duration=25, num_models=3)
+        >>> after = TensorDict(position=torch.ones(6, 2), reward=torch.zeros(6, 1),
+        ...                    duration=torch.full((6, 1), 25),
+        ...                    terminated=torch.zeros(6, 1, dtype=torch.bool), batch_size=[6])
+        >>> td = TensorDict(position=torch.zeros(6, 2), option=torch.zeros(6, dtype=torch.int64),
+        ...                 next=after, batch_size=[6])
+        >>> [key for key in OptionModelLoss(model.fit_normalization(td))(td).keys()]
+        ['loss_delta', 'loss_reward', 'loss_duration', 'loss_terminated', 'delta_error',
+         'terminated_accuracy']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        reward: NestedKey = "reward"
+        duration: NestedKey = "duration"
+        terminated: NestedKey = "terminated"
+        bootstrap_mask: NestedKey = "bootstrap_mask"
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = [
+        "loss_delta",
+        "loss_reward",
+        "loss_duration",
+        "loss_terminated",
+        "delta_error",
+        "terminated_accuracy",
+    ]
+
+    model: OptionModel
+    delta_coeff: Tensor
+    reward_coeff: Tensor
+    duration_coeff: Tensor
+    terminated_coeff: Tensor
+
+    def __init__(
+        self,
+        model: OptionModel,
+        *,
+        delta_loss: str = "smooth_l1",
+        reward_loss: str = "l2",
+        duration_loss: str = "smooth_l1",
+        delta_coeff: float = 1.0,
+        reward_coeff: float = 1.0,
+        duration_coeff: float = 1.0,
+        terminated_coeff: float = 1.0,
+        reduction: str = "mean",
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        super().__init__()
+        check_reduction(type(self).__name__, reduction)
+        for name, loss in (
+            ("delta", delta_loss),
+            ("reward", reward_loss),
+            ("duration", duration_loss),
+        ):
+            if loss not in ("l1", "l2", "smooth_l1"):
+                raise ValueError(
+                    f"OptionModelLoss has the losses 'l1', 'l2' and 'smooth_l1'; got "
+                    f"{name}_loss={loss!r}."
+                )
+        self.model = model
+        self.delta_loss = delta_loss
+        self.reward_loss = reward_loss
+        self.duration_loss = duration_loss
+        self.reduction = reduction
+        for name, coeff in (
+            ("delta_coeff", delta_coeff),
+            ("reward_coeff", reward_coeff),
+            ("duration_coeff", duration_coeff),
+            ("terminated_coeff", terminated_coeff),
+        ):
+            if not coeff >= 0.0:
+                raise ValueError(f"OptionModelLoss needs {name} >= 0, a weight; got {coeff}.")
+            self.register_coeff_buffer(name, float(coeff))
+        self.set_keys(
+            reward=model.reward_key, duration=model.duration_key, terminated=model.terminated_key
+        )
+
+    _in_keys: Any  # list of keys, or None until it is known
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        outcome = [*self.model.delta_keys, keys.reward, keys.duration, keys.terminated]
+        self._in_keys = [*self.model.in_keys, *(unravel_key(("next", key)) for key in outcome)]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            self._set_in_keys()
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        self._in_keys = None
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        keys, size = self.tensor_keys, self.model.num_deltas
+        outputs = self.model.outputs(tensordict)  # [K, *B, D + 3]
+        target = self.model.targets(
+            tensordict,
+            reward_key=keys.reward,
+            duration_key=keys.duration,
+            terminated_key=keys.terminated,
+        ).expand_as(outputs)
+        mask = tensordict.get(keys.bootstrap_mask, None)
+        share = None if mask is None else mask.movedim(-1, 0).to(outputs.dtype)  # [K, *B]
+
+        def distance(part: slice | int, kind: str) -> Tensor:
+            return distance_loss(outputs[..., part], target[..., part], kind)
+
+        parts = {
+            "loss_delta": distance(slice(size), self.delta_loss).mean(-1) * self.delta_coeff,
+            "loss_reward": distance(size, self.reward_loss) * self.reward_coeff,
+            "loss_duration": distance(size + 1, self.duration_loss) * self.duration_coeff,
+            "loss_terminated": self.terminated_coeff
+            * F.binary_cross_entropy_with_logits(
+                outputs[..., -1], target[..., -1], reduction="none"
+            ),
+        }
+        weights = self._maybe_get_priority_weight(tensordict)
+        batch_size = tensordict.batch_size if self.reduction == "none" else torch.Size([])
+        out = TensorDict({}, batch_size=batch_size)
+        for name, part in parts.items():
+            shared = (part if share is None else part * share).mean(0)
+            out.set(name, self._reduce_loss(shared, tensordict=tensordict, weights=weights))
+        with torch.no_grad():
+            errors = (outputs - target)[..., :size].abs().mean(-1).mean(0)
+            hits = ((outputs[..., -1] > 0) == (target[..., -1] > 0.5)).to(outputs.dtype).mean(0)
+        for name, value in (("delta_error", errors), ("terminated_accuracy", hits)):
+            out.set(name, value if self.reduction == "none" else value.mean())
+        return out

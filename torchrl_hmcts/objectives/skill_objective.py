@@ -1,0 +1,182 @@
+"""What makes skills different: a representation, its loss, and the reward it gives."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
+
+
+class SkillObjective(LossModule):
+    r"""Base class of skill objectives: the loss of a representation and the reward it gives.
+
+    .. math:: L(\phi; s, z, s'), \qquad r_\phi(s, z, s')
+
+    An objective is everything in which one method of skill discovery differs from another. A
+    :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` trains it beside actor and critics, a
+    :class:`~torchrl_hmcts.transforms.SkillReward` writes its reward; both take any objective.
+
+    Sub-classes define :meth:`losses`, :meth:`reward` and three attributes: ``root_features`` and
+    ``next_features``, the entries they read of the state before and after a transition, and
+    ``out_keys``. Gradients of the losses stay within the objective's own parameters.
+
+    Args:
+        num_skills (int): number of skills ``Z``.
+        prior (SkillPrior, sequence of float or Tensor, optional): p(z), ``[Z]``, normalised; 0
+            switches a skill off. Default ``None``: uniform. A
+            :class:`~torchrl_hmcts.modules.SkillPrior` is read at every use and stays its owner's.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
+
+    Returns:
+        TensorDict with the entries ``loss_*`` of the objective and detached diagnostics; with
+        ``reduction="none"`` all are ``[*B]``.
+
+    Raises:
+        ValueError: if the reduction is unknown or the prior is not over ``num_skills`` skills.
+
+    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``priority_weight``
+    (default ``"priority_weight"``).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.objectives import SkillObjective
+        >>> class GoWhereTheSkillSays(SkillObjective):
+        ...     root_features = next_features = ["x"]
+        ...     out_keys = []
+        ...     def losses(self, tensordict):
+        ...         return {}
+        ...     def reward(self, tensordict):
+        ...         sign = 2 * tensordict["skill"].unsqueeze(-1) - 1
+        ...         return sign * (tensordict["next", "x"] - tensordict["x"])
+        >>> objective = GoWhereTheSkillSays(2)
+        >>> td = TensorDict(x=torch.zeros(2, 1), skill=torch.tensor([0, 1]),
+        ...                 next=TensorDict(x=torch.ones(2, 1), batch_size=[2]), batch_size=[2])
+        >>> objective.reward(td).flatten().tolist()
+        [-1.0, 1.0]
+        >>> objective.in_keys
+        ['skill', 'x', ('next', 'x')]
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        skill: NestedKey = "skill"
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    #: Names of the entries that :meth:`losses` returns, in order.
+    out_keys: list[str]
+    #: Entries that are read of the state before a transition.
+    root_features: Sequence[NestedKey]
+    #: Entries that are read of the state after a transition, without ``"next"``.
+    next_features: Sequence[NestedKey]
+
+    def __init__(
+        self,
+        num_skills: int,
+        *,
+        prior: SkillPrior | Sequence[float] | Tensor | None = None,
+        reduction: str = "mean",
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        super().__init__()
+        name = type(self).__name__
+        check_reduction(name, reduction)
+        self.reduction = reduction
+        self.num_skills = int(num_skills)
+        # Past nn.Module.__setattr__: a prior is saved and trained by its owner.
+        self.__dict__["prior"] = as_skill_prior(name, prior, num_skills)
+        # A fixed prior that switches nothing off costs nothing below.
+        fixed = not isinstance(prior, SkillPrior)
+        self._always_all_active = fixed and bool(self.prior.active().all())
+
+    prior: SkillPrior
+    _in_keys: Any  # list of keys, or None until it is known
+
+    def log_prior(self, like: Tensor) -> Tensor:
+        """Returns log p(z) as it is now, ``[Z]``, detached, of the type and device of ``like``."""
+        return self.prior.log_probs().detach().to(like)
+
+    def inactive(self) -> Tensor | None:
+        """Returns which skills are switched off, bool ``[Z]``; None if all are on for good."""
+        return None if self._always_all_active else ~self.prior.active()
+
+    @abstractmethod
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Returns the reduced ``loss_*`` entries and detached diagnostics of transitions."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def reward(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the intrinsic reward ``[*B, 1]`` of transitions ``[*B]``, detached."""
+        raise NotImplementedError
+
+    def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+    def _average(self, diagnostic: Tensor) -> Tensor:
+        diagnostic = diagnostic.detach()
+        return diagnostic if self.reduction == "none" else diagnostic.mean()
+
+    def _set_in_keys(self) -> None:
+        after = [("next", key) for key in self.next_features]
+        keys = [self.tensor_keys.skill, *self.root_features, *after]
+        self._in_keys = [unravel_key(key) for key in keys]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            self._set_in_keys()
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        batch_size = tensordict.batch_size if self.reduction == "none" else torch.Size([])
+        out = TensorDict(self.losses(tensordict), batch_size=batch_size)
+        own = [key for key in self._modules if key.endswith("_params")]
+        self._clear_weakrefs(tensordict, out, *own)
+        return out
+
+
+def check_reduction(owner: str, reduction: str) -> None:
+    """Raises ValueError unless the reduction is one TorchRL knows."""
+    if reduction not in ("none", "mean", "sum"):
+        raise ValueError(
+            f"{owner} reduces its losses over the batch by 'mean', 'sum' or 'none'; got "
+            f"reduction={reduction!r}."
+        )
+
+
+def known_num_skills(owner: str, module: torch.nn.Module, num_skills: int | None) -> int:
+    """Returns the number of skills of a module, or the given one where it does not say."""
+    known = getattr(module, "num_skills", None)
+    if num_skills is None:
+        num_skills = known
+    if num_skills is None:
+        raise ValueError(
+            f"{owner} cannot tell how many skills {type(module).__name__} distinguishes, since it "
+            "has no attribute num_skills. Pass num_skills=."
+        )
+    if known is not None and known != num_skills:
+        raise ValueError(
+            f"{owner} was told of {num_skills} skills, but its {type(module).__name__} "
+            f"distinguishes {known}. Give both the same num_skills."
+        )
+    return num_skills

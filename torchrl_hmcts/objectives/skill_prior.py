@@ -1,0 +1,189 @@
+"""The loss of a learned distribution over skills."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_hmcts.modules.skill_prior import SkillPrior
+from torchrl_hmcts.objectives.skill_objective import check_reduction
+
+
+class SkillPriorLoss(LossModule):
+    r"""Moves p(z) to the skills whose intrinsic reward is high, held apart by an entropy bonus.
+
+    .. math::
+
+        L(\psi) = -\sum_z p_\psi(z)\, \bar r(z) - \beta\, H(p_\psi), \qquad
+        \bar r(z) = \mathbb{E}\bigl[\log q(z \mid s') \,\big|\, z\bigr]
+
+    With :math:`\beta = 1` that is minus the mutual information of skill and state, the objective of
+    variational intrinsic control. The gradient is exact: skills are few, so the sum over them is
+    written out, and :math:`\bar r(z)` is a running mean over the transitions of each skill. (It is
+    the expectation of the score-function gradient of that paper, without its variance, and
+    right as well for transitions whose skill an earlier p(z) drew.) The minimum is
+
+    .. math:: p(z) \propto \exp\bigl(\bar r(z) / \beta\bigr)
+
+    Why not always learn it: a skill that is drawn more often is trained more, becomes easier to
+    tell and is drawn more often still, until one or a few are left. The authors of DIAYN fix p(z)
+    for that reason. :math:`\beta > 1` pulls towards uniform; :math:`\beta \to \infty` is DIAYN.
+
+    Args:
+        prior (SkillPrior): the prior to train, e.g. a
+            :class:`~torchrl_hmcts.modules.LearnedSkillPrior`. Its parameters are this loss's. Give
+            the same object to the :class:`~torchrl_hmcts.transforms.SkillTransform` and to the
+            skill objective.
+        entropy_coeff (float): :math:`\beta`, not negative, in units of reward. Default ``1.0``.
+        prior_in_reward (bool): the reward that is read contains ``-log p(z)``, as DIAYN's and VIC's
+            do; it is taken out, since the entropy stands for it. Pass ``False`` for a reward
+            without it, e.g. METRA's. Default ``True``.
+        decay (float): share of the old running mean that a batch keeps, in ``[0, 1)``. Default
+            ``0.9``; 0 looks at the latest batch only. In eval mode the mean stays.
+        reduction (str): over skills: ``"sum"`` (default) is L above; ``"none"`` gives its terms,
+            ``[Z]``; ``"mean"`` is L / Z.
+
+    Returns:
+        TensorDict with ``loss_skill_prior`` and the detached ``skill_prior_entropy`` (nats) and
+        ``num_effective_skills`` (its exponential, between 1 and ``Z``).
+
+    Raises:
+        ValueError: if the prior has nothing to train, or a number is out of its range.
+
+    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``reward`` (float
+    ``[*B, 1]``, read from ``"next"``, default ``"reward"``).
+
+    Reference:
+        Gregor, Rezende and Wierstra, "Variational Intrinsic Control", 2016, arXiv 1611.07507,
+        algorithm 1; Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070 (why p(z)
+        is fixed there).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.modules import LearnedSkillPrior
+        >>> from torchrl_hmcts.objectives import SkillPriorLoss
+        >>> prior = LearnedSkillPrior(2)
+        >>> loss = SkillPriorLoss(prior, prior_in_reward=False)
+        >>> td = TensorDict(skill=torch.tensor([0, 1]),
+        ...                 next=TensorDict(reward=torch.tensor([[0.0], [-1.0]]), batch_size=[2]),
+        ...                 batch_size=[2])
+        >>> optimizer = torch.optim.SGD(loss.parameters(), lr=1.0)
+        >>> for _ in range(50):
+        ...     optimizer.zero_grad()
+        ...     loss(td)["loss_skill_prior"].backward()
+        ...     optimizer.step()
+        >>> prior.probs().detach(), torch.tensor([0.0, -1.0]).softmax(-1)
+        (tensor([0.7311, 0.2689]), tensor([0.7311, 0.2689]))
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        skill: NestedKey = "skill"
+        reward: NestedKey = "reward"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_skill_prior", "skill_prior_entropy", "num_effective_skills"]
+
+    mean_reward: Tensor  # [Z] running mean of the reward, without -log p(z)
+    seen: Tensor  # bool [Z]
+
+    def __init__(
+        self,
+        prior: SkillPrior,
+        *,
+        entropy_coeff: float = 1.0,
+        prior_in_reward: bool = True,
+        decay: float = 0.9,
+        reduction: str = "sum",
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        super().__init__()
+        check_reduction("SkillPriorLoss", reduction)
+        if not any(p.requires_grad for p in prior.parameters()):
+            raise ValueError(
+                f"SkillPriorLoss trains the parameters of a prior; {type(prior).__name__} has none "
+                "to train. Pass a LearnedSkillPrior."
+            )
+        if not entropy_coeff >= 0.0:
+            raise ValueError(
+                "SkillPriorLoss rewards entropy, so entropy_coeff must not be negative; got "
+                f"{entropy_coeff}."
+            )
+        if not 0.0 <= decay < 1.0:
+            raise ValueError(
+                f"SkillPriorLoss keeps a share decay in [0, 1) of its running mean; got {decay}."
+            )
+        self.prior = prior
+        self.num_skills = prior.num_skills
+        self.entropy_coeff = float(entropy_coeff)
+        self.prior_in_reward = bool(prior_in_reward)
+        self.decay = float(decay)
+        self.reduction = reduction
+        self.register_buffer("mean_reward", torch.zeros(self.num_skills))
+        self.register_buffer("seen", torch.zeros(self.num_skills, dtype=torch.bool))
+
+    _in_keys: Any  # list of keys, or None until it is known
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            self._in_keys = [unravel_key(keys.skill), unravel_key(("next", keys.reward))]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        self._in_keys = None  # set_keys was called
+
+    @torch.no_grad()
+    def _remember(self, tensordict: TensorDictBase) -> None:
+        """Moves the running means of the skills that occur in a batch."""
+        skill = tensordict.get(self.tensor_keys.skill).flatten()
+        reward = tensordict.get(("next", self.tensor_keys.reward)).flatten()
+        on = self.prior.active()[skill]  # a skill that is switched off has log p(z) = -inf
+        skill, reward = skill[on], reward[on].to(self.mean_reward)
+        if self.prior_in_reward:
+            reward = reward + self.prior.log_probs().to(reward)[skill]
+        count = torch.zeros_like(self.mean_reward).index_add_(0, skill, torch.ones_like(reward))
+        total = torch.zeros_like(self.mean_reward).index_add_(0, skill, reward)
+        batch_mean = total / count.clamp_min(1.0)
+        moved = self.mean_reward.lerp(batch_mean, 1.0 - self.decay)
+        moved = torch.where(self.seen, moved, batch_mean)
+        present = count > 0
+        self.mean_reward.copy_(torch.where(present, moved, self.mean_reward))
+        self.seen.logical_or_(present)
+
+    def skill_rewards(self) -> Tensor:
+        """Returns the running mean reward of each skill, ``[Z]``; unseen ones count as average."""
+        known = self.mean_reward[self.seen]
+        average = known.mean() if known.numel() else self.mean_reward.new_zeros(())
+        return torch.where(self.seen, self.mean_reward, average)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.training:
+            self._remember(tensordict)
+        probs = self.prior.probs()  # [Z]
+        entropy = torch.special.entr(probs)  # [Z], summands
+        terms = -probs * self.skill_rewards().to(probs) - self.entropy_coeff * entropy
+        nats = entropy.detach().sum()
+        return TensorDict(
+            {
+                "loss_skill_prior": self._reduce_loss(terms),
+                "skill_prior_entropy": nats,
+                "num_effective_skills": nats.exp(),
+            },
+            batch_size=[],
+        )

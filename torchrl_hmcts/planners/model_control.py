@@ -1,0 +1,134 @@
+"""Acting in one env while planning in a model of it.
+
+Letters: *B batch of the tensordict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
+
+from torchrl_hmcts.planners.control import HierarchicalPolicy
+from torchrl_hmcts.planners.mcts import MCTSPlanner
+
+StateMap = Callable[[TensorDictBase], TensorDictBase]
+
+
+class ModelBasedControl(TensorDictModuleBase):
+    r"""Acts in an env that cannot be set to a state, by planning in a model that can.
+
+    Before every decision the model's state is made from what the real env shows,
+
+    .. math:: \hat s = \mathrm{map}(o), \qquad \text{option} = \mathrm{plan}(\hat s),
+
+    and the option is carried out in the real env, which is under an
+    :class:`~torchrl_hmcts.transforms.OptionTransform` with the same worker. The plan's first option
+    ends somewhere else than the model predicted, so that by default a new plan is made after every
+    option.
+
+    Args:
+        planner (MCTSPlanner): over the model, a macro env that can be set to any state.
+        state_map (callable, optional): ``state_map(td) -> TensorDict [*B]`` of what the planner
+            reads (its ``in_keys``), from the entries of the real env. Default: the real env writes
+            them itself, and they are taken as they are.
+        env (EnvBase, optional): the real macro env, checked once against the model's options.
+        replan_every (int, optional): options after which to plan again. Default 1; None for the
+            plan's end.
+        max_plan_length (int): as of :class:`HierarchicalPolicy`. Default 64.
+
+    Writes: the option, and the plan as :class:`HierarchicalPolicy` does.
+
+    Raises:
+        ValueError: if the real env has other options than the model; at a call if the mapped state
+            lacks an entry, or has another batch size.
+
+    Reference:
+        Dissertation, section 4.2 (plan in a simulation, carry out in the environment).
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner, ModelBasedControl
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> model, real = ChainEnv(length=5), ChainEnv(length=5)
+        >>> policy = ModelBasedControl(MCTSPlanner(model), env=real)
+        >>> td = real.rollout(10, policy=policy)
+        >>> td["next", "reward"].sum().item(), td["num_plans"].flatten().tolist()
+        (1.0, [1, 2, 3, 4])
+    """
+
+    def __init__(
+        self,
+        planner: MCTSPlanner,
+        state_map: StateMap | None = None,
+        *,
+        env: EnvBase | None = None,
+        replan_every: int | None = 1,
+        max_plan_length: int = 64,
+    ) -> None:
+        super().__init__()
+        self.policy = HierarchicalPolicy(
+            planner, replan_every=replan_every, max_plan_length=max_plan_length
+        )
+        self.__dict__["state_map"] = state_map  # its owner trains and moves it
+        self.out_keys = list(self.policy.out_keys)
+        read = self.policy.in_keys if state_map is None else getattr(state_map, "in_keys", [])
+        self.in_keys = [unravel_key(key) for key in read]
+        if env is not None:
+            self._check(env, planner)
+
+    def _check(self, env: EnvBase, planner: MCTSPlanner) -> None:
+        name, key = type(getattr(env, "base_env", env)).__name__, planner.option_key
+        model = planner.simulator.env
+        theirs: TensorSpec | None = env.full_action_spec.get(key, None)
+        ours = model.full_action_spec[key]
+        spaces = [getattr(spec, "space", None) for spec in (theirs, ours)]
+        if theirs is None or type(theirs) is not type(ours) or spaces[0] != spaces[1]:
+            raise ValueError(
+                f"The options of the real env and of the model must be the same; {name} has "
+                f"{theirs} under {key!r}, the model {ours}. Put both under an OptionTransform with "
+                f"the same worker."
+            )
+        available = {unravel_key(k) for k in env.full_observation_spec.keys(True, True)}
+        available |= {unravel_key(k) for k in env.full_state_spec.keys(True, True)}
+        missing = _missing(self.in_keys, available)
+        if missing:
+            raise ValueError(
+                f"ModelBasedControl reads {missing}, which {name} does not write: it writes "
+                f"{sorted(map(str, available))}. Pass a state_map that makes the model's state "
+                f"from those."
+            )
+
+    def reset(self) -> None:
+        """Forget what the policy keeps between decisions."""
+        self.policy.reset()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the option to take, and the plan that it begins."""
+        if self.state_map is None:
+            self.policy(tensordict)
+            return tensordict
+        state = self.state_map(tensordict)
+        missing = _missing(self.policy.in_keys, set(state.keys(True, True)))
+        if missing or state.batch_size != tensordict.batch_size:
+            raise ValueError(
+                f"state_map must return the model's state {list(map(str, self.policy.in_keys))} of "
+                f"batch size {list(tensordict.batch_size)}; got batch size "
+                f"{list(state.batch_size)}, without {missing}."
+            )
+        state = state.copy()
+        for key in (*self.out_keys, "is_init", "_step", "done"):
+            value = tensordict.get(key, None)
+            if value is not None:  # the plan so far, and who needs none
+                state.set(key, value)
+        self.policy(state)
+        for key in self.out_keys:
+            tensordict.set(key, state.get(key))
+        return tensordict
+
+
+def _missing(keys: Sequence[NestedKey], available: set[NestedKey]) -> list[NestedKey]:
+    return [key for key in keys if key not in available]

@@ -1,0 +1,178 @@
+"""The base transitions of every option an env takes, kept for training.
+
+Letters: *B batch of the tensordict, T base steps an option can take at most, n recorded steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Composite, ReplayBuffer
+from torchrl.envs import Transform
+
+from torchrl_hmcts.transforms.trajectory import OptionTrajectory
+
+
+class OptionRecorder(Transform):
+    r"""Keeps the base transitions that options consist of, wherever the options are taken.
+
+    Appended after an :class:`OptionTransform` that hands out its base transitions, it takes them
+    out of the tensordict and stores those that were taken, each with the option as its skill and
+    the displacement since the option began,
+
+    .. math:: \Delta_t = x_t - x_{t_0}, \qquad t_0 = \text{the option's first base step}
+
+    as :class:`DisplacementTransform` writes it in the env of a skill's training. What is simulated
+    by a planner is recorded like what is carried out, so that search itself feeds the training of
+    its worker. The env gives the same as without it.
+
+    Args:
+        keys (sequence of NestedKey): entries of a base transition to store, e.g. the ``in_keys`` of
+            the loss: ``"velocity"``, ``"action"``, ``("next", "velocity")``. ``skill_key`` and
+            ``displacement_key``, under ``"next"`` too, are written by the recorder.
+        replay_buffer (ReplayBuffer, optional): extended at every macro-step. Default ``None``: the
+            recorder keeps the transitions until :meth:`take` is called, which is faster.
+        position_key (NestedKey): entry ``[*B, D]`` whose displacement is measured. Default
+            ``"position"``; read only if ``displacement_key`` is among the ``keys``.
+        displacement_key (NestedKey): displacement to write, ``[n, D]`` in the units of the
+            position. Default ``"displacement"``.
+        skill_key (NestedKey): entry under which the ``OptionTransform`` tells the worker its option
+            and under which it is stored, int64 ``[n]``. Default ``"skill"``.
+
+    Raises:
+        ValueError: at construction if ``keys`` names nothing to record.
+        KeyError: when attached, if the env before it does not hand out what is to be recorded.
+
+    Reference:
+        Bartley 2023, algorithm 3: the samples S on which the skills are trained again.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.transforms import OptionRecorder, OptionTransform
+        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+        >>> recorder = OptionRecorder(["state", "skill", ("next", "state")])
+        >>> options = OptionTransform(worker, 2, 3, trajectory_keys=recorder.trajectory_keys)
+        >>> env = TransformedEnv(ChainEnv(length=9), Compose(options, recorder))
+        >>> td = env.step(env.reset().set("option", torch.tensor(1)))  # 1: three to the right
+        >>> data = recorder.take()
+        >>> data["state"].tolist(), data["next", "state"].tolist(), data["skill"].tolist()
+        ([0, 1, 2], [1, 2, 3], [1, 1, 1])
+    """
+
+    def __init__(
+        self,
+        keys: Sequence[NestedKey],
+        replay_buffer: ReplayBuffer | None = None,
+        *,
+        position_key: NestedKey = "position",
+        displacement_key: NestedKey = "displacement",
+        skill_key: NestedKey = "skill",
+    ) -> None:
+        super().__init__(in_keys=[OptionTrajectory.KEY], out_keys=[])
+        self.keys = [unravel_key(key) for key in keys]
+        self.position_key = unravel_key(position_key)
+        self.displacement_key = unravel_key(displacement_key)
+        self.skill_key = unravel_key(skill_key)
+        self.replay_buffer = replay_buffer
+        self.num_base_steps = 0
+        """Base steps recorded so far, an int."""
+        skill = (self.skill_key, _next(self.skill_key))
+        self._skill_keys = [key for key in self.keys if key in skill]
+        displacement = (self.displacement_key, _next(self.displacement_key))
+        self._displacement_keys = [key for key in self.keys if key in displacement]
+        made = {*self._skill_keys, *self._displacement_keys}
+        self._copied_keys = [key for key in self.keys if key not in made]
+        needed = list(self._copied_keys)
+        if self._displacement_keys:
+            needed += [self.position_key, _next(self.position_key)]
+        self.trajectory_keys: list[NestedKey] = list(dict.fromkeys(needed))
+        """What the ``OptionTransform`` must hand out: its argument of the same name."""
+        if not self.trajectory_keys:
+            raise ValueError(
+                f"OptionRecorder was given the keys {self.keys}, of which none is an entry of a "
+                'base transition. Name what to store, e.g. ["action", ("next", "velocity")].'
+            )
+        self._blocks: list[tuple[TensorDictBase, Tensor]] = []
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        block = next_tensordict.pop(OptionTrajectory.KEY)  # [*B, T]
+        # Its own copy: a planner may use the memory of its options again.
+        skill = tensordict.get(self.skill_key).clone()
+        self._blocks.append((block.reshape(-1, block.shape[-1]), skill.reshape(-1)))
+        self.num_base_steps += int(block.get(OptionTrajectory.MASK_KEY).sum())
+        if self.replay_buffer is not None:
+            self.replay_buffer.extend(self.take())
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        tensordict_reset.pop(OptionTrajectory.KEY, None)
+        return tensordict_reset
+
+    def take(self) -> TensorDictBase:
+        """Hands over the transitions recorded since the last call and forgets them.
+
+        Returns:
+            Transitions ``[n]`` with the ``keys``, those of an option one after the other. Without
+            any it has batch size ``[0]`` and no entries.
+        """
+        if not self._blocks:
+            return TensorDict(batch_size=[0])
+        blocks, skills = zip(*self._blocks, strict=True)
+        self._blocks = []
+        block = torch.cat(blocks) if len(blocks) > 1 else blocks[0]  # [m, T]
+        mask = block.get(OptionTrajectory.MASK_KEY)
+        out = TensorDict(batch_size=[int(mask.sum())], device=block.device)
+        for key in self._copied_keys:
+            out.set(key, block.get(key)[mask])
+        if self._skill_keys:
+            skill = torch.cat(skills).unsqueeze(-1).expand(mask.shape)[mask]
+            for key in self._skill_keys:
+                out.set(key, skill.clone())
+        if self._displacement_keys:
+            position = block.get(self.position_key)  # [m, T, D]
+            origin = position[:, :1]
+            for key in self._displacement_keys:
+                is_next = key != self.displacement_key
+                moved = block.get(_next(self.position_key)) if is_next else position
+                out.set(key, (moved - origin)[mask])
+        return out
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Not defined: the recorder listens to an env."""
+        raise RuntimeError(
+            "OptionRecorder records the options an env takes; stored data hold the transitions "
+            "already. Append it to a TransformedEnv, after the OptionTransform."
+        )
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        key = OptionTrajectory.KEY
+        handed = observation_spec[key].keys(True, True) if key in observation_spec.keys() else ()
+        missing = [key for key in self.trajectory_keys if key not in set(handed)]
+        if missing:
+            raise KeyError(
+                f"OptionRecorder records {missing}, which the env before it does not hand out. Put "
+                "it after an OptionTransform(..., trajectory_keys=recorder.trajectory_keys)."
+            )
+        observation_spec = observation_spec.clone()
+        del observation_spec[key]
+        return observation_spec
+
+    def _check_batched_worker_compat(self) -> None:
+        raise RuntimeError(
+            "OptionRecorder in a worker of a SerialEnv or ParallelEnv would record out of your "
+            "reach. Put it outside: TransformedEnv(ParallelEnv(n, make_env), "
+            "Compose(OptionTransform(...), OptionRecorder(...)))."
+        )
+
+
+def _next(key: NestedKey) -> NestedKey:
+    return ("next", key) if isinstance(key, str) else ("next", *key)

@@ -1,0 +1,118 @@
+"""Which options a planner may take while skills are switched on and off."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Binary, TensorSpec
+from torchrl.envs import Transform
+
+from torchrl_hmcts.modules.skill_prior import SkillPrior
+
+
+class SkillMaskTransform(Transform):
+    r"""Writes which options may be taken: those whose skill the prior has switched on.
+
+    .. math:: \text{mask}(z) = [\,p(z) > 0\,]
+
+    For a macro environment, whose action is a skill: append it after the
+    :class:`OptionTransform`. :class:`~torchrl_hmcts.planners.MCTSPlanner` reads the entry by its
+    default ``mask_key``; TorchRL's ``ActionMask`` behind it keeps random actions within it, too.
+    The prior is asked at every step and stays its owner's.
+
+    Args:
+        prior (SkillPrior): over the skills, one per option, ``Z``.
+        mask_key (NestedKey): entry to write, bool ``[*B, Z]``. Default ``"action_mask"``.
+
+    Raises:
+        TypeError: if the prior is no :class:`~torchrl_hmcts.modules.SkillPrior`.
+        ValueError: when the specs are made, if the env has another number of options.
+
+    Reference:
+        This project's (section 6.2 of Bartley 2023 asks for skills that are added as needed).
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from torchrl_hmcts.modules import GrowingSkillPrior
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.transforms import OptionTransform, SkillMaskTransform
+        >>> prior = GrowingSkillPrior(2, num_active=1)
+        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+        >>> env = TransformedEnv(
+        ...     ChainEnv(length=6),
+        ...     Compose(OptionTransform(worker, 2, 4), SkillMaskTransform(prior)),
+        ... )
+        >>> env.reset()["action_mask"].tolist()
+        [True, False]
+        >>> prior.set_num_active(2)
+        >>> env.reset()["action_mask"].tolist()
+        [True, True]
+    """
+
+    def __init__(self, prior: SkillPrior, mask_key: NestedKey = "action_mask") -> None:
+        if not isinstance(prior, SkillPrior):
+            raise TypeError(
+                "SkillMaskTransform asks a SkillPrior which skills are on; got "
+                f"{type(prior).__name__}. Pass e.g. FixedSkillPrior(4, [1.0, 1.0, 0.0, 0.0])."
+            )
+        self.mask_key = unravel_key(mask_key)
+        super().__init__(in_keys=[], out_keys=[self.mask_key])
+        # Past nn.Module.__setattr__: a sub-module would be saved and moved with the env.
+        self.__dict__["prior"] = prior
+
+    prior: SkillPrior
+
+    def mask(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the mask into a tensordict of states ``[*B]``, e.g. ones made without the env."""
+        active: Tensor = self.prior.active()
+        if tensordict.device is not None:
+            active = active.to(tensordict.device)
+        shape = (*tensordict.batch_size, self.prior.num_skills)
+        return tensordict.set(self.mask_key, active.expand(shape).clone())
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self.mask(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.mask(next_tensordict)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError(
+            "SkillMaskTransform says which skills may be taken while an env runs; what a replay "
+            "buffer holds has been taken. Append it to a TransformedEnv instead."
+        )
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        self._check_options()
+        shape = torch.Size([*observation_spec.shape, self.prior.num_skills])
+        observation_spec[self.mask_key] = Binary(
+            self.prior.num_skills, shape=shape, dtype=torch.bool, device=observation_spec.device
+        )
+        return observation_spec
+
+    def _check_options(self) -> None:
+        """Raises ValueError unless the env has one option per skill."""
+        parent = self.parent
+        if parent is None:
+            return
+        for key in parent.action_keys:
+            space = parent.full_action_spec[key].space
+            number = getattr(space, "n", None)
+            if number is not None and int(number) != self.prior.num_skills:
+                raise ValueError(
+                    f"SkillMaskTransform says of {self.prior.num_skills} skills which are on, but "
+                    f"the action {key!r} has {int(number)} options. Build the OptionTransform with "
+                    f"num_options={self.prior.num_skills}, and append the mask after it."
+                )
+
+    def _check_batched_worker_compat(self) -> None:
+        raise RuntimeError(
+            "SkillMaskTransform reads a prior that changes; the workers of a SerialEnv or "
+            "ParallelEnv have a copy that does not. Put it outside: "
+            "TransformedEnv(ParallelEnv(n, make_env), SkillMaskTransform(prior))."
+        )
