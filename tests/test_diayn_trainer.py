@@ -3,21 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.data import (
+    Bounded,
+    Categorical,
+    Composite,
+    LazyTensorStorage,
+    ReplayBuffer,
+    TensorDictReplayBuffer,
+    Unbounded,
+)
 from torchrl.envs import Compose, EnvBase, TransformedEnv
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import DiscreteSACLoss, SoftUpdate
+from torchrl.record import CSVLogger
+from torchrl.trainers import (
+    DefaultOptimizationStepper,
+    ReplayBufferTrainer,
+    TargetNetUpdaterHook,
+    Trainer,
+)
 from torchrl.trainers.algorithms import SACTrainer
 
-from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.objectives import DIAYNLoss
-from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.transforms import DIAYNReward, DisplacementTransform, SkillTransform
+from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
+from torchrl_hmcts.objectives import DIAYNLoss, METRAEncoderLoss
+from torchrl_hmcts.trainers.coverage import StateCoverage
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
+from torchrl_hmcts.transforms import (
+    DIAYNReward,
+    DisplacementTransform,
+    SkillReward,
+    SkillTransform,
+)
 
 DIRECTIONS = torch.tensor([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]])
 
@@ -113,13 +136,146 @@ def test_three_batches_train_every_network_and_log_the_four_curves() -> None:
     still = [k for k in before if torch.equal(before[k], after[k]) and before[k].ndim > 1]
     assert still == []
     history = trainer.history
-    for curve in ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator"):
+    for curve in ("actor_loss", "critic_1_loss", "critic_2_loss", "discriminator_loss"):
+        assert len(history[curve]) == 3
+    for curve in ("discriminator_accuracy", "entropy", "state_coverage"):
         assert len(history[curve]) == 3
     assert len(trainer.replay_buffer) == 192
     assert history["optim_steps"] == [3, 6, 9]
     (bar,) = bars
     assert (bar.total, bar.n, bar.closed) == (192, 192, True)
     assert "discriminator_accuracy" in bar.figures
+
+
+def test_curves_are_found_by_the_names_of_the_loss_too() -> None:
+    trainer = make_trainer()
+    trainer.train()
+    history = trainer.history
+    assert history["qvalue_loss_1"] == history["critic_2_loss"]
+    assert "qvalue_loss_1" not in list(history)
+    total = np.add(history["critic_1_loss"], history["critic_2_loss"])
+    assert np.allclose(total, history["critic_loss"])
+    with pytest.raises(KeyError, match="'speed' was not logged; there are .*'actor_loss'"):
+        history["speed"]
+
+
+def train_with_logger(folder: Path, **kwargs: Any) -> DIAYNTrainer:
+    logger = CSVLogger("run", str(folder))
+    trainer = make_trainer(logger=logger, **kwargs)
+    trainer.train()
+    for file in logger.experiment.files.values():  # TorchRL leaves them to the garbage collector
+        file.close()
+    return trainer
+
+
+def test_curves_reach_a_logger_with_base_steps_as_x(tmp_path: Path) -> None:
+    trainer = train_with_logger(tmp_path)
+    for curve in ("actor_loss", "critic_1_loss", "critic_2_loss", "discriminator_loss", "entropy"):
+        rows = np.loadtxt(tmp_path / "run" / "scalars" / f"{curve}.csv", delimiter=",")
+        assert rows[:, 0].tolist() == [64, 128, 192]
+        assert np.allclose(rows[:, 1], trainer.history[curve])
+    seen = np.loadtxt(tmp_path / "run" / "scalars" / "state_coverage.csv", delimiter=",")
+    assert seen[:, 1].tolist() == trainer.history["state_coverage"]
+
+
+def test_a_log_interval_thins_out_what_the_logger_gets(tmp_path: Path) -> None:
+    train_with_logger(tmp_path, log_interval=100)
+    rows = np.loadtxt(tmp_path / "run" / "scalars" / "entropy.csv", delimiter=",", ndmin=2)
+    assert rows[:, 0].tolist() == [128]
+
+
+def test_coverage_counts_the_cells_of_the_entry_it_is_given() -> None:
+    coverage = StateCoverage("position", cell_side=9.0)
+    trainer = make_trainer(coverage=coverage)
+    trainer.train()
+    # Cells as large as the box: its inside is one, and a wall at 9 belongs to the next.
+    assert 1 <= trainer.history["state_coverage_total"][-1] <= 4
+    assert ("next", "position") in trainer.replay_buffer.storage[:].keys(True)
+
+
+def visit(coverage: StateCoverage, *cells: tuple[float, float]) -> tuple[float, float]:
+    moved = TensorDict(displacement=torch.tensor(cells), batch_size=[len(cells)])
+    counts = coverage(TensorDict(next=moved, batch_size=[len(cells)]))
+    return counts["state_coverage"], counts["state_coverage_total"]
+
+
+def test_coverage_forgets_what_left_the_window_but_not_since_the_start() -> None:
+    coverage = StateCoverage(cell_side=0.5, window=4)
+    assert visit(coverage, (0.1, 0.1), (0.6, 0.1)) == (2, 2)
+    assert visit(coverage, (0.4, 0.4), (-0.1, 0.1)) == (3, 3)  # -0.1 is in the cell below 0
+    assert visit(coverage, (0.1, 0.1), (0.1, 0.1)) == (2, 3)  # (0.6, 0.1) is forgotten
+    state = coverage.state_dict()
+    copy = StateCoverage(cell_side=0.5, window=4)
+    copy.load_state_dict(state)
+    for counter in (coverage, copy):
+        assert visit(counter, (0.9, 0.1), (5.0, 5.0)) == (3, 4)
+
+
+def test_coverage_before_any_step_is_saved_and_loaded() -> None:
+    coverage = StateCoverage()
+    coverage.load_state_dict(StateCoverage().state_dict())
+    assert visit(coverage, (0.0, 0.0)) == (1, 1)
+
+
+def test_cells_without_extent_are_refused() -> None:
+    with pytest.raises(ValueError, match="cell_side=0"):
+        StateCoverage(cell_side=0)
+    with pytest.raises(ValueError, match="window=0"):
+        StateCoverage(window=0)
+
+
+def test_another_objective_trains_in_the_same_trainer() -> None:
+    env = make_env()
+    objective = METRAEncoderLoss(SkillEncoder(2, num_skills=4, in_keys=["position"]))
+    loss = DIAYNTrainer.make_loss(env, 4, objective=objective, critic_keys=["position"])
+    before = {name: p.detach().clone() for name, p in loss.named_parameters()}
+    trainer = DIAYNTrainer(env, loss, total_frames=128, seed=0)
+    trainer.train()
+    still = [name for name, p in loss.named_parameters() if torch.equal(p, before[name])]
+    # The bias of the encoder's last layer cancels in what METRA looks at, phi(s') - phi(s).
+    assert len(still) == 1
+    assert still[0].startswith("objective.encoder")
+    assert still[0].endswith("bias")
+    assert len(trainer.history["encoder_loss"]) == 2
+    # Nothing of a discriminator is left; coverage is counted where the encoder looks.
+    assert not [name for name in trainer.history if "discriminator" in name]
+    assert trainer.history["state_coverage_total"][-1] >= 32
+
+
+def test_a_loss_without_objective_is_refused() -> None:
+    env = make_env()
+    nets = DIAYNTrainer.make_loss(env, 4)
+    loss = DiscreteSACLoss(
+        nets.actor_network, nets.qvalue_network, action_space="categorical", num_actions=4
+    )
+    with pytest.raises(TypeError, match="DiscreteSACLoss has none"):
+        DIAYNTrainer(env, loss)
+
+
+def test_the_optimiser_trains_every_parameter_once_with_the_rate_of_its_part() -> None:
+    loss = DIAYNTrainer.make_loss(make_env(), 4, fixed_alpha=False)
+    groups = make_skill_optimizer(loss, 0.1, 0.2, 0.3, 0.4).param_groups
+    assert [(g["name"], g["lr"]) for g in groups] == [
+        ("actor", 0.1),
+        ("critic", 0.2),
+        ("objective", 0.3),
+        ("alpha", 0.4),
+    ]
+    trained = [id(p) for g in groups for p in g["params"]]
+    assert len(trained) == len(set(trained))
+    assert set(trained) == {id(p) for p in loss.parameters() if p.requires_grad}
+
+
+def test_targets_move_by_tau_towards_the_critics() -> None:
+    trainer = make_trainer(target_tau=0.25)
+    loss = trainer.loss_module
+    old = loss.target_qvalue_network_params.clone()
+    for p in loss.qvalue_network_params.parameters():
+        p.data.add_(1.0)
+    trainer._post_optim_hook()
+    for key, value in loss.target_qvalue_network_params.items(True, True):
+        assert torch.allclose(value, old[key] + 0.25)
+    trainer.collector.shutdown()
 
 
 def test_without_a_progress_bar_nothing_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -156,6 +312,39 @@ def test_a_batch_must_divide_among_the_copies() -> None:
 def test_a_missing_entry_is_named() -> None:
     with pytest.raises(KeyError, match="speed"):
         DIAYNTrainer.make_loss(make_env(), in_keys=["speed"])
+
+
+def test_the_loss_runs_in_torchrls_own_plain_trainer() -> None:
+    env = make_env(16)
+    loss = DIAYNTrainer.make_loss(env, num_skills=4)
+    collector = Collector(
+        env,
+        loss.actor_network,
+        frames_per_batch=64,
+        total_frames=192,
+        auto_register_policy_transforms=False,
+    )
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(1000), transform=SkillReward(loss.objective), batch_size=32
+    )
+    trainer = Trainer(
+        collector=collector,
+        total_frames=192,
+        frame_skip=1,
+        optim_steps_per_batch=2,
+        loss_module=loss,
+        optimizer=make_skill_optimizer(loss),
+        optimization_stepper=DefaultOptimizationStepper(),
+        progress_bar=False,
+    )
+    replay = ReplayBufferTrainer(buffer, batch_size=32, flatten_tensordicts=True)
+    trainer.register_op("batch_process", replay.extend)
+    trainer.register_op("process_optim_batch", replay.sample)
+    trainer.register_op("post_optim", TargetNetUpdaterHook(SoftUpdate(loss, tau=0.05)))
+    before = [p.detach().clone() for p in loss.parameters()]
+    trainer.train()
+    changed = [not torch.equal(a, b) for a, b in zip(before, loss.parameters(), strict=True)]
+    assert all(changed)
 
 
 @pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
@@ -10,18 +11,20 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import EnvBase
-from torchrl.objectives import SoftUpdate
+from torchrl.envs import EnvBase, Transform
+from torchrl.objectives import LossModule, SoftUpdate
 from torchrl.trainers import (
-    DefaultOptimizationStepper,
     ReplayBufferTrainer,
     TargetNetUpdaterHook,
     Trainer,
 )
 
 from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator, SkillPolicy
-from torchrl_hmcts.objectives import DIAYNLoss
-from torchrl_hmcts.transforms import DIAYNReward
+from torchrl_hmcts.objectives import DIAYNLoss, DiscreteSkillSACLoss, SkillObjective
+from torchrl_hmcts.trainers.coverage import StateCoverage
+from torchrl_hmcts.trainers.curves import Curves, log_curves
+from torchrl_hmcts.trainers.resume import ResumableTrainer
+from torchrl_hmcts.transforms import SkillReward
 
 
 class Progress(Protocol):
@@ -32,41 +35,74 @@ class Progress(Protocol):
     def close(self) -> object: ...
 
 
-class DIAYNTrainer(Trainer):
-    """Trains skills with :class:`DIAYNLoss` off-policy, on TorchRL's Trainer and Collector.
+class DIAYNTrainer(ResumableTrainer):
+    """Trains skills off-policy with any skill loss, on TorchRL's Trainer and Collector.
 
     Per batch: collect ``frames_per_batch`` base steps with the current policy, store them, and make
     ``updates_per_batch`` updates, each on ``batch_size`` transitions whose reward the current
-    discriminator gives (:class:`DIAYNReward`), with one Adam over all parameters and a soft update
-    of the target critics.
+    objective gives (:class:`SkillReward`), with one Adam over all parameters and a soft update
+    of the target critics. Another objective (METRA, LSD, DADS) is another loss, nothing else.
+
+    What is logged, per batch the mean over its updates, in :attr:`history` and to the ``logger``
+    with base steps as x. Figures are the dissertation's.
+
+    ============================  ======================================  =======
+    name                          entry of the loss's output              figure
+    ============================  ======================================  =======
+    ``actor_loss``                ``loss_actor``                          4.6
+    ``critic_1_loss``             ``qvalue_loss_0``                       4.7
+    ``critic_2_loss``             ``qvalue_loss_1``                       4.8
+    ``discriminator_loss``        ``loss_discriminator``                  4.9
+    ``discriminator_accuracy``    the same; share of skills guessed
+    ``entropy``                   the same, of the policy, in nats
+    ``critic_loss``               ``loss_qvalue``, both critics
+    ``alpha``, ``alpha_loss``     ``alpha``, ``loss_alpha``
+    ``grad_norm``                 norm of the gradient before clipping
+    ``optim_steps``               updates so far
+    ``state_coverage``            cells visited, see :class:`StateCoverage`
+    ``state_coverage_total``      the same since the start
+    ============================  ======================================  =======
+
+    Any other entry ``loss_x`` is logged as ``x_loss``; all others keep their names. In ``history``
+    the entries can also be read by the loss's own names.
 
     Args:
-        env (EnvBase): env under :class:`SkillTransform` and whatever the discriminator reads (e.g.
+        env (EnvBase): env under :class:`SkillTransform` and whatever the objective reads (e.g.
             :class:`DisplacementTransform`). Mini-episodes of 50 steps and 32 copies in one batch
             (a stateless env built with ``batch_size=[32]``) go with the defaults below.
-        loss_module (DIAYNLoss): the loss, e.g. from :meth:`make_loss`.
+        loss_module (LossModule): a :class:`DIAYNLoss`, e.g. from :meth:`make_loss`, or any
+            :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` (continuous actions).
         total_frames (int): base steps in all. Default ``40_000``, the source's.
         frames_per_batch (int): base steps per batch, a multiple of the env's copies. Default
             ``64``.
         updates_per_batch (int): updates per batch. Default ``3``.
         batch_size (int): transitions per update. Default ``256``.
         buffer_size (int): transitions kept. Default ``20_000``.
-        actor_lr, critic_lr, discriminator_lr (float): Adam's learning rates. Defaults ``2e-3``,
+        actor_lr, critic_lr, objective_lr (float): Adam's learning rates. Defaults ``2e-3``,
             ``3e-3`` and ``1e-2``: the actor is the slowest, so that it follows settled values.
         alpha_lr (float): learning rate of log alpha, when it is tuned. Default ``1e-2``.
         target_tau (float): share of the critics moved into their targets per update. Default
             ``0.05``.
         clip_norm (float): bound of the gradient's norm, over all parameters. Default ``10.0``.
         reward (Transform, optional): replay buffer transform that writes the reward. Default:
-            ``DIAYNReward`` with the loss's discriminator.
+            ``SkillReward(loss_module.objective)``.
+        coverage (StateCoverage, optional): what counts as visited. Default ``None``: the first
+            entry that the objective reads of the next state, in cells of side 0.5.
         progress (callable, optional): called with ``total=total_frames`` it returns a progress bar,
             e.g. ``tqdm.tqdm``. Default ``None``: quiet.
         seed (int, optional): seeds the env and torch before the first reset. Default ``None``. The
             networks' initial weights are older than the trainer: :meth:`make_loss` has its own.
-        **trainer_kwargs: passed to ``torchrl.trainers.Trainer`` (``logger``, ``checkpoint``, ...).
+        save_dir (path, optional): folder of checkpoints. Default ``None``: none. To go on from one,
+            build env, loss and trainer as before and call ``trainer.load(save_dir)``; the run goes
+            on as if it had never stopped, see :class:`ResumableTrainer`.
+        log_interval (int): base steps between two values that reach the ``logger``. Default ``0``:
+            every batch.
+        **trainer_kwargs: passed to :class:`ResumableTrainer` and ``torchrl.trainers.Trainer``
+            (``logger``, ``keep_last``, ``save_trainer_interval``, ...).
 
     Raises:
         ValueError: if a batch does not divide among the env's copies.
+        TypeError: if the loss has no skill objective and no ``reward`` is given.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4.
@@ -83,14 +119,14 @@ class DIAYNTrainer(Trainer):
         >>> loss = DIAYNTrainer.make_loss(env, num_skills=4, seed=0)
         >>> trainer = DIAYNTrainer(env, loss, total_frames=128, seed=0)
         >>> trainer.train()
-        >>> len(trainer.history["loss_discriminator"])
+        >>> len(trainer.history["discriminator_loss"])
         2
     """
 
     def __init__(
         self,
         env: EnvBase,
-        loss_module: DIAYNLoss,
+        loss_module: LossModule,
         *,
         total_frames: int = 40_000,
         frames_per_batch: int = 64,
@@ -99,13 +135,16 @@ class DIAYNTrainer(Trainer):
         buffer_size: int = 20_000,
         actor_lr: float = 2e-3,
         critic_lr: float = 3e-3,
-        discriminator_lr: float = 1e-2,
+        objective_lr: float = 1e-2,
         alpha_lr: float = 1e-2,
         target_tau: float = 0.05,
         clip_norm: float = 10.0,
-        reward: torch.nn.Module | None = None,
+        reward: Transform | None = None,
+        coverage: StateCoverage | None = None,
         progress: Callable[..., Progress] | None = None,
         seed: int | None = None,
+        save_dir: str | Path | None = None,
+        log_interval: int = 0,
         **trainer_kwargs: Any,
     ) -> None:
         copies = env.batch_size.numel()
@@ -114,20 +153,16 @@ class DIAYNTrainer(Trainer):
                 f"DIAYNTrainer collects whole steps of all {copies} copies of the env, so "
                 f"frames_per_batch must be a multiple of {copies}; got {frames_per_batch}."
             )
+        objective = _objective(loss_module)
         if seed is not None:  # before the collector makes its first reset
             env.set_seed(seed)
             torch.manual_seed(seed)
-        discriminator = loss_module.discriminator
         if reward is None:
-            reward = DIAYNReward(
-                discriminator,
-                discriminator.num_skills,
-                skill_key=loss_module.tensor_keys.skill,
-                skill_logits_key=loss_module.tensor_keys.skill_logits,
-                reward_key=loss_module.tensor_keys.reward,
-            )
-        # Only what the loss reads is stored.
-        keys = loss_module.in_keys
+            reward = SkillReward(objective, reward_key=loss_module.tensor_keys.reward)
+        if coverage is None:
+            coverage = StateCoverage(_reached(objective))
+        # Only what is read is stored.
+        keys = list(dict.fromkeys([*loss_module.in_keys, *objective.in_keys, coverage.key]))
 
         def stored(batch: TensorDictBase) -> TensorDictBase:
             return batch.select(*keys, strict=False).reshape(-1)
@@ -141,35 +176,30 @@ class DIAYNTrainer(Trainer):
             trust_policy=True,
             track_traj_ids=False,
             use_buffers=False,
+            return_same_td=True,  # each batch is a new one as it is
             auto_register_policy_transforms=False,
         )
         buffer = ReplayBuffer(
-            storage=LazyTensorStorage(buffer_size),
-            transform=reward,
-            batch_size=batch_size,
+            storage=LazyTensorStorage(buffer_size), transform=reward, batch_size=batch_size
         )
-        groups: list[dict[str, Any]] = [
-            {"params": list(loss_module.actor_network_params.parameters()), "lr": actor_lr},
-            {"params": list(loss_module.qvalue_network_params.parameters()), "lr": critic_lr},
-            {"params": list(loss_module.discriminator_params.parameters()), "lr": discriminator_lr},
-        ]
-        if loss_module.log_alpha.requires_grad:
-            groups.append({"params": [loss_module.log_alpha], "lr": alpha_lr})
-        optimizer = torch.optim.Adam(groups, fused=True)
-        updater = SoftUpdate(loss_module, tau=target_tau)
+        updater = _SoftUpdate(loss_module, tau=target_tau)
         super().__init__(
             collector=collector,
             total_frames=total_frames,
             frame_skip=1,
             optim_steps_per_batch=updates_per_batch,
             loss_module=loss_module,
-            optimizer=optimizer,
-            optimization_stepper=_DetachedStepper(),
+            optimizer=make_skill_optimizer(
+                loss_module, actor_lr, critic_lr, objective_lr, alpha_lr
+            ),
             replay_buffer=buffer,
             target_net_updater=updater,
             batch_size=batch_size,
             clip_norm=clip_norm,
             progress_bar=False,
+            save_dir=save_dir,
+            log_interval=log_interval,
+            auto_log_optim_steps=False,
             **trainer_kwargs,
         )
         self.seed = seed
@@ -177,19 +207,22 @@ class DIAYNTrainer(Trainer):
         self.register_op("batch_process", replay.extend)
         self.register_op("process_optim_batch", replay.sample)
         self.register_op("post_optim", TargetNetUpdaterHook(updater))
+        self.register_op("post_optim_complete_log", log_curves)
+        coverage.register(self)
         if progress is not None:
-            _ProgressHook(self, progress(total=total_frames)).register(self)
+            _ProgressHook(self, progress).register(self)
 
     @property
     def history(self) -> dict[str, list[float]]:
-        """Per batch the mean over its updates of each loss and diagnostic, by its name."""
-        return {key: [float(x) for x in values] for key, values in self._log_dict.items()}
+        """All logged values by name: per batch the mean over its updates of each curve."""
+        return Curves(super().history)
 
     @staticmethod
     def make_loss(
         env: EnvBase,
         num_skills: int = 4,
         *,
+        objective: SkillObjective | None = None,
         in_keys: Sequence[NestedKey] = ("velocity",),
         critic_keys: Sequence[NestedKey] = ("velocity", "displacement"),
         discriminator_keys: Sequence[NestedKey] = ("displacement",),
@@ -197,12 +230,15 @@ class DIAYNTrainer(Trainer):
         discriminator_hidden: Sequence[int] = (),
         seed: int | None = None,
         **loss_kwargs: Any,
-    ) -> DIAYNLoss:
+    ) -> DiscreteSkillSACLoss:
         """Builds actor, critics, discriminator and loss with the sizes of an env's specs.
 
         Args:
             env (EnvBase): env that writes ``in_keys`` and ``discriminator_keys``.
             num_skills (int): number of skills. Default ``4``.
+            objective (SkillObjective, optional): what makes skills different, e.g.
+                :class:`METRAEncoderLoss`. Default ``None``: DIAYN's discriminator, built with
+                ``discriminator_keys`` and ``discriminator_hidden``.
             in_keys (sequence of NestedKey): what the actor sees besides the skill. Default
                 ``("velocity",)``.
             critic_keys (sequence of NestedKey): what the critics see besides the skill. Default
@@ -216,10 +252,13 @@ class DIAYNTrainer(Trainer):
                 Default ``()``: see :class:`SkillDiscriminator`.
             seed (int, optional): seed of the initial weights; torch's generator is left as it was.
                 Default ``None``: torch's generator goes on.
-            **loss_kwargs: passed to :class:`DIAYNLoss`.
+            **loss_kwargs: passed to the loss.
 
         Returns:
-            DIAYNLoss: the loss, with fresh networks.
+            DIAYNLoss, or with an ``objective`` DiscreteSkillSACLoss: the loss, with fresh networks.
+
+        Raises:
+            KeyError: if the env does not write one of the keys.
         """
         action_spec = env.action_spec_unbatched
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
@@ -235,39 +274,114 @@ class DIAYNTrainer(Trainer):
                 in_keys=critic_keys,
                 hidden=hidden,
             )
+            loss_kwargs["action_space"] = action_spec
+            if objective is not None:
+                return DiscreteSkillSACLoss(actor, critic, objective, **loss_kwargs)
             discriminator = SkillDiscriminator(
                 _width(env, discriminator_keys),
                 num_skills,
                 in_keys=discriminator_keys,
                 hidden=discriminator_hidden,
             )
-            return DIAYNLoss(actor, critic, discriminator, action_space=action_spec, **loss_kwargs)
+            return DIAYNLoss(actor, critic, discriminator, **loss_kwargs)
 
 
-class _DetachedStepper(DefaultOptimizationStepper):
-    """The default step; what it logs is kept for ever and must not hold a graph."""
+def make_skill_optimizer(
+    loss_module: LossModule,
+    actor_lr: float = 2e-3,
+    critic_lr: float = 3e-3,
+    objective_lr: float = 1e-2,
+    alpha_lr: float = 1e-2,
+) -> torch.optim.Adam:
+    """Builds one Adam for all parts of a skill loss, each with its own learning rate.
 
-    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        return super().step(trainer, sub_batch).detach()
+    Args:
+        loss_module (LossModule): e.g. a :class:`DIAYNLoss` or :class:`DiscreteSkillSACLoss`.
+        actor_lr, critic_lr, objective_lr (float): learning rates. Defaults ``2e-3``, ``3e-3`` and
+            ``1e-2``.
+        alpha_lr (float): of log alpha, when it is tuned. Default ``1e-2``.
+
+    Returns:
+        torch.optim.Adam: with the groups ``"actor"``, ``"critic"``, ``"objective"`` (left out if
+        it has no parameters) and, when alpha is tuned, ``"alpha"``, under ``"name"``.
+
+    Examples:
+        >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
+        >>> from torchrl_hmcts.trainers.worker import make_training_env
+        >>> loss = DIAYNTrainer.make_loss(make_training_env(copies=1))
+        >>> [(g["name"], g["lr"]) for g in make_skill_optimizer(loss).param_groups]
+        [('actor', 0.002), ('critic', 0.003), ('objective', 0.01)]
+    """
+    parts = {
+        "actor": (loss_module.actor_network_params.parameters(), actor_lr),
+        "critic": (loss_module.qvalue_network_params.parameters(), critic_lr),
+        "objective": (_objective(loss_module).parameters(), objective_lr),
+        "alpha": ([loss_module.log_alpha], alpha_lr),
+    }
+    groups = []
+    for name, (parameters, lr) in parts.items():
+        trained = [p for p in parameters if p.requires_grad]
+        if trained:
+            groups.append({"params": trained, "lr": lr, "name": name})
+    return torch.optim.Adam(groups, fused=True)
+
+
+class _SoftUpdate(SoftUpdate):
+    """Moves all targets in one call instead of one by one."""
+
+    @torch.no_grad()
+    def step(self) -> None:
+        targets = list(self._targets.values(True, True))
+        torch._foreach_lerp_(targets, list(self._sources.values(True, True)), 1.0 - self.eps)
 
 
 class _ProgressHook:
     """Moves a progress bar and shows the latest figures beside it."""
 
-    figures = ("loss_actor", "loss_qvalue", "loss_discriminator", "discriminator_accuracy")
+    figures = ("actor_loss", "critic_loss", "discriminator_loss", "discriminator_accuracy")
 
-    def __init__(self, trainer: Trainer, bar: Progress) -> None:
-        self.trainer, self.bar = trainer, bar
+    def __init__(self, trainer: Trainer, progress: Callable[..., Progress]) -> None:
+        self.trainer, self.progress = trainer, progress
 
     def register(self, trainer: Trainer) -> None:
+        trainer.register_op("setup", self.begin)
         trainer.register_op("post_steps_log", self)
-        trainer.register_op("shutdown", self.bar.close)
+        trainer.register_op("shutdown", self.end)
+
+    def begin(self) -> None:
+        self.bar = self.progress(total=self.trainer.total_frames)
+        self.bar.update(self.trainer.collected_frames)  # those of a resumed run
 
     def __call__(self, batch: TensorDictBase) -> None:
         log = self.trainer._log_dict
         figures = {key: f"{float(log[key][-1]):.3f}" for key in self.figures if log.get(key)}
         self.bar.set_postfix(refresh=False, **figures)
         self.bar.update(batch.numel())
+
+    def end(self) -> None:
+        self.bar.close()
+
+
+def _objective(loss_module: LossModule) -> SkillObjective:
+    objective = getattr(loss_module, "objective", None)
+    if not isinstance(objective, SkillObjective):
+        raise TypeError(
+            f"Skills are trained with a loss whose attribute `objective` is a SkillObjective; "
+            f"{type(loss_module).__name__} has none. Use DIAYNLoss, DiscreteSkillSACLoss or "
+            "SkillSACLoss."
+        )
+    return objective
+
+
+def _reached(objective: SkillObjective) -> NestedKey:
+    """Returns the first entry that an objective reads of the next state."""
+    for key in objective.in_keys:
+        if isinstance(key, tuple) and key[0] == "next":
+            return key[1:] if len(key) > 2 else key[1]
+    raise ValueError(
+        f"{type(objective).__name__} reads nothing of the next state, so DIAYNTrainer cannot guess "
+        "where to count coverage. Pass coverage=StateCoverage(key)."
+    )
 
 
 def _width(env: EnvBase, keys: Sequence[NestedKey]) -> int:

@@ -1,0 +1,228 @@
+"""Training that is saved and resumed, and what a checkpoint holds."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torchrl.checkpoint import CheckpointError, CheckpointRotation, GlobalRNGState
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import Compose, TransformedEnv
+
+from torchrl_hmcts.envs import WaterworldMazeEnv
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.resume import GeneratorStates, RunningEpisodes
+from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+
+HALF = 16 * 7  # base steps: 14 of each copy, so that episodes of 10 end on the way
+
+
+def make_env(copies: int = 8) -> TransformedEnv:
+    base = WaterworldMazeEnv(batch_size=[copies], observation=False, max_steps=10)
+    return TransformedEnv(base, Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()))
+
+
+def make_trainer(total: int, copies: int = 8, seed: int | None = None, **kw: Any) -> DIAYNTrainer:
+    env = make_env(copies)
+    loss = DIAYNTrainer.make_loss(env, 4, hidden=(8, 8), fixed_alpha=False)
+    settings = {"frames_per_batch": 16, "batch_size": 32, "buffer_size": 128, **kw}
+    return DIAYNTrainer(env, loss, total_frames=total, seed=seed, **settings)
+
+
+def train(trainer: DIAYNTrainer) -> dict[str, Any]:
+    """Trains, and returns everything on which what comes next depends."""
+    end: dict[str, Any] = {}
+
+    def look() -> None:  # before the collector is shut down
+        end.update(
+            loss=trainer.loss_module.state_dict(),
+            optimizer=trainer.optimizer.state_dict(),
+            buffer=trainer.replay_buffer.storage[:].to_dict(),
+            cursor=trainer.replay_buffer.writer._cursor,
+            rng=GlobalRNGState().state_dict(),
+            counters=[trainer.collected_frames, trainer._optim_count, trainer._last_save],
+            last_log=dict(trainer._last_log),
+            history=dict(trainer.history),
+            collector=trainer.collector.state_dict(),
+            generators=trainer._modules["generators"].state_dict(),
+            episodes=trainer._modules["running_episodes"].state_dict(),
+            coverage=trainer._modules["state_coverage"].state_dict(),
+        )
+        torch.save(end, trainer.copy_of_end)
+
+    trainer.register_op("shutdown", look)
+    trainer.train()
+    return torch.load(trainer.copy_of_end, weights_only=True)
+
+
+def differences(a: Any, b: Any, path: str = "") -> list[str]:
+    """Returns the paths at which two nested structures differ in any bit."""
+    if isinstance(a, torch.Tensor):
+        same = a.dtype == b.dtype and torch.equal(a, b)
+        return [] if same else [path]
+    if isinstance(a, Mapping):
+        if list(a) != list(b):
+            return [f"{path}: {sorted(map(str, a))} and {sorted(map(str, b))}"]
+        return [d for key in a for d in differences(a[key], b[key], f"{path}.{key}")]
+    if isinstance(a, Sequence) and not isinstance(a, str):
+        if len(a) != len(b):
+            return [f"{path}: {len(a)} and {len(b)}"]
+        return [d for i in range(len(a)) for d in differences(a[i], b[i], f"{path}.{i}")]
+    return [] if a == b else [f"{path}: {a} and {b}"]
+
+
+def resume_in_this_process(folder: Path) -> None:
+    trainer = make_trainer(2 * HALF, seed=99, save_dir=folder / "again", save_trainer_interval=60)
+    trainer.load(folder / "checkpoints")
+    trainer.copy_of_end = folder / "resumed.pt"
+    train(trainer)
+
+
+def test_a_run_resumed_in_a_new_process_ends_bit_for_bit_as_one_that_never_stopped(
+    tmp_path: Path,
+) -> None:
+    saving = {"save_trainer_interval": 60}
+    torch.manual_seed(1)
+    whole = make_trainer(2 * HALF, seed=5, save_dir=tmp_path / "other", **saving)
+    whole.copy_of_end = tmp_path / "whole.pt"
+    expected = train(whole)
+    torch.manual_seed(1)
+    half = make_trainer(HALF, seed=5, save_dir=tmp_path / "checkpoints", **saving)
+    half.copy_of_end = tmp_path / "half.pt"
+    assert differences(train(half)["loss"], expected["loss"]) != []
+    subprocess.run([sys.executable, __file__, str(tmp_path)], check=True, timeout=300)
+    resumed = torch.load(tmp_path / "resumed.pt", weights_only=True)
+    assert differences(resumed, expected) == []
+    assert expected["counters"] == [224, 42, 192]
+    assert len(expected["history"]["actor_loss"]) == 14
+
+
+def test_a_checkpoint_holds_no_pickle(tmp_path: Path) -> None:
+    make_trainer(32, save_dir=tmp_path).train()
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} == {".json", ".memmap"}
+
+
+def test_the_newest_checkpoint_of_a_folder_is_loaded_and_old_ones_are_removed(
+    tmp_path: Path,
+) -> None:
+    make_trainer(96, save_dir=tmp_path, keep_last=2, save_trainer_interval=15).train()
+    assert len(CheckpointRotation(tmp_path, keep_last=2).checkpoints()) == 2
+    assert make_trainer(96).load(tmp_path).collected_frames == 96
+    oldest = CheckpointRotation(tmp_path, keep_last=2).checkpoints()[0]
+    assert make_trainer(96).load(oldest).collected_frames == 80
+
+
+def test_a_finished_run_can_be_given_more_base_steps(tmp_path: Path) -> None:
+    make_trainer(32, save_dir=tmp_path).train()
+    trainer = make_trainer(64).load(tmp_path)
+    trainer.train()
+    assert trainer.history["optim_steps"] == [3, 6, 9, 12]
+
+
+def test_a_checkpoint_of_another_number_of_copies_is_refused(tmp_path: Path) -> None:
+    make_trainer(32, save_dir=tmp_path).train()
+    with pytest.raises(CheckpointError, match=r"batch size \[8\]; this one has \[4\]"):
+        make_trainer(32, copies=4).load(tmp_path)
+
+
+def test_a_folder_without_checkpoint_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no checkpoint in .*nothing"):
+        make_trainer(32).load(tmp_path / "nothing")
+
+
+def test_two_places_for_checkpoints_are_refused(tmp_path: Path) -> None:
+    rotation = CheckpointRotation(tmp_path, keep_last=1)
+    with pytest.raises(ValueError, match="save_dir=.* and checkpoint_rotation"):
+        make_trainer(32, save_dir=tmp_path, checkpoint_rotation=rotation)
+
+
+def make_collector(env: Any) -> Collector:
+    return Collector(
+        env, frames_per_batch=8, total_frames=-1, auto_register_policy_transforms=False
+    )
+
+
+def test_episodes_of_a_collector_go_on_in_another() -> None:
+    env, other = make_env(4), make_env(4)
+    env.set_seed(0)
+    collector = make_collector(env)
+    collector.next()
+    state = RunningEpisodes(collector).state_dict()
+    expected = collector.next()
+    copy = make_collector(other)
+    RunningEpisodes(copy).load_state_dict(state)
+    assert torch.equal(copy._carrier["position"], expected["position"][:, 0])
+    assert copy._carrier["step_count"].flatten().tolist() == [2, 2, 2, 2]
+    ids = [c._carrier["collector", "traj_ids"].tolist() for c in (collector, copy)]
+    assert ids == [[0, 1, 2, 3]] * 2
+    pools = [c._traj_pool.get_traj_and_increment(1).tolist() for c in (collector, copy)]
+    assert pools[0] == pools[1]
+    collector.shutdown()
+    copy.shutdown()
+
+
+def test_episodes_of_an_env_with_state_of_its_own_cannot_go_on() -> None:
+    class Locked(WaterworldMazeEnv):
+        batch_locked = True
+        _supports_set_state = False
+
+    collector = make_collector(Locked(batch_size=[4], observation=False))
+    episodes = RunningEpisodes(collector)
+    state = episodes.state_dict()
+    with pytest.raises(ValueError, match="Locked keeps state of its own"):
+        episodes.load_state_dict(state)
+    collector.shutdown()
+
+
+def test_a_collector_in_other_processes_is_refused() -> None:
+    with pytest.raises(TypeError, match="MultiSyncCollector keeps its own"):
+        RunningEpisodes(object.__new__(MultiSyncCollector))
+
+
+class Owner(nn.Module):
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.inner = nn.Module()
+        self.inner.generator = torch.Generator().manual_seed(seed)
+        self.parts = [{"numpy": np.random.default_rng(seed)}, random.Random(seed)]
+        self.itself = self
+
+    def draw(self) -> list[float]:
+        numpy, python = self.parts[0]["numpy"], self.parts[1]  # type: ignore[index]
+        return [
+            float(torch.rand((), generator=self.inner.generator)),
+            float(numpy.random()),
+            python.random(),
+        ]
+
+
+def test_all_kinds_of_generators_are_found_and_go_on_where_they_stood() -> None:
+    one, two = Owner(0), Owner(1)
+    one.draw()
+    state = GeneratorStates(owner=one).state_dict()
+    assert sorted(state) == [
+        "owner._modules.inner.generator",
+        "owner.parts.0.numpy",
+        "owner.parts.1",
+    ]
+    GeneratorStates(owner=two).load_state_dict(state)
+    assert two.draw() == one.draw()
+
+
+def test_a_generator_that_is_missing_is_named() -> None:
+    state = GeneratorStates(owner=Owner(0)).state_dict()
+    with pytest.raises(ValueError, match="owner.parts.1"):
+        GeneratorStates(owner=nn.Module()).load_state_dict(state)
+
+
+if __name__ == "__main__":
+    resume_in_this_process(Path(sys.argv[1]))

@@ -1,0 +1,139 @@
+"""How much of the state space training has seen.
+
+Letters: n base steps of a batch, D size of the watched entry, C distinct cells.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.trainers import Trainer, TrainerHookBase
+
+
+class StateCoverage(TrainerHookBase):
+    r"""Counts the distinct cells of an entry that were visited: lately, and since the start.
+
+    .. math::
+
+        C_t = \bigl|\{\lfloor x_i / h \rfloor : t - w < i \le t\}\bigr|
+
+    with the watched entry :math:`x_i` after base step i, the side :math:`h` of a cell and the
+    window :math:`w`. Coverage of the window falls when skills forget where they went; that since
+    the start only grows. A hook of any TorchRL ``Trainer``, and usable alone: call it with batches.
+
+    Args:
+        key (NestedKey): entry ``[*B, D]`` to watch, read under ``"next"``. Default
+            ``"displacement"``: how far and in which directions the skills carry.
+        cell_side (float): side of a cell in the units of the entry. Default ``0.5``: half a
+            tile, the diameter of Waterworld's disc.
+        window (int): base steps that count as late, in whole batches. Default ``4_000``: a tenth of
+            the default training.
+
+    Returns:
+        From ``coverage(batch)``: ``{"state_coverage": C of the window, "state_coverage_total": C
+        since the start}``, which a ``Trainer`` logs under these names.
+
+    Raises:
+        ValueError: if ``cell_side`` or ``window`` is not positive.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.trainers.coverage import StateCoverage
+        >>> coverage = StateCoverage(cell_side=1.0, window=2)
+        >>> def visit(*x):
+        ...     moved = torch.tensor(x).unsqueeze(-1)
+        ...     return coverage(TensorDict(next=TensorDict(displacement=moved)))
+        >>> visit(0.1, 2.3)
+        {'state_coverage': 2.0, 'state_coverage_total': 2.0}
+        >>> visit(2.9, 2.1)
+        {'state_coverage': 1.0, 'state_coverage_total': 2.0}
+    """
+
+    def __init__(
+        self, key: NestedKey = "displacement", *, cell_side: float = 0.5, window: int = 4_000
+    ) -> None:
+        if not cell_side > 0.0:
+            raise ValueError(
+                f"StateCoverage needs cells of a positive side, in units of {key!r}; got "
+                f"cell_side={cell_side}."
+            )
+        if window < 1:
+            raise ValueError(
+                f"StateCoverage needs a window of at least one base step; got window={window}."
+            )
+        self.key = unravel_key(("next", key))
+        self.cell_side = float(cell_side)
+        self.window = int(window)
+        self._total: set[bytes] = set()
+        self._recent: Counter[bytes] = Counter()
+        self._batches: deque[list[bytes]] = deque()
+        self._steps = 0
+        self._size = 0  # D, known from the first batch on
+
+    def __call__(self, batch: TensorDictBase) -> dict[str, float]:
+        value = batch.get(self.key)
+        rows = value.detach().reshape(-1, value.shape[-1]).numpy(force=True)
+        cells = np.floor(rows / self.cell_side).astype(np.int32)
+        self._size = cells.shape[1]
+        self._add(_as_bytes(cells))
+        return {
+            "state_coverage": float(len(self._recent)),
+            "state_coverage_total": float(len(self._total)),
+        }
+
+    def _add(self, cells: list[bytes]) -> None:
+        self._total.update(cells)
+        self._recent.update(cells)
+        self._batches.append(cells)
+        self._steps += len(cells)
+        # The last batch stays, even if it alone is longer than the window.
+        while self._steps > self.window and len(self._batches) > 1:
+            old = self._batches.popleft()
+            self._steps -= len(old)
+            for cell in old:
+                self._recent[cell] -= 1
+                if not self._recent[cell]:
+                    del self._recent[cell]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the visited cells, int32 ``[*, D]``, and the sizes of the window's batches."""
+        return {
+            "total": self._as_cells(sorted(self._total)),
+            "recent": self._as_cells([cell for batch in self._batches for cell in batch]),
+            "batch_steps": [len(batch) for batch in self._batches],
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        total, recent = (state_dict[name].numpy(force=True) for name in ("total", "recent"))
+        self._size = total.shape[1]
+        self._total = set(_as_bytes(total))
+        self._recent.clear()
+        self._batches.clear()
+        self._steps = begin = 0
+        for steps in state_dict["batch_steps"]:
+            self._add(_as_bytes(recent[begin : begin + steps]))
+            begin += steps
+
+    def register(self, trainer: Trainer, name: str = "state_coverage") -> None:
+        trainer.register_op("pre_steps_log", self)
+        trainer.register_module(name, self)
+
+    def _as_cells(self, cells: list[bytes]) -> torch.Tensor:
+        flat = np.frombuffer(b"".join(cells), np.int32).copy()
+        return torch.from_numpy(flat.reshape(len(cells), self._size))
+
+
+def _as_bytes(cells: np.ndarray) -> list[bytes]:
+    """Returns the rows of int32 cells as keys that can be counted."""
+    if not cells.size:
+        return []
+    width = 4 * cells.shape[1]
+    data = cells.tobytes()
+    return [data[i : i + width] for i in range(0, len(data), width)]

@@ -1,0 +1,355 @@
+"""Training of the manager: search, learn from the search, search with what was learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import EnvBase
+from torchrl.trainers import (
+    DefaultOptimizationStepper,
+    LRSchedulerHook,
+    ReplayBufferTrainer,
+    Trainer,
+)
+
+from torchrl_hmcts.objectives import ExpertIterationLoss
+from torchrl_hmcts.planners import (
+    PUCT,
+    MaxBackup,
+    MCTSPlanner,
+    NoveltyTest,
+    PolicyValueEvaluator,
+    SearchBudget,
+    search_examples,
+)
+from torchrl_hmcts.trainers.diayn import Progress
+
+_TARGETS = ("policy_target", "policy_weight", "value_target", "value_weight", "action_mask")
+
+
+def make_guided_planner(
+    env: EnvBase,
+    network: TensorDictModuleBase,
+    *,
+    c: float = 0.3,
+    uniform_share: float = 0.05,
+    novelty: NoveltyTest | None = None,
+    expand: Literal["all", "one"] = "one",
+    budget: SearchBudget | None = None,
+    **planner_kwargs: Any,
+) -> MCTSPlanner:
+    """Build a planner that a network guides: PUCT with its prior, its values at the leaves.
+
+    Args:
+        env: the macro environment.
+        network: writes ``"logits"`` and ``"state_value"`` from entries of the env.
+        c: exploration constant of PUCT, in units of the return. Default 0.3, for returns up to 1.
+        uniform_share: share of the prior that is spread over all options. Default 0.05: a few
+            simulations more where the network is right, far fewer where it is wrong.
+        novelty: which new nodes are worth searching. Default: all. Choose a test much stricter on
+            what it calls equal than without a network (in Waterworld a radius of 0.2 tiles instead
+            of 0.7): the values tell near states apart, but a network that is still wrong goes in
+            circles without one.
+        expand: ``"one"`` (default) simulates only the option that PUCT chooses.
+        budget: Default: 4,000 expansions, of one option each.
+        **planner_kwargs: passed to ``MCTSPlanner``.
+
+    Returns:
+        The planner. Values are backed up by their maximum, which is exact in a deterministic env.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> from torchrl_hmcts.trainers.expert_iteration import make_guided_planner
+        >>> from torchrl_hmcts.trainers.maze_networks import MazeNetwork
+        >>> env = WaterworldMazeEnv(observation=False)  # plans base steps, for example
+        >>> make_guided_planner(env, MazeNetwork(env.mazes)).num_options
+        4
+    """
+    guide = PolicyValueEvaluator(network, uniform_share=uniform_share)
+    if budget is None:
+        budget = SearchBudget(expansions=4_000)
+    return MCTSPlanner(
+        env,
+        tree_policy=PUCT(c=c),
+        leaf_evaluator=guide.value,
+        option_prior=guide.prior,
+        backup=MaxBackup(),
+        novelty=novelty,
+        expand=expand,
+        budget=budget,
+        **planner_kwargs,
+    )
+
+
+class SearchCollector:
+    """Yields one batch of examples per iteration, from searches at fresh starts of an env.
+
+    Takes the place of a TorchRL collector in a ``Trainer``: a frame is an example. What the
+    searches cost is counted in ``base_steps``.
+
+    Args:
+        env: the macro environment whose resets give the starts; batch size ``[]``.
+        first_planner: searches in iteration 0, before anything is learned.
+        planner: searches in the iterations after it.
+        iterations: batches to yield.
+        searches: starts per iteration.
+        keys: entries of the states that the network reads.
+        group: searches side by side. Default 100.
+        seed: of the starts: those of iteration i come from ``seed + i``. Default 0.
+        example_kwargs: passed to :func:`~torchrl_hmcts.planners.search_examples`.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.trainers.expert_iteration import SearchCollector
+        >>> env = ChainEnv(length=4)
+        >>> planner = MCTSPlanner(env)
+        >>> collector = SearchCollector(
+        ...     env, planner, planner, iterations=1, searches=2, keys=["state"])
+        >>> next(iter(collector))["state"].reshape(-1).tolist(), collector.solved
+        ([0, 1, 2, 0, 1, 2], [2])
+    """
+
+    init_random_frames = 0
+
+    def __init__(
+        self,
+        env: EnvBase,
+        first_planner: MCTSPlanner,
+        planner: MCTSPlanner,
+        *,
+        iterations: int,
+        searches: int,
+        keys: Sequence[NestedKey],
+        group: int = 100,
+        seed: int = 0,
+        example_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        self.env = env
+        self.planners = (first_planner, planner)
+        self.iterations = iterations
+        self.searches = searches
+        self.keys = list(keys)
+        self.group = group
+        self.seed = seed
+        self.example_kwargs = example_kwargs or {}
+        self.base_steps: list[int] = []  # simulated, per iteration
+        self.simulations: list[int] = []  # options simulated, per iteration
+        self.solved: list[int] = []  # searches that found a plan, per iteration
+        for planner in self.planners:
+            planner.simulator.keep([k for k in self.keys if k not in planner.simulator.kept_keys])
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while len(self.solved) < self.iterations:
+            yield self.collect()
+
+    def collect(self) -> TensorDictBase:
+        """Search once at each start of the next iteration, and return the examples ``[K]``."""
+        iteration = len(self.solved)
+        planner = self.planners[min(iteration, 1)]
+        self.env.set_seed(self.seed + iteration)
+        starts = self.env.reset(TensorDict(batch_size=[self.searches]))
+        examples, counts = [], np.zeros(3, np.int64)
+        for begin in range(0, self.searches, self.group):
+            search = planner.search(starts[begin : begin + self.group], seed=iteration)
+            found = search_examples(search, keys=self.keys, **self.example_kwargs)
+            examples.append(found.select(*self.keys, *_TARGETS))
+            counts += (
+                search.num_base_steps.sum(),
+                search.num_simulations.sum(),
+                (search.best_node >= 0).sum(),
+            )
+        planner.last_search = None  # its trees are large
+        for kept, count in zip(
+            (self.base_steps, self.simulations, self.solved), counts, strict=True
+        ):
+            kept.append(int(count))
+        return torch.cat(examples)
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seed the starts of the iterations to come."""
+        self.seed = seed
+        return seed
+
+    def shutdown(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing runs beside this process."""
+
+    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing to do: the planner reads the network that is trained."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what was counted, and with it the iteration."""
+        return {name: list(getattr(self, name)) for name in ("base_steps", "simulations", "solved")}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on after the iterations of another collector."""
+        for name, values in state_dict.items():
+            setattr(self, name, list(values))
+
+
+class ExpertIterationTrainer(Trainer):
+    """Trains the network that guides a planner, on what the planner finds with its help.
+
+    Per iteration: search at fresh starts (:class:`SearchCollector`), store the examples, and make
+    ``updates_per_iteration`` updates with Adam, whose learning rate falls to zero by a cosine over
+    all updates. Iteration 0 searches without the network.
+
+    Args:
+        env (EnvBase): the macro environment of the training mazes.
+        network (TensorDictModuleBase): reads entries of the env's states, writes ``"logits"`` and
+            ``"state_value"``.
+        first_planner (MCTSPlanner): over ``env``, for iteration 0.
+        planner (MCTSPlanner, optional): for the iterations after it. Default:
+            :func:`make_guided_planner` with at most 400 expansions.
+        loss_module (ExpertIterationLoss, optional): Default: ``value_loss="log"`` with
+            ``value_coeff=4``, Huber's loss of the base steps to the goal.
+        iterations (int): Default 4.
+        searches_per_iteration (int): starts per iteration. Default 400.
+        updates_per_iteration (int): Default 200.
+        batch_size (int): examples per update. Default 256.
+        buffer_size (int): examples kept. Default 50,000.
+        lr (float): Adam's learning rate at the start. Default 5e-3.
+        clip_norm (float): bound of the gradient's norm. Default 5.
+        example_kwargs (dict, optional): passed to
+            :func:`~torchrl_hmcts.planners.search_examples`. Default ``{"roots": False}``: the
+            states from which a plan was found.
+        progress (callable, optional): called with ``total=`` the updates it returns a progress bar,
+            e.g. ``tqdm.tqdm``. Default: quiet.
+        seed (int): of the starts and of the batches. Default 0.
+        **trainer_kwargs: passed to ``torchrl.trainers.Trainer`` (``logger``, ``checkpoint``, ...).
+
+    Raises:
+        ValueError: if a number is below 1.
+
+    Reference:
+        Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search", 2017,
+        arXiv 1705.08439.
+
+    Example:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.trainers import ExpertIterationTrainer
+        >>> class TwoHeads(torch.nn.Linear):
+        ...     def forward(self, state):
+        ...         out = super().forward(state.float().reshape(-1, 1))
+        ...         return out[:, :2], out[:, 2:].sigmoid()
+        >>> net = TensorDictModule(TwoHeads(1, 3), ["state"], ["logits", "state_value"])
+        >>> env = ChainEnv(length=5)
+        >>> trainer = ExpertIterationTrainer(
+        ...     env, net, MCTSPlanner(env), iterations=2, searches_per_iteration=1,
+        ...     updates_per_iteration=60)
+        >>> trainer.train()
+        >>> trainer.collector.solved, trainer.collector.simulations[0]  # plans, options simulated
+        ([1, 1], 30)
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        network: TensorDictModuleBase,
+        first_planner: MCTSPlanner,
+        *,
+        planner: MCTSPlanner | None = None,
+        loss_module: ExpertIterationLoss | None = None,
+        iterations: int = 4,
+        searches_per_iteration: int = 400,
+        updates_per_iteration: int = 200,
+        batch_size: int = 256,
+        buffer_size: int = 50_000,
+        lr: float = 5e-3,
+        clip_norm: float = 5.0,
+        example_kwargs: dict[str, Any] | None = None,
+        progress: Callable[..., Progress] | None = None,
+        seed: int = 0,
+        **trainer_kwargs: Any,
+    ) -> None:
+        for name, value in (
+            ("iterations", iterations),
+            ("searches_per_iteration", searches_per_iteration),
+            ("updates_per_iteration", updates_per_iteration),
+        ):
+            if value < 1:
+                raise ValueError(f"ExpertIterationTrainer needs {name} >= 1; got {value}.")
+        if planner is None:
+            # What is not found soon is left out: a search of thousands costs more than it teaches.
+            planner = make_guided_planner(env, network, budget=SearchBudget(expansions=400))
+        if loss_module is None:
+            loss_module = ExpertIterationLoss(network, value_loss="log", value_coeff=4.0)
+        collector = SearchCollector(
+            env,
+            first_planner,
+            planner,
+            iterations=iterations,
+            searches=searches_per_iteration,
+            keys=list(network.in_keys),
+            seed=seed,
+            example_kwargs={"roots": False} if example_kwargs is None else example_kwargs,
+        )
+        buffer = ReplayBuffer(
+            storage=LazyTensorStorage(buffer_size),
+            batch_size=batch_size,
+            generator=torch.Generator().manual_seed(seed),
+        )
+        optimizer = torch.optim.Adam(loss_module.parameters(), lr=lr)
+        super().__init__(
+            collector=collector,  # type: ignore[arg-type]
+            total_frames=torch.iinfo(torch.int64).max,  # the collector knows when to end
+            frame_skip=1,
+            optim_steps_per_batch=updates_per_iteration,
+            loss_module=loss_module,
+            optimizer=optimizer,
+            optimization_stepper=_DetachedStepper(),
+            replay_buffer=buffer,
+            batch_size=batch_size,
+            clip_norm=clip_norm,
+            progress_bar=False,
+            **trainer_kwargs,
+        )
+        self.network = network
+        self.planner = planner
+        replay = ReplayBufferTrainer(buffer, batch_size=batch_size)
+        self.register_op("batch_process", replay.extend)
+        self.register_op("process_optim_batch", replay.sample)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+            optimizer, iterations * updates_per_iteration
+        )
+        LRSchedulerHook(schedule, interval="optim").register(self)
+        if progress is not None:
+            bar = progress(total=iterations * updates_per_iteration)
+            self.register_op("post_optim", lambda: bar.update(1))
+            self.register_op("post_steps_log", lambda batch: self._report(bar))
+            self.register_op("shutdown", bar.close)
+
+    def _report(self, bar: Progress) -> None:
+        counts = self.collector
+        searches = counts.searches
+        figures = {
+            "solved": f"{counts.solved[-1]}/{searches}",
+            "base_steps_per_search": f"{counts.base_steps[-1] / searches:.0f}",
+        }
+        accuracy = self._log_dict.get("policy_accuracy")
+        if accuracy:
+            figures["policy_accuracy"] = f"{float(accuracy[-1]):.3f}"
+        bar.set_postfix(refresh=False, **figures)
+
+    @property
+    def history(self) -> dict[str, list[float]]:
+        """Per iteration the mean over its updates of each loss and diagnostic, by its name."""
+        return {key: [float(x) for x in values] for key, values in self._log_dict.items()}
+
+
+class _DetachedStepper(DefaultOptimizationStepper):
+    """The default step; what it logs is kept for ever and must not hold a graph."""
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        return super().step(trainer, sub_batch).detach()

@@ -1,0 +1,367 @@
+"""Skills that are added while they are of use.
+
+Letters: B searches, Z skills there is room for.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDictBase
+from torchrl.trainers import Trainer, TrainerHookBase
+
+from torchrl_hmcts.modules import GrowingSkillPrior, SkillPrior
+from torchrl_hmcts.planners import MCTSPlanner, Search
+from torchrl_hmcts.planners.tree import PRUNED
+
+
+class SearchCoverage:
+    r"""Counts the places that searches of a fixed budget reach with the skills that are on.
+
+    .. math:: C = \frac{1}{B} \sum_{b < B} \bigl|\{\text{nodes of tree } b
+        \text{ that its novelty test accepted}\}\bigr|
+
+    Nodes that the novelty test accepts are apart by its radius, so that C measures the area within
+    reach. Give the planner a budget of simulated base steps: every skill costs some in every
+    expansion, so that a skill which leads nowhere new lowers C.
+
+    Args:
+        planner (MCTSPlanner): over the worker's skills, with a novelty test that keeps its radius
+            (``max_relaxations=0``) and a budget that does not end at the first plan
+            (``until_plan=False``).
+        starts (TensorDictBase): states ``[B]`` to search from, in training mazes. Every call
+            searches from all of them, with the same random numbers.
+        prior (SkillPrior, optional): which skills are on, written into the starts under the
+            planner's mask key. Default ``None``: the starts are used as they are.
+
+    Returns:
+        From ``coverage()``: C, a float. The attribute ``base_steps`` adds up what was simulated.
+
+    Raises:
+        ValueError: if the planner has no novelty test, or ends at its first plan.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.trainers.growing import SearchCoverage
+        >>> env = ChainEnv(length=5)
+        >>> planner = MCTSPlanner(
+        ...     env,
+        ...     novelty=RadiusNovelty("state", 1.0, max_relaxations=0),
+        ...     budget=SearchBudget(base_steps=20, until_plan=False),
+        ... )
+        >>> SearchCoverage(planner, env.reset().unsqueeze(0))()
+        5.0
+    """
+
+    def __init__(
+        self, planner: MCTSPlanner, starts: TensorDictBase, prior: SkillPrior | None = None
+    ) -> None:
+        if planner.novelty is None:
+            raise ValueError(
+                "SearchCoverage counts the nodes that a novelty test accepts; the planner has "
+                "none. Build it with e.g. novelty=RadiusNovelty('position', 0.7)."
+            )
+        if planner.budget.until_plan:
+            raise ValueError(
+                "SearchCoverage needs searches that use up their budget, or it counts how near the "
+                "target is. Build the planner with budget=SearchBudget(..., until_plan=False)."
+            )
+        self.planner = planner
+        self.starts = starts
+        self.prior = prior
+        self.base_steps = 0
+
+    def __call__(self) -> float:
+        starts = self.starts.clone()
+        key = self.planner.simulator.mask_key
+        if self.prior is not None and key is not None:
+            active = self.prior.active()
+            starts.set(key, active.expand(*starts.batch_size, len(active)).clone())
+        search = self.planner.search(starts, seed=0)
+        self.base_steps += int(search.num_base_steps.sum())
+        return float(num_places(search).mean())
+
+
+def num_places(search: Search) -> np.ndarray:
+    """Return how many nodes of each tree its novelty test accepted, int64 ``[B]``.
+
+    Args:
+        search: a search, finished or not.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=5)
+        >>> int(num_places(MCTSPlanner(env).search(env.reset()))[0]) > 1
+        True
+    """
+    used = np.arange(search.tree.capacity) < search.tree.num_nodes[:, None]
+    accepted: np.ndarray = (search.tree.nodes["flags"] & PRUNED) == 0
+    return (accepted & used).sum(-1)
+
+
+class GrowSkills(TrainerHookBase):
+    r"""Switches on one skill after the other while they add coverage, then goes back to the best.
+
+    .. math:: C_n \ge (1 + g_{\min})\, C_{n^*} \;\Rightarrow\; n^* \leftarrow n
+
+    :math:`C_n` is the coverage with n skills, measured once they are learned: as soon as the
+    discriminator's accuracy has stopped to rise over a window, but not before ``min_base_steps``
+    and not later than ``max_base_steps`` after the last change. When ``patience`` skills in a row
+    have added nothing, they are switched off again, the networks get back the weights with which
+    :math:`n^*` was measured, and the rest of training is spent on these skills. With ``prune``, a
+    skill without which coverage is no smaller (two that do the same) is dropped before, the most
+    useless first.
+
+    A skill that is switched on starts from the fresh weights its heads were built with, and the
+    replay buffer is emptied: it holds the new skill hardly at all, so that the discriminator
+    would hold it to be rare and the new skill would do what an old one does.
+
+    A hook of any TorchRL ``Trainer`` (of one process) whose loss has the prior. No loss or env
+    saves the prior, so this does.
+
+    Args:
+        prior (GrowingSkillPrior): the prior that the env's ``SkillTransform``, the skill objective
+            and the planner's ``SkillMaskTransform`` read.
+        coverage (callable): ``coverage() -> float`` with the skills that are on: a
+            :class:`SearchCoverage`, or your own. More is better.
+        min_gain (float): :math:`g_{\min}`, the share of coverage that more skills must add. Default
+            ``0.05``.
+        patience (int): skills in a row that may add nothing before growing ends. Default ``2``: a
+            third skill on a plane often has to wait for the fourth.
+        prune (bool): drop useless skills among the :math:`n^*` when growing ends. Default ``True``.
+        enough (float, optional): coverage from which on no skill is added. Default ``None``: only
+            the gain counts.
+        min_base_steps, max_base_steps (int): base steps that a number of skills is trained before
+            it is judged, at least and at most. Defaults ``3_200`` and ``4_800``.
+        until (int, optional): base steps of training after which no skill is switched on, so that
+            the last ones are trained long enough. Default ``None``: as long as training lasts.
+        window (int): batches over which the accuracy must have stopped to rise. Default ``40``.
+        min_rise (float): rise of the mean accuracy, from the first half of the window to the
+            second, below which it has stopped. Default ``0.01``.
+        accuracy_key (str): entry of the losses that is watched. Default
+            ``"discriminator_accuracy"``; where a loss has none, ``max_base_steps`` decides.
+
+    Attributes:
+        history: dict of lists, one entry per judgement: ``base_steps`` of training, ``num_active``
+            skills judged, ``accuracy``, ``coverage``, ``gain`` over the best before (NaN for the
+            first), ``better``.
+        dropped (list of int): the skills that pruning has dropped, in order.
+        finished (bool): the number of skills will not change any more.
+
+    Raises:
+        ValueError: if a number is out of its range.
+
+    Reference:
+        This project's, for what section 6.2 of Bartley 2023 leaves to the future. Adding skills as
+        the discriminator's accuracy saturates: the curriculum of Achiam et al., "Variational Option
+        Discovery Algorithms", 2018, arXiv 1807.10299.
+
+    Example:
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> from torchrl_hmcts.modules import GrowingSkillPrior
+        >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+        >>> from torchrl_hmcts.trainers.growing import GrowSkills
+        >>> from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+        >>> prior = GrowingSkillPrior(8, num_active=2)
+        >>> env = TransformedEnv(
+        ...     WaterworldMazeEnv(batch_size=[32], observation=False),
+        ...     Compose(SkillTransform(8, 50, prior=prior), DisplacementTransform()),
+        ... )
+        >>> loss = DIAYNTrainer.make_loss(env, num_skills=8, seed=0, prior=prior)
+        >>> trainer = DIAYNTrainer(env, loss, total_frames=256, seed=0)
+        >>> coverages = iter([1.0, 2.0, 2.0])  # of 2, 3 and 4 skills
+        >>> grow = GrowSkills(
+        ...     prior, lambda: next(coverages), patience=1, prune=False,
+        ...     min_base_steps=64, max_base_steps=64)
+        >>> grow.register(trainer)
+        >>> trainer.train()
+        >>> grow.history["num_active"], grow.history["better"], int(prior.num_active)
+        ([2, 3, 4], [True, True, False], 3)
+    """
+
+    def __init__(
+        self,
+        prior: GrowingSkillPrior,
+        coverage: Callable[[], float],
+        *,
+        min_gain: float = 0.05,
+        patience: int = 2,
+        prune: bool = True,
+        enough: float | None = None,
+        min_base_steps: int = 3_200,
+        max_base_steps: int = 4_800,
+        until: int | None = None,
+        window: int = 40,
+        min_rise: float = 0.01,
+        accuracy_key: str = "discriminator_accuracy",
+    ) -> None:
+        if not 1 <= min_base_steps <= max_base_steps:
+            raise ValueError(
+                "GrowSkills judges skills between min_base_steps and max_base_steps after the last "
+                f"change, 1 <= min <= max; got {min_base_steps} and {max_base_steps}."
+            )
+        if window < 2:
+            raise ValueError(
+                f"GrowSkills compares two halves of a window of batches; got window={window}."
+            )
+        if patience < 1:
+            raise ValueError(
+                "GrowSkills ends when patience skills in a row have added nothing, one at least; "
+                f"got patience={patience}."
+            )
+        if not min_gain >= 0.0:
+            raise ValueError(
+                "GrowSkills keeps skills that raise coverage by min_gain, which must not be "
+                f"negative, or it would never stop; got {min_gain}."
+            )
+        self.prior = prior
+        self.coverage = coverage
+        self.min_gain = float(min_gain)
+        self.patience = int(patience)
+        self.prune = bool(prune)
+        self.enough = enough
+        self.min_base_steps = int(min_base_steps)
+        self.max_base_steps = int(max_base_steps)
+        self.until = until
+        self.window = int(window)
+        self.min_rise = float(min_rise)
+        self.accuracy_key = accuracy_key
+        self.finished = False
+        self.history: dict[str, list[Any]] = {key: [] for key in _COLUMNS}
+        self.dropped: list[int] = []
+        self._changed_at = 0  # base steps of training at the last change
+        self._best: dict[str, Any] = {}  # number, coverage and weights of the best skills so far
+        self._fruitless = 0  # skills in a row that added nothing
+        self._accuracies: list[float] = []  # since the last change, at most a window
+        self._trainer: Trainer | None = None
+
+    def register(self, trainer: Trainer, name: str = "grow_skills") -> None:
+        self._trainer = trainer
+        trainer.register_op("post_optim_complete_log", self.watch)
+        trainer.register_op("post_steps", self)
+        trainer.register_module(name, self)
+
+    def watch(self, optim_steps: int, losses: TensorDictBase | None) -> dict[str, float]:
+        """Notes a batch's accuracy; returns what to log."""
+        accuracy = None if losses is None else losses.get(self.accuracy_key, None)
+        if accuracy is not None:
+            self._accuracies = [*self._accuracies, float(accuracy)][-self.window :]
+        return {"num_active_skills": float(self.prior.active().sum())}
+
+    def saturated(self) -> bool:
+        """Returns whether the accuracy has stopped to rise."""
+        if len(self._accuracies) < self.window:
+            return False
+        half = self.window // 2
+        first, second = self._accuracies[:half], self._accuracies[half:]
+        return float(np.mean(second) - np.mean(first)) < self.min_rise
+
+    def __call__(self) -> None:
+        if self._trainer is None:
+            raise RuntimeError("GrowSkills runs inside a Trainer: call grow.register(trainer).")
+        now = int(self._trainer.collected_frames)
+        since = now - self._changed_at
+        if self.finished or since < self.min_base_steps:
+            return
+        if self.saturated() or since >= self.max_base_steps:
+            self._judge(self._trainer, now)
+
+    def _judge(self, trainer: Trainer, base_steps: int) -> None:
+        """Measures the coverage; then switches a skill on, or those off that add nothing."""
+        number = int(self.prior.num_active)
+        coverage = float(self.coverage())
+        gain = float("nan")
+        if self._best:
+            before = self._best["coverage"]
+            gain = coverage / before - 1.0 if before else float("inf")
+        better = not self._best or gain >= self.min_gain
+        accuracy = float(np.mean(self._accuracies)) if self._accuracies else float("nan")
+        row = (base_steps, number, accuracy, coverage, gain, better)
+        for key, value in zip(_COLUMNS, row, strict=True):
+            self.history[key].append(value)
+        if better:
+            self._best = {"number": number, "coverage": coverage, "weights": _weights(trainer)}
+        self._fruitless = 0 if better else self._fruitless + 1
+        self.finished = (
+            self._fruitless >= self.patience
+            or number == self.prior.num_skills
+            or (self.until is not None and base_steps >= self.until)
+            or (self.enough is not None and coverage >= self.enough)
+        )
+        if not self.finished:
+            self.prior.set_num_active(number + 1)
+        else:
+            if not better:
+                self.prior.set_num_active(self._best["number"])
+                _load_weights(trainer, self._best["weights"])
+            if self.prune:
+                self._drop_useless_skills()
+            self._best.pop("weights")
+            if better and not self.dropped:
+                return  # nothing has changed
+        self._changed_at = base_steps
+        self._accuracies = []
+        if trainer.replay_buffer is not None:
+            trainer.replay_buffer.empty()
+
+    def _drop_useless_skills(self) -> None:
+        """Drops skills while coverage without them is no smaller."""
+        coverage = self._best["coverage"]
+        while int(self.prior.active().sum()) > 2:
+            without = {}
+            for skill in self.prior.active().nonzero().flatten().tolist():
+                self.prior.drop(skill)
+                without[skill] = float(self.coverage())
+                self.prior.drop(skill, dropped=False)
+            useless = max(without, key=lambda skill: without[skill])
+            if without[useless] < coverage:
+                return
+            coverage = without[useless]
+            self.prior.drop(useless)
+            self.dropped.append(useless)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the prior's state, how far growing has come, the best weights, the history."""
+        return {
+            "prior": self.prior.state_dict(),
+            "finished": self.finished,
+            "changed_at": self._changed_at,
+            "best": dict(self._best),
+            "fruitless": self._fruitless,
+            "dropped": list(self.dropped),
+            "accuracies": list(self._accuracies),
+            "history": {key: list(values) for key, values in self.history.items()},
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        self.prior.load_state_dict(state_dict["prior"])
+        self.finished = bool(state_dict["finished"])
+        self._changed_at = int(state_dict["changed_at"])
+        self._best = dict(state_dict["best"])
+        self._fruitless = int(state_dict["fruitless"])
+        self.dropped = list(state_dict["dropped"])
+        self._accuracies = list(state_dict["accuracies"])
+        self.history = {key: list(state_dict["history"][key]) for key in _COLUMNS}
+
+
+def _weights(trainer: Trainer) -> dict[str, Any]:
+    """Copies what training has learned so far."""
+    parts = {"loss_module": trainer.loss_module, "optimizer": trainer.optimizer}
+    return {
+        name: copy.deepcopy(part.state_dict()) for name, part in parts.items() if part is not None
+    }
+
+
+def _load_weights(trainer: Trainer, weights: Mapping[str, Any]) -> None:
+    trainer.loss_module.load_state_dict(weights["loss_module"])
+    if trainer.optimizer is not None:
+        trainer.optimizer.load_state_dict(copy.deepcopy(weights["optimizer"]))
+
+
+_COLUMNS = ("base_steps", "num_active", "accuracy", "coverage", "gain", "better")

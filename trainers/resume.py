@@ -1,0 +1,315 @@
+"""Checkpoints from which training goes on as if it had never stopped.
+
+TorchRL's ``Trainer`` saves the loss, the optimiser, the replay buffer and its counters. What else
+the next update depends on is saved by the components here, each of them an object with
+``state_dict`` and ``load_state_dict`` to hand to any ``torchrl.checkpoint.Checkpoint``:
+the running episodes (:class:`RunningEpisodes`), the random number generators that envs, transforms
+and policies own (:class:`GeneratorStates`) and the curves so far (:class:`HistoryState`).
+:class:`ResumableTrainer` is a ``Trainer`` with all of them.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointRotation,
+    GlobalRNGState,
+    StateDictCheckpointAdapter,
+)
+from torchrl.collectors import BaseCollector, Collector
+from torchrl.trainers import DefaultOptimizationStepper, Trainer
+
+Generator = torch.Generator | np.random.Generator | random.Random
+
+
+class RunningEpisodes:
+    """State of the episodes that a collector is in the middle of.
+
+    A collector's own state dict has its counters and the env's transforms, but not where the
+    episodes stand, so that a resumed run would begin new ones. This adds the tensordict from which
+    the collector takes its next step. It needs an env whose whole state is in the tensordict.
+
+    Args:
+        collector (Collector): single-process collector over an env whose ``_supports_set_state`` is
+            True or whose ``batch_locked`` is False, as those of ``torchrl_hmcts.envs``.
+
+    Raises:
+        TypeError: if the collector runs its envs in other processes.
+
+    Examples:
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> from torchrl_hmcts.trainers.resume import RunningEpisodes
+        >>> collector = Collector(
+        ...     WaterworldMazeEnv(batch_size=[2], observation=False),
+        ...     frames_per_batch=4, total_frames=8, auto_register_policy_transforms=False)
+        >>> RunningEpisodes(collector).state_dict()["entries"]["position"].shape
+        torch.Size([2, 2])
+        >>> collector.shutdown()
+    """
+
+    def __init__(self, collector: BaseCollector) -> None:
+        if not isinstance(collector, Collector):
+            raise TypeError(
+                f"RunningEpisodes saves the episodes of a Collector, which runs in this process; "
+                f"{type(collector).__name__} keeps its own in others. Collect with "
+                "torchrl.collectors.Collector, or do without exact resume."
+            )
+        self.collector = collector
+
+    @property
+    def complete(self) -> bool:
+        """Whether the env's whole state is in the tensordict."""
+        env = self.collector.env
+        return bool(env._supports_set_state or not env.batch_locked)
+
+    def state_dict(self) -> dict[str, Any]:
+        carrier = self.collector._carrier
+        state: dict[str, Any] = {
+            "batch_size": list(carrier.batch_size),
+            "entries": carrier.to_dict(convert_tensors=False),
+        }
+        if self.collector.track_traj_ids:
+            state["traj_pool"] = self.collector._traj_pool.state_dict()
+        return state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        if not self.complete:
+            raise ValueError(
+                f"{type(self.collector.env).__name__} keeps state of its own, so its episodes "
+                "cannot go on from a checkpoint. Use an env that can be set to any state, or leave "
+                "this component out when loading (strict='warn'): new episodes begin then."
+            )
+        old = self.collector._carrier
+        saved = torch.Size(state_dict["batch_size"])
+        if saved != old.batch_size:
+            raise ValueError(
+                f"The checkpoint has episodes of an env of batch size {list(saved)}; this one has "
+                f"{list(old.batch_size)}. Resume with as many copies as before."
+            )
+        self.collector._carrier = TensorDict(
+            dict(state_dict["entries"]), batch_size=saved, device=old.device
+        )
+        if "traj_pool" in state_dict and self.collector.track_traj_ids:
+            # The collector's own load has given out numbers for the episodes it would have begun.
+            self.collector._traj_pool.load_state_dict(state_dict["traj_pool"])
+
+
+class GeneratorStates:
+    """States of all random number generators that objects own.
+
+    Looks through the attributes of the owners and of every ``nn.Module`` (env, transform, policy)
+    and list, tuple or dict below them for ``torch.Generator``, ``numpy.random.Generator`` and
+    ``random.Random``. The global generators are ``torchrl.checkpoint.GlobalRNGState``'s.
+
+    Args:
+        **owners: objects to look through, by the names their states get. After loading, owners of
+            the same names must have the same generators.
+
+    Raises:
+        ValueError: on loading, if a generator of the checkpoint is missing here.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> from torchrl_hmcts.trainers.resume import GeneratorStates
+        >>> env = WaterworldMazeEnv(seed=0)
+        >>> states = GeneratorStates(env=env)
+        >>> before = states.state_dict()
+        >>> first = env.reset()["position"]
+        >>> states.load_state_dict(before)
+        >>> bool((env.reset()["position"] == first).all())
+        True
+    """
+
+    def __init__(self, **owners: Any) -> None:
+        self.owners = owners
+
+    def generators(self) -> dict[str, Generator]:
+        """Returns the generators by their path, e.g. ``"env._generator"``."""
+        seen: set[int] = set()
+        return dict(
+            found for name, owner in self.owners.items() for found in _find(name, owner, seen, True)
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        return {path: _get_state(generator) for path, generator in self.generators().items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        generators = self.generators()
+        missing = sorted(set(state_dict).difference(generators))
+        if missing:
+            raise ValueError(
+                f"The checkpoint has states of the generators {missing}; found here: "
+                f"{sorted(generators)}. Build env, transforms and policy as in the saved run."
+            )
+        for path, state in state_dict.items():
+            _set_state(generators[path], state)
+
+
+class HistoryState:
+    """The curves that a ``Trainer`` has logged so far.
+
+    Args:
+        trainer (Trainer): whose log is saved.
+
+    Examples:
+        >>> from torchrl_hmcts.trainers.resume import HistoryState
+        >>> class Logged:
+        ...     _log_dict = {"loss_actor": [torch.tensor(0.5), 0.25]}
+        >>> HistoryState(Logged()).state_dict()["loss_actor"].tolist()
+        [0.5, 0.25]
+    """
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer = trainer
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {
+            key: torch.tensor([float(value) for value in values], dtype=torch.float64)
+            for key, values in self.trainer._log_dict.items()
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
+        self.trainer._log_dict.clear()
+        for key, values in state_dict.items():
+            self.trainer._log_dict[key] = values.tolist()
+
+
+class ResumableTrainer(Trainer):
+    """A TorchRL ``Trainer`` that resumes exactly.
+
+    Training to 2 n base steps and training to n, loading in a new process and training to 2 n give
+    the same weights, optimiser state, replay buffer, random numbers, counters and curves, bit for
+    bit, if the env's whole state is in its tensordict. Checkpoints are read without pickle.
+
+    Args:
+        save_dir (path, optional): folder of the checkpoints; one is written whenever
+            ``save_trainer_interval`` base steps have passed, and at the end. Default ``None``: no
+            checkpoints.
+        keep_last (int): checkpoints kept. Default ``2``.
+        **trainer_kwargs: passed to ``torchrl.trainers.Trainer``.
+
+    Raises:
+        ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
+            ``save_trainer_file``.
+    """
+
+    def __init__(
+        self, *, save_dir: str | Path | None = None, keep_last: int = 2, **trainer_kwargs: Any
+    ) -> None:
+        if save_dir is not None:
+            for other in ("checkpoint_rotation", "save_trainer_file"):
+                if trainer_kwargs.get(other) is not None:
+                    raise ValueError(
+                        f"save_dir={str(save_dir)!r} and {other} both say where checkpoints go. "
+                        "Pass one of them."
+                    )
+            trainer_kwargs["checkpoint_rotation"] = CheckpointRotation(
+                save_dir, keep_last=keep_last
+            )
+        if trainer_kwargs.get("checkpoint") is None and not trainer_kwargs.get("save_trainer_file"):
+            trainer_kwargs["checkpoint"] = Checkpoint()
+        trainer_kwargs.setdefault("optimization_stepper", DetachedStepper())
+        checkpoint, buffer = (trainer_kwargs.get(k) for k in ("checkpoint", "replay_buffer"))
+        if checkpoint is not None and buffer is not None and "replay_buffer" not in checkpoint:
+            # A buffer's own dump() writes a pickle beside the tensors; its state dict needs none.
+            checkpoint.register("replay_buffer", buffer, adapter=StateDictCheckpointAdapter())
+        super().__init__(**trainer_kwargs)
+        # TorchRL keeps this dict on the class, where the next trainer built would empty it.
+        self._last_log: dict[str, Any] = {}
+        if self.checkpoint is not None and "rng" not in self.checkpoint:
+            self.checkpoint.register("rng", GlobalRNGState())
+        collector = self.collector
+        self.register_module("history", HistoryState(self))
+        if isinstance(collector, Collector):
+            self.register_module("running_episodes", RunningEpisodes(collector))
+            self.register_module(
+                "generators", GeneratorStates(env=collector.env, policy=collector._wrapped_policy)
+            )
+
+    @property
+    def history(self) -> dict[str, list[float]]:
+        """All values logged so far, by name."""
+        return {key: [float(x) for x in values] for key, values in self._log_dict.items()}
+
+    def load(self, path: str | Path) -> ResumableTrainer:
+        """Goes on from a checkpoint; call it before ``train()``.
+
+        Args:
+            path (path): a checkpoint, or a folder of checkpoints (``save_dir``), of which the
+                newest is taken.
+
+        Returns:
+            ResumableTrainer: itself.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+            CheckpointError: if the checkpoint does not fit, e.g. another number of copies.
+        """
+        found: Path | None = Path(path)
+        if not Checkpoint.is_checkpoint(path):
+            found = CheckpointRotation(path, keep_last=1).latest()
+        if found is None:
+            raise FileNotFoundError(
+                f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to go on "
+                "with, or one of the checkpoint folders in it."
+            )
+        self.load_from_file(found)
+        return self
+
+
+class DetachedStepper(DefaultOptimizationStepper):
+    """TorchRL's default step; what it logs is kept for the history and must not hold a graph."""
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        return super().step(trainer, sub_batch).detach()
+
+
+def _find(
+    path: str, value: Any, seen: set[int], owner: bool = False
+) -> Iterator[tuple[str, Generator]]:
+    """Yields the generators below a value with their paths."""
+    if id(value) in seen:
+        return
+    if isinstance(value, torch.Generator | np.random.Generator | random.Random):
+        seen.add(id(value))
+        yield path, value
+        return
+    items: list[tuple[Any, Any]] = []
+    if isinstance(value, dict):
+        items = list(value.items())
+    elif isinstance(value, list | tuple):
+        items = list(enumerate(value))
+    elif isinstance(value, nn.Module) or (owner and hasattr(value, "__dict__")):
+        items = list(vars(value).items())
+    if items:
+        seen.add(id(value))
+        for name, item in items:
+            yield from _find(f"{path}.{name}", item, seen)
+
+
+def _get_state(generator: Generator) -> Any:
+    if isinstance(generator, torch.Generator):
+        return generator.get_state()
+    if isinstance(generator, np.random.Generator):
+        return generator.bit_generator.state
+    return generator.getstate()
+
+
+def _set_state(generator: Generator, state: Any) -> None:
+    if isinstance(generator, torch.Generator):
+        generator.set_state(state)
+    elif isinstance(generator, np.random.Generator):
+        generator.bit_generator.state = state
+    else:
+        generator.setstate(state)

@@ -1,0 +1,233 @@
+"""Rounds of planning and acting, as something a TorchRL ``Trainer`` can collect from.
+
+Letters: m rounds side by side, n base transitions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+
+from torchrl_hmcts.planners import MCTSPlanner
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out
+from torchrl_hmcts.transforms import OptionRecorder
+
+RECORDED = ("round", "training_steps", "solved", "found", "simulated_steps", "executed_steps")
+
+
+class RoundRecords:
+    """What each round of planning and acting cost, in the order in which they were played.
+
+    Args:
+        columns: int64 ``[rounds]`` by the names in ``RECORDED``. Default: no rounds yet.
+
+    Attributes:
+        columns: ``round`` its number t; ``training_steps`` base steps its worker had been trained
+            on; ``solved`` and plan ``found`` (0 or 1); ``simulated_steps`` of the search and
+            ``executed_steps`` of the episode, in base steps.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_hmcts.trainers.evaluation import Results
+        >>> yes, two = np.ones(2, dtype=bool), np.full(2, 7)
+        >>> records = RoundRecords()
+        >>> _ = records.add(Results(yes, yes, two, two, two, two, two + 1), np.arange(2), 640)
+        >>> records.curve()["base_steps"].tolist()
+        [15.0]
+    """
+
+    def __init__(self, columns: Mapping[str, np.ndarray] | None = None) -> None:
+        self.columns = {
+            name: np.asarray([] if columns is None else columns[name], dtype=np.int64)
+            for name in RECORDED
+        }
+
+    def __len__(self) -> int:
+        return len(self.columns["round"])
+
+    def add(self, results: Results, rounds: np.ndarray, training_steps: int) -> dict[str, float]:
+        """Append rounds; return their means."""
+        new = {
+            "round": rounds,
+            "training_steps": np.full(len(rounds), training_steps),
+            "solved": results.solved,
+            "found": results.found,
+            "simulated_steps": results.simulated_steps,
+            "executed_steps": results.episode_steps,
+        }
+        for name, values in new.items():
+            self.columns[name] = np.concatenate((self.columns[name], values.astype(np.int64)))
+        return {
+            "solved": float(np.mean(results.solved)),
+            "base_steps": float(np.mean(results.simulated_steps + results.episode_steps)),
+            "simulated_steps": float(np.mean(results.simulated_steps)),
+            "executed_steps": float(np.mean(results.episode_steps)),
+        }
+
+    def curve(self) -> dict[str, np.ndarray]:
+        """Return means over the rounds played at the same training, float64 ``[points]``.
+
+        Entries ``training_steps``, ``rounds`` (how many), ``solved`` (share), ``base_steps`` to
+        solve (simulated and executed; a round that was not solved counts with what it cost),
+        ``simulated_steps`` and ``executed_steps``.
+        """
+        steps, index = np.unique(self.columns["training_steps"], return_inverse=True)
+        count = np.bincount(index, minlength=len(steps)).astype(float)
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            return np.bincount(index, weights=values, minlength=len(steps)) / count
+
+        simulated, executed = self.columns["simulated_steps"], self.columns["executed_steps"]
+        return {
+            "training_steps": steps.astype(float),
+            "rounds": count,
+            "solved": mean(self.columns["solved"]),
+            "base_steps": mean(simulated + executed),
+            "simulated_steps": mean(simulated),
+            "executed_steps": mean(executed),
+        }
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {name: torch.from_numpy(values.copy()) for name, values in self.columns.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
+        self.columns = {name: state_dict[name].numpy().copy() for name in RECORDED}
+
+
+class PlanningRounds:
+    """Plays the rounds of Algorithm 3 and yields the base transitions they consisted of.
+
+    The first batch are those of ``num_init_samples`` options, each drawn uniformly and carried out
+    from a state after a reset. Every later batch is ``interval`` rounds: a plan is searched from a
+    state after a reset and carried out; both the simulated and the executed base transitions count.
+    It has what a ``Trainer`` wants of a collector.
+
+    Random numbers are a function of ``seed`` and of the round, so that a resumed run needs to know
+    no more than its round.
+
+    Args:
+        env: in which plans are carried out: stateless, under an ``OptionTransform``.
+        simulator: in which they are searched, of the same kind.
+        make_planner: ``make_planner(simulator, seed=...)`` builds the planner for some rounds.
+        recorders: of the two envs.
+        num_init_samples: options carried out at first.
+        interval: rounds of a batch, planned side by side.
+        rounds: after which the iteration ends.
+        seed: of all random numbers.
+    """
+
+    init_random_frames = 0
+
+    def __init__(
+        self,
+        env: EnvBase,
+        simulator: EnvBase,
+        make_planner: Callable[..., MCTSPlanner],
+        recorders: tuple[OptionRecorder, OptionRecorder],
+        *,
+        num_init_samples: int,
+        interval: int,
+        rounds: int,
+        seed: int,
+    ) -> None:
+        self.env, self.simulator = env, simulator
+        self.make_planner = make_planner
+        self.recorders = recorders
+        self.num_init_samples = num_init_samples
+        self.interval = interval
+        self.rounds = rounds
+        self.seed = seed
+        self.round = -1  # the next one; -1: the first samples have not been drawn
+        self.training_steps = 0  # base steps handed out so far
+        self.init_steps = 0  # those of the first samples
+        self.records = RoundRecords()
+        self.latest: dict[str, float] = {}  # means of the latest batch of rounds
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while self.round < self.rounds:
+            if self.round < 0:
+                with seeded(self.seed, "init", 0) as seed:
+                    self._draw(seed)
+                self.round = 0
+            else:
+                count = min(self.interval - self.round % self.interval, self.rounds - self.round)
+                with seeded(self.seed, "round", self.round) as seed:
+                    self._play(count, seed)
+                self.round += count
+            taken = [data for recorder in self.recorders if len(data := recorder.take())]
+            batch = torch.cat(taken) if len(taken) > 1 else taken[0]
+            self.training_steps += len(batch)
+            yield batch
+
+    def _starts(self, count: int, seed: int) -> TensorDictBase:
+        self.env.set_seed(seed)
+        return self.env.reset(TensorDict(batch_size=[count], device=self.env.device))
+
+    def _draw(self, seed: int) -> None:
+        starts = self._starts(self.num_init_samples, seed)
+        key = self.env.action_keys[0]
+        num_options = int(self.env.full_action_spec[key].space.n)
+        options = torch.randint(num_options, (self.num_init_samples,))
+        after = self.env.step(starts.set(key, options))["next"]
+        self.init_steps = int(after["duration"].sum())
+
+    def _play(self, count: int, seed: int) -> None:
+        planner = self.make_planner(self.simulator, seed=seed)
+        starts = self._starts(count, seed)
+        results = plan_and_carry_out(planner, self.env, starts, group=count)
+        rounds = self.round + np.arange(count)
+        self.latest = self.records.add(results, rounds, self.training_steps)
+
+    # -------------------------------------------------- what a Trainer asks of a collector
+
+    def shutdown(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing runs elsewhere."""
+
+    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing to copy: the worker has the live parameters of the loss."""
+
+    def state_dict(self) -> dict[str, Any]:
+        counters = {
+            name: getattr(self, name)
+            for name in ("round", "training_steps", "init_steps", "seed", "interval")
+        }
+        return {**counters, "records": self.records.state_dict()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        for name in ("interval", "seed"):
+            if int(state_dict[name]) != getattr(self, name):
+                argument = "retrain_interval" if name == "interval" else name
+                raise ValueError(
+                    f"The checkpoint was written with {argument}={int(state_dict[name])}; this "
+                    f"trainer has {getattr(self, name)}. Resume with the same one."
+                )
+        for name in ("round", "training_steps", "init_steps"):
+            setattr(self, name, int(state_dict[name]))
+        self.records.load_state_dict(state_dict["records"])
+
+
+@contextmanager
+def seeded(seed: int, phase: str, index: int) -> Iterator[int]:
+    """Make torch's global generator a function of the arguments, and leave it as it was.
+
+    Yields:
+        A further seed below 2^31, for what has a generator of its own.
+
+    Example:
+        >>> with seeded(0, "round", 3):
+        ...     first = torch.rand(())
+        >>> with seeded(0, "round", 3):
+        ...     bool(torch.rand(()) == first)
+        True
+    """
+    entropy = [seed, *phase.encode(), index]
+    own, other = np.random.SeedSequence(entropy).generate_state(2, np.uint32).tolist()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(own)
+        yield other >> 1
