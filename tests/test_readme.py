@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 README = Path(__file__).parents[1] / "README.md"
 
 
@@ -22,8 +24,9 @@ def test_pictures_and_links_of_the_readme_exist():
         assert (README.parent / target).exists(), f"README links to {target}, which does not exist"
 
 
-def test_every_python_block_of_the_page_on_planning_runs(capsys):
-    page = README.parent / "docs" / "planning.md"
+@pytest.mark.parametrize("name", ["planning.md", "skills.md"])
+def test_every_python_block_of_a_page_runs(name, capsys):
+    page = README.parent / "docs" / name
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
     assert len(blocks) >= 8
     namespace: dict = {}
