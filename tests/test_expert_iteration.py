@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -423,6 +424,21 @@ def test_training_repeats_with_its_seed() -> None:
         trainer.train()
         weights.append(trainer.network.module.table.weight.detach().clone())
     assert torch.equal(*weights)
+
+
+def test_a_run_that_was_stopped_and_loaded_is_the_run_that_never_stopped(tmp_path: Path) -> None:
+    whole = make_trainer()
+    whole.train()
+    first = make_trainer(save_dir=tmp_path, save_trainer_interval=0)
+    first.register_op("post_steps_log", lambda batch: first.request_stop("enough"))
+    first.train()
+    assert len(first.collector.solved) == 1
+    second = make_trainer(save_dir=tmp_path).load(tmp_path)
+    second.train()
+    assert second.collector.simulations == whole.collector.simulations
+    assert second.history == whole.history
+    for a, b in zip(second.network.parameters(), whole.network.parameters(), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_a_collector_goes_on_where_another_stopped() -> None:

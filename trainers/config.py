@@ -38,8 +38,8 @@ class DemoConfig:
     """Base steps of worker training in the training mazes."""
     leaves_per_wave: int = 4
     """Leaves of the tree whose options are simulated together; more are faster, less selective."""
-    novelty_radius: float = 0.7
-    """Tiles within which a place counts as visited; about half of what an option covers."""
+    novelty_radius: float = 1.0
+    """Tiles within which a place counts as visited; about what an option covers."""
     expansions: int = 1_000
     """Nodes that a search may expand before it gives up."""
     gamma: float = 0.99

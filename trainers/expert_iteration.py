@@ -12,12 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.trainers import (
-    DefaultOptimizationStepper,
-    LRSchedulerHook,
-    ReplayBufferTrainer,
-    Trainer,
-)
+from torchrl.trainers import LRSchedulerHook, ReplayBufferTrainer
 
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import (
@@ -30,6 +25,7 @@ from torchrl_hmcts.planners import (
     search_examples,
 )
 from torchrl_hmcts.trainers.diayn import Progress
+from torchrl_hmcts.trainers.resume import ResumableTrainer
 
 _TARGETS = ("policy_target", "policy_weight", "value_target", "value_weight", "action_mask")
 
@@ -195,7 +191,7 @@ class SearchCollector:
             setattr(self, name, list(values))
 
 
-class ExpertIterationTrainer(Trainer):
+class ExpertIterationTrainer(ResumableTrainer):
     """Trains the network that guides a planner, on what the planner finds with its help.
 
     Per iteration: search at fresh starts (:class:`SearchCollector`), store the examples, and make
@@ -224,7 +220,7 @@ class ExpertIterationTrainer(Trainer):
         progress (callable, optional): called with ``total=`` the updates it returns a progress bar,
             e.g. ``tqdm.tqdm``. Default: quiet.
         seed (int): of the starts and of the batches. Default 0.
-        **trainer_kwargs: passed to ``torchrl.trainers.Trainer`` (``logger``, ``checkpoint``, ...).
+        **trainer_kwargs: passed to :class:`ResumableTrainer` (``logger``, ``save_dir``, ...).
 
     Raises:
         ValueError: if a number is below 1.
@@ -308,7 +304,6 @@ class ExpertIterationTrainer(Trainer):
             optim_steps_per_batch=updates_per_iteration,
             loss_module=loss_module,
             optimizer=optimizer,
-            optimization_stepper=_DetachedStepper(),
             replay_buffer=buffer,
             batch_size=batch_size,
             clip_norm=clip_norm,
@@ -341,15 +336,3 @@ class ExpertIterationTrainer(Trainer):
         if accuracy:
             figures["policy_accuracy"] = f"{float(accuracy[-1]):.3f}"
         bar.set_postfix(refresh=False, **figures)
-
-    @property
-    def history(self) -> dict[str, list[float]]:
-        """Per iteration the mean over its updates of each loss and diagnostic, by its name."""
-        return {key: [float(x) for x in values] for key, values in self._log_dict.items()}
-
-
-class _DetachedStepper(DefaultOptimizationStepper):
-    """The default step; what it logs is kept for ever and must not hold a graph."""
-
-    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        return super().step(trainer, sub_batch).detach()

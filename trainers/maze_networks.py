@@ -95,12 +95,12 @@ class MazeNetwork(TensorDictModuleBase):
         self.gamma = gamma
         self.num_options = num_options
         self.steps_per_tile = steps_per_tile
-        self.costs = nn.Sequential(
-            nn.Conv2d(1, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, 8, 1)
-        )
+        first, last = nn.Conv2d(1, channels, 3, padding=1), nn.Conv2d(channels, 8, 1)
+        assert last.bias is not None
         with torch.no_grad():  # at first all moves cost about a tile
-            self.costs[-1].weight.mul_(0.3)
-            self.costs[-1].bias.fill_(0.54)
+            last.weight.mul_(0.3)
+            last.bias.fill_(0.54)
+        self.costs = nn.Sequential(first, nn.ReLU(), last)
         self.head = nn.Sequential(
             nn.Linear(9 + 9 + 6, hidden),
             nn.ReLU(),

@@ -206,8 +206,9 @@ def make_option_model(config: OptionModelConfig) -> OptionModel:
         layers: list[nn.Module] = []
         widths = (window.num_features, *config.hidden)
         for fan_in, fan_out in zip(widths, config.hidden, strict=False):
-            layers += [nn.Linear(fan_in, fan_out), nn.SiLU()]
-            nn.init.kaiming_normal_(layers[-2].weight, nonlinearity="relu")
+            linear = nn.Linear(fan_in, fan_out)
+            nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
+            layers += [linear, nn.SiLU()]
         return nn.Sequential(*layers, nn.Linear(widths[-1], out_features))
 
     return OptionModel(
@@ -239,7 +240,7 @@ def train_option_model(
     parts = [data.exclude(("next", "trajectory"))]
     for i in range(config.hindsight):
         parts.append(relabel_targets(data, gamma=config.gamma, seed=1_000 * config.seed + i))
-    examples = torch.cat(parts)
+    examples: TensorDictBase = torch.cat(parts)
     torch.manual_seed(config.seed)
     model = make_option_model(config).fit_normalization(examples)
     if config.bootstrap:

@@ -25,7 +25,7 @@ def skill_figures(
     num_skills: int = 4,
     steps: tuple[int, ...] = (25, 50, 100),
     seed: int = 0,
-) -> dict[str, Any]:
+) -> dict[int, dict[str, Any]]:
     """Let every skill act once in every maze, and ask the discriminator which it was.
 
     Each mini-episode starts at rest in the middle of a free tile drawn uniformly; the displacement
@@ -67,7 +67,7 @@ def skill_figures(
     state = env.make_state(index, start, torch.where(near_low, high, low))
     skill = torch.arange(num_skills).repeat(num_mazes)
     state.set("skill", skill)
-    out: dict[str, Any] = {}
+    out: dict[int, dict[str, Any]] = {}
     hits: list[Tensor] = []
     for step in range(1, max(steps) + 1):
         after = env._step(policy(state))

@@ -26,6 +26,8 @@ from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
 from torchrl_hmcts.trainers.skill_figures import search_coverage, skill_figures
 from torchrl_hmcts.trainers.worker import make_option_env
 
+RADIUS = 0.7  # of the novelty test, tiles, in all benchmarks of skills
+
 
 def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     """Train a worker and take all figures."""
@@ -35,7 +37,7 @@ def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     greedy = SkillPolicy(loss.actor_network, deterministic=True)
     env, real = (make_option_env(greedy, mazes) for _ in range(2))
     starts = make_starts(env.base_env, num_mazes, seed)
-    novelty = RadiusNovelty("position", config.novelty_radius, shorter_paths=True)
+    novelty = RadiusNovelty("position", RADIUS, shorter_paths=True)
     budget = SearchBudget(expansions=config.expansions)
     planner = MCTSPlanner(
         env, novelty=novelty, budget=budget, leaves_per_wave=config.leaves_per_wave
@@ -43,7 +45,7 @@ def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     solved = plan_and_carry_out(planner, real, starts)
     wide = MCTSPlanner(
         env,
-        novelty=RadiusNovelty("position", config.novelty_radius),
+        novelty=RadiusNovelty("position", RADIUS),
         budget=SearchBudget(expansions=200, until_plan=False),
     )
     coverage = torch.cat(

@@ -128,7 +128,7 @@ class OptionRecorder(Transform):
             return TensorDict(batch_size=[0])
         blocks, skills = zip(*self._blocks, strict=True)
         self._blocks = []
-        block = torch.cat(blocks) if len(blocks) > 1 else blocks[0]  # [m, T]
+        block: TensorDictBase = torch.cat(blocks) if len(blocks) > 1 else blocks[0]  # [m, T]
         mask = block.get(OptionTrajectory.MASK_KEY)
         out = TensorDict(batch_size=[int(mask.sum())], device=block.device)
         for key in self._copied_keys:
