@@ -24,6 +24,9 @@ def test_pictures_and_links_of_the_readme_exist():
         assert (README.parent / target).exists(), f"README links to {target}, which does not exist"
 
 
+@pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")
+@pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
+@pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
 @pytest.mark.parametrize("name", ["planning.md", "skills.md"])
 def test_every_python_block_of_a_page_runs(name, capsys):
     page = README.parent / "docs" / name

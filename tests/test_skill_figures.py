@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -12,6 +15,7 @@ from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
 from torchrl_hmcts.trainers.skill_figures import search_coverage, skill_figures, smallest_angle
+from torchrl_hmcts.trainers.solving_curves import band, plot_solving_curves
 from torchrl_hmcts.trainers.worker import make_option_env
 
 PUSH = TensorDictModule(lambda skill: skill, ["skill"], ["action"])  # skill z: thrust z
@@ -117,3 +121,29 @@ def test_figures_need_no_gradient() -> None:
     room, _, _ = maze_from_text("...\n...\n...")
     figures = skill_figures(PUSH, net, room[None], steps=(3,))
     assert isinstance(figures[3]["accuracy"], float)
+
+
+def test_curves_of_seeds_are_brought_to_the_steps_that_all_of_them_reached() -> None:
+    short = {"training_steps": [0, 10], "solved": [0.0, 1.0]}
+    long = {"training_steps": [0, 5, 10, 20], "solved": [0.0, 0.0, 0.5, 1.0]}
+    shown = band([long, short], "solved")
+    assert shown["training_steps"].tolist() == [0.0, 5.0, 10.0]
+    assert shown["mean"].tolist() == [0.0, 0.25, 0.75]
+    assert shown["least"].tolist() == [0.0, 0.0, 0.5]
+    assert shown["largest"].tolist() == [0.0, 0.5, 1.0]
+    with pytest.raises(ValueError, match="got none"):
+        band([], "solved")
+
+
+def test_solving_curves_are_drawn(tmp_path: Path) -> None:
+    curve = {
+        "training_steps": [0, 10],
+        "base_steps": [900.0, 100.0],
+        "executed_steps": [90.0, 50.0],
+        "solved": [0.5, 1.0],
+    }
+    plot_solving_curves({"from scratch": [curve, curve]}, tmp_path / "a.png", title="two seeds")
+    picture = iio.imread(tmp_path / "a.png")
+    assert picture.shape[:2] == (550, 1210)
+    blue = (np.abs(picture[..., :3].astype(int) - (29, 78, 216)) < 12).all(-1)
+    assert blue.sum() > 500  # the curve is there

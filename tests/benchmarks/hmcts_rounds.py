@@ -24,11 +24,11 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.curves import plot_solving_curves
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
+from torchrl_hmcts.trainers.solving_curves import plot_solving_curves
 from torchrl_hmcts.trainers.worker import make_option_env, make_training_env
 
 NUM_SKILLS, OPTION_STEPS, RADIUS = 4, 25, 0.7
