@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import importlib.metadata
 import json
 import re
@@ -252,3 +253,14 @@ def test_importing_the_components_loads_nothing_heavy_beyond_torchrl(tmp_path: P
     }
     assert not (heavy & loaded) - baseline
     assert not {name for name in loaded if layer(name) in ("envs", "trainers")}
+
+
+def test_everything_that_benchmarks_import_from_the_project_exists() -> None:
+    missing = []
+    for path in sorted((ROOT / "tests" / "benchmarks").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchrl_hmcts"):
+                module = importlib.import_module(node.module or "")
+                names = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                missing += [f"{path.name}: {node.module}.{name}" for name in names]
+    assert missing == []
