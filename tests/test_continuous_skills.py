@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import (
     Bounded,
     Categorical,
-    Composite,
     LazyTensorStorage,
     ReplayBuffer,
-    Unbounded,
 )
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl.trainers.algorithms import SACTrainer
 
@@ -41,6 +38,7 @@ from torchrl_hmcts.objectives import (
     SkillObjective,
     SkillSACLoss,
 )
+from torchrl_hmcts.testing import PointMassEnv
 from torchrl_hmcts.transforms import DisplacementTransform, SkillReward, SkillTransform
 
 OBJECTIVES = {
@@ -58,51 +56,10 @@ GROUPS = {
 SPEC = Bounded(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0]), shape=(2,))
 
 
-class PushedPoint(EnvBase):
-    """A push in any direction accelerates a point in a box of 9 x 9 tiles."""
-
-    batch_locked = False
-
-    def __init__(self, batch_size: Sequence[int] = ()) -> None:
-        super().__init__(batch_size=torch.Size(batch_size))
-        shape = self.batch_size
-        spec = {
-            "position": Bounded(0.0, 9.0, shape=(*shape, 2)),
-            "velocity": Unbounded((*shape, 2)),
-        }
-        self.observation_spec = Composite(spec, shape=shape)
-        self.state_spec = self.observation_spec.clone()
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*shape, 2))
-        self.reward_spec = Unbounded((*shape, 1))
-        self.generator = torch.Generator()
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.generator.manual_seed(seed)
-
-    def _reset(self, td: TensorDictBase | None, **kwargs: Any) -> TensorDict:
-        shape = self.batch_size if td is None else td.batch_size
-        position = 9.0 * torch.rand((*shape, 2), generator=self.generator)
-        velocity = torch.zeros_like(position)
-        return TensorDict({"position": position, "velocity": velocity}, batch_size=shape)
-
-    def _step(self, td: TensorDictBase) -> TensorDict:
-        velocity = td["velocity"] + 0.05 * (4.0 * td["action"] - 2.0 * td["velocity"])
-        never = torch.zeros((*td.batch_size, 1), dtype=torch.bool)
-        return TensorDict(
-            {
-                "position": (td["position"] + 0.05 * velocity).clamp(0.0, 9.0),
-                "velocity": velocity,
-                "reward": never.float(),
-                "done": never,
-                "terminated": never.clone(),
-            },
-            batch_size=td.batch_size,
-        )
-
-
 def make_env(copies: int = 16) -> TransformedEnv:
     return TransformedEnv(
-        PushedPoint([copies]), Compose(SkillTransform(4, 50), DisplacementTransform())
+        PointMassEnv([copies], continuous=True),
+        Compose(SkillTransform(4, 50), DisplacementTransform()),
     )
 
 

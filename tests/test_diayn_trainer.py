@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import (
-    Bounded,
-    Categorical,
-    Composite,
     LazyTensorStorage,
     ReplayBuffer,
     TensorDictReplayBuffer,
-    Unbounded,
 )
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 from torchrl.record import CSVLogger
 from torchrl.trainers import (
@@ -33,6 +28,7 @@ from torchrl.trainers.algorithms import SACTrainer
 
 from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, METRAEncoderLoss
+from torchrl_hmcts.testing import PointMassEnv
 from torchrl_hmcts.trainers.coverage import StateCoverage
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
 from torchrl_hmcts.transforms import (
@@ -42,57 +38,10 @@ from torchrl_hmcts.transforms import (
     SkillTransform,
 )
 
-DIRECTIONS = torch.tensor([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]])
-
-
-class PointMass(EnvBase):
-    """Four thrusts push a point in a box of 9 x 9 tiles; walls stop it dead."""
-
-    batch_locked = False
-
-    def __init__(self, batch_size: Sequence[int] = ()) -> None:
-        super().__init__(batch_size=torch.Size(batch_size))
-        shape = self.batch_size
-        spec = {
-            "position": Bounded(0.0, 9.0, shape=(*shape, 2)),
-            "velocity": Unbounded((*shape, 2)),
-        }
-        self.observation_spec = Composite(spec, shape=shape)
-        self.state_spec = self.observation_spec.clone()
-        self.action_spec = Categorical(4, shape=shape)
-        self.reward_spec = Unbounded((*shape, 1))
-        self.generator = torch.Generator()
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.generator.manual_seed(seed)
-
-    def _reset(self, td: TensorDictBase | None, **kwargs: Any) -> TensorDict:
-        shape = self.batch_size if td is None else td.batch_size
-        position = 9.0 * torch.rand((*shape, 2), generator=self.generator)
-        velocity = torch.zeros_like(position)
-        return TensorDict({"position": position, "velocity": velocity}, batch_size=shape)
-
-    def _step(self, td: TensorDictBase) -> TensorDict:
-        velocity = td["velocity"]
-        velocity = velocity + 0.05 * (4.0 * DIRECTIONS[td["action"]] - 2.0 * velocity)
-        free = td["position"] + 0.05 * velocity
-        position = free.clamp(0.0, 9.0)
-        never = torch.zeros((*td.batch_size, 1), dtype=torch.bool)
-        return TensorDict(
-            {
-                "position": position,
-                "velocity": torch.where(position == free, velocity, 0.0),
-                "reward": never.float(),
-                "done": never,
-                "terminated": never.clone(),
-            },
-            batch_size=td.batch_size,
-        )
-
 
 def make_env(copies: int = 32) -> TransformedEnv:
     return TransformedEnv(
-        PointMass([copies]), Compose(SkillTransform(4, 50), DisplacementTransform())
+        PointMassEnv([copies]), Compose(SkillTransform(4, 50), DisplacementTransform())
     )
 
 

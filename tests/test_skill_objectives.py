@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SoftUpdate
@@ -37,6 +37,7 @@ from torchrl_hmcts.objectives import (
     SkillDynamicsLoss,
     SkillObjective,
 )
+from torchrl_hmcts.testing import PointMassEnv
 from torchrl_hmcts.transforms import DisplacementTransform, SkillReward, SkillTransform
 
 OBJECTIVES = ["diayn", "metra", "lsd", "dads"]
@@ -405,55 +406,9 @@ def test_an_env_scores_each_step(name: str) -> None:
 # Swapping
 
 
-class PointMass(EnvBase):
-    """Four thrusts push a point in a box of 9 x 9 tiles; walls stop it dead."""
-
-    batch_locked = False
-    directions = torch.tensor([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]])
-
-    def __init__(self, batch_size: Sequence[int] = ()) -> None:
-        super().__init__(batch_size=torch.Size(batch_size))
-        shape = self.batch_size
-        spec = {
-            "position": Bounded(0.0, 9.0, shape=(*shape, 2)),
-            "velocity": Unbounded((*shape, 2)),
-        }
-        self.observation_spec = Composite(spec, shape=shape)
-        self.state_spec = self.observation_spec.clone()
-        self.action_spec = Categorical(4, shape=shape)
-        self.reward_spec = Unbounded((*shape, 1))
-        self.generator = torch.Generator()
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.generator.manual_seed(seed)
-
-    def _reset(self, td: TensorDictBase | None, **kwargs: Any) -> TensorDict:
-        shape = self.batch_size if td is None else td.batch_size
-        position = 9.0 * torch.rand((*shape, 2), generator=self.generator)
-        velocity = torch.zeros_like(position)
-        return TensorDict({"position": position, "velocity": velocity}, batch_size=shape)
-
-    def _step(self, td: TensorDictBase) -> TensorDict:
-        velocity = td["velocity"]
-        velocity = velocity + 0.05 * (4.0 * self.directions[td["action"]] - 2.0 * velocity)
-        free = td["position"] + 0.05 * velocity
-        position = free.clamp(0.0, 9.0)
-        never = torch.zeros((*td.batch_size, 1), dtype=torch.bool)
-        return TensorDict(
-            {
-                "position": position,
-                "velocity": torch.where(position == free, velocity, 0.0),
-                "reward": never.float(),
-                "done": never,
-                "terminated": never.clone(),
-            },
-            batch_size=td.batch_size,
-        )
-
-
 def make_env(copies: int = 16) -> TransformedEnv:
     return TransformedEnv(
-        PointMass([copies]), Compose(SkillTransform(4, 50), DisplacementTransform())
+        PointMassEnv([copies]), Compose(SkillTransform(4, 50), DisplacementTransform())
     )
 
 

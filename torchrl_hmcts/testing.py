@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-__all__ = ["ChainEnv", "TableEnv"]
+__all__ = ["ChainEnv", "PointMassEnv", "TableEnv"]
 
 
 class TableEnv(EnvBase):
@@ -203,3 +203,74 @@ class ChainEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Nothing is random."""
+
+
+class PointMassEnv(EnvBase):
+    r"""A point with momentum in a box, pushed about without any reward: to learn skills in.
+
+    .. math:: v' = v + 0.05\,(4 a - 2 v), \qquad x' = x + 0.05\, v'
+
+    with the velocity 0 along an axis on which a wall stops the point. Stateless, any batch shape,
+    never done. Entries ``"position"`` (float ``[*B, 2]``, 0 to 9) and ``"velocity"``.
+
+    Args:
+        batch_size: copies that ``reset()`` makes. Default none.
+        continuous: the action is the push, ``[*B, 2]`` in -1 to 1, instead of one of four: up
+            (towards 0), down, left, right. Default False.
+
+    Example:
+        >>> env = PointMassEnv()
+        >>> td = env.reset().set("action", torch.tensor(3))
+        >>> (env.step(td)["next", "velocity"]).tolist()
+        [0.20000000298023224, 0.0]
+    """
+
+    batch_locked = False
+    _directions = torch.tensor([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]])
+
+    def __init__(self, batch_size: Sequence[int] = (), *, continuous: bool = False) -> None:
+        super().__init__(batch_size=torch.Size(batch_size))
+        shape = self.batch_size
+        spec = {
+            "position": Bounded(0.0, 9.0, shape=(*shape, 2)),
+            "velocity": Unbounded((*shape, 2)),
+        }
+        self.observation_spec = Composite(spec, shape=shape)
+        self.state_spec = self.observation_spec.clone()
+        if continuous:
+            self.action_spec = Bounded(-1.0, 1.0, shape=(*shape, 2))
+        else:
+            self.action_spec = Categorical(4, shape=shape)
+        self.reward_spec = Unbounded((*shape, 1))
+        self.continuous = continuous
+        self.generator = torch.Generator()
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            self.generator.seed()
+        else:
+            self.generator.manual_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        shape = self.batch_size if tensordict is None else tensordict.batch_size
+        position = 9.0 * torch.rand((*shape, 2), generator=self.generator)
+        velocity = torch.zeros_like(position)
+        return TensorDict({"position": position, "velocity": velocity}, batch_size=shape)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        velocity, action = tensordict["velocity"], tensordict["action"]
+        push = action if self.continuous else self._directions[action]
+        velocity = velocity + 0.05 * (4.0 * push - 2.0 * velocity)
+        free = tensordict["position"] + 0.05 * velocity
+        position = free.clamp(0.0, 9.0)
+        never = torch.zeros((*tensordict.batch_size, 1), dtype=torch.bool)
+        return TensorDict(
+            {
+                "position": position,
+                "velocity": torch.where(position == free, velocity, 0.0),
+                "reward": never.float(),
+                "done": never,
+                "terminated": never.clone(),
+            },
+            batch_size=tensordict.batch_size,
+        )
