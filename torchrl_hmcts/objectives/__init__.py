@@ -1,5 +1,6 @@
 """Losses of the worker: actor and critics beside interchangeable skill objectives."""
 
+from torchrl_hmcts.objectives.a3c import A3CLoss, NStepReturn, n_step_returns
 from torchrl_hmcts.objectives.dads import SkillDynamicsLoss
 from torchrl_hmcts.objectives.diayn import ContinuousDIAYNLoss, DIAYNLoss
 from torchrl_hmcts.objectives.discrete_skill_sac import DiscreteSkillSACLoss
@@ -14,6 +15,7 @@ from torchrl_hmcts.objectives.skill_prior import SkillPriorLoss
 from torchrl_hmcts.objectives.skill_sac import SkillSACLoss
 
 __all__ = [
+    "A3CLoss",
     "ContinuousDIAYNLoss",
     "DIAYNLoss",
     "DiscreteSkillSACLoss",
@@ -21,6 +23,7 @@ __all__ = [
     "IntraOptionQLoss",
     "LSDEncoderLoss",
     "METRAEncoderLoss",
+    "NStepReturn",
     "OptionModelLoss",
     "OptionTerminationLoss",
     "SkillDiscriminatorLoss",
@@ -28,4 +31,5 @@ __all__ = [
     "SkillObjective",
     "SkillPriorLoss",
     "SkillSACLoss",
+    "n_step_returns",
 ]

@@ -1,0 +1,305 @@
+"""The objective of asynchronous actor-learners: n-step returns bootstrapped at a segment's end.
+
+Letters: *B batch of environments, T steps of a segment, F features of a reward (1).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.objectives import A2CLoss
+from torchrl.objectives.utils import ValueEstimators
+from torchrl.objectives.value import TD1Estimator
+
+from torchrl_hmcts.objectives.skill_objective import check_reduction
+
+
+def n_step_returns(
+    reward: Tensor, discount: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor
+) -> Tensor:
+    r"""Returns the discounted rewards until the segment or the episode ends, and the value there.
+
+    .. math::
+
+        G_t = r_t + \gamma_t \begin{cases}
+            0 & \text{after step } t \text{ the episode is terminated} \\
+            V(s'_t) & \text{it is truncated, or the segment ends} \\
+            G_{t+1} & \text{otherwise}
+        \end{cases}
+
+    Args:
+        reward (Tensor): float ``[*B, T, F]``.
+        discount (Tensor): float ``[*B, T, F]``, of what follows each step: gamma to the power of
+            its duration.
+        next_value (Tensor): float ``[*B, T, F]``, V(s'), read where a step is truncated or the
+            last, and otherwise of no account.
+        done (Tensor): bool ``[*B, T, F]``, the episode ends with this step.
+        terminated (Tensor): bool ``[*B, T, F]``, it ends in a state whose value is 0.
+
+    Returns:
+        Tensor: float ``[*B, T, F]``.
+
+    Reference:
+        Mnih et al., "Asynchronous methods for deep reinforcement learning", 2016, arXiv 1602.01783,
+        algorithm S3.
+
+    Examples:
+        >>> one, no = torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.bool)
+        >>> n_step_returns(one, 0.5 * one, 8 * one, done=no, terminated=no).flatten().tolist()
+        [2.75, 3.5, 5.0]
+    """
+    ends = done.clone()
+    ends[..., -1, :] = True
+    own = torch.addcmul(reward, discount * (ends & ~terminated), next_value.nan_to_num())
+    carry = discount * ~(ends | terminated)
+    following = torch.zeros_like(own[..., 0, :])
+    returns = []
+    for own_t, carry_t in zip(reversed(own.unbind(-2)), reversed(carry.unbind(-2)), strict=True):
+        following = torch.addcmul(own_t, carry_t, following)
+        returns.append(following)
+    returns.reverse()
+    return torch.stack(returns, -2)
+
+
+class NStepReturn(TD1Estimator):
+    r"""TorchRL's TD(1), with the critic called only where its value is used.
+
+    The targets of :func:`n_step_returns`, with :math:`\gamma_t = \gamma^{k_t}` for steps that take
+    :math:`k_t` base steps, and the advantage :math:`G_t - V(s_t)`, both without gradients.
+    TorchRL's ``TD1Estimator`` computes the same from the values of all next states; here it is
+    those where an episode is truncated or the segment ends. What else a ``TD1Estimator`` can do
+    (critics with a memory, ``differentiable``, ``average_rewards``, ``shifted``) is left to it.
+
+    In an ``OnPolicyTrainer``, which shuffles steps before the loss sees them, it goes where GAE
+    goes: ``A2CTrainer(..., gae=NStepReturn(gamma=0.99, value_network=critic))``.
+
+    Args:
+        gamma (float): discount per base step.
+        value_network (TensorDictModule): the critic; writes ``state_value`` ``[*B, T, 1]``.
+        **kwargs: of ``torchrl.objectives.value.TD1Estimator``.
+
+    Keys (``set_keys``): those of ``TD1Estimator``; ``steps_to_next_obs`` is
+    ``("next", "duration")`` by default. Without that entry a step takes one base step.
+
+    Reference:
+        Mnih et al., "Asynchronous methods for deep reinforcement learning", 2016, arXiv 1602.01783,
+        algorithm S3.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import ValueOperator
+        >>> critic = ValueOperator(torch.nn.Linear(2, 1), in_keys=["observation"])
+        >>> torch.nn.init.zeros_(critic.module.weight); torch.nn.init.ones_(critic.module.bias)
+        Parameter containing: ...
+        >>> no = torch.zeros(3, 1, dtype=torch.bool)
+        >>> after = TensorDict(observation=torch.rand(3, 2), done=no, terminated=no,
+        ...                    reward=torch.tensor([[0.], [0.], [3.]]),
+        ...                    duration=torch.tensor([[2], [1], [1]]))
+        >>> segment = TensorDict(observation=torch.rand(3, 2), next=after, batch_size=[3])
+        >>> out = NStepReturn(gamma=0.5, value_network=critic)(segment)
+        >>> out["value_target"].flatten().tolist()
+        [0.4375, 1.75, 3.5]
+    """
+
+    # The accepted keys stay TorchRL's own class: it looks names up in that class alone.
+    default_keys = partial(TD1Estimator._AcceptedKeys, steps_to_next_obs=("next", "duration"))
+
+    @torch.no_grad()
+    @dispatch
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        params: TensorDictBase | None = None,
+        target_params: TensorDictBase | None = None,
+    ) -> TensorDictBase:
+        network, keys = self.value_network, self.tensor_keys
+        if not self._usual:
+            return super().forward(tensordict, params=params, target_params=target_params)
+        if not tensordict.ndim:
+            raise ValueError(
+                "NStepReturn needs a segment, a tensordict whose last dimension is time; this one "
+                "has no dimension at all. Stack the steps: torch.stack(steps, -1)."
+            )
+        time = self._get_time_dim(None, tensordict)
+        after = tensordict.get("next")
+        reward, done = after.get(keys.reward), after.get(keys.done)
+        terminated = after.get(keys.terminated, done)
+        ends = done.clone()
+        ends.select(time, -1).fill_(True)
+        # One value per step, whatever further dimensions a reward has.
+        used = (ends & ~terminated).reshape(*tensordict.shape, -1).any(-1)
+        value = self._values(tensordict, params)
+        next_value = torch.zeros_like(value)
+        if used.any():
+            rows = after.select(*network.in_keys, strict=False)[used]
+            missing = [key for key in network.in_keys if rows.get(key, None) is None]
+            rows.update(tensordict.select(*missing)[used])
+            next_value[used] = self._values(
+                rows, params if target_params is None else target_params
+            )
+        discount = torch.as_tensor(self.gamma, device=reward.device).expand_as(reward)
+        duration = tensordict.get(keys.steps_to_next_obs, None)
+        if duration is not None:
+            discount = discount ** duration.view_as(reward)
+        inputs = (reward, discount, next_value, done, terminated)
+        moved = [entry.movedim(time, -2) for entry in inputs]
+        target = n_step_returns(*moved).movedim(-2, time)
+        tensordict.set(keys.value, value)
+        tensordict.set(keys.advantage, target - value)
+        return tensordict.set(keys.value_target, target)
+
+    @property
+    def _usual(self) -> bool:
+        """Whether nothing is asked for that only TorchRL's own estimator does."""
+        network = self.value_network
+        asked = self.shifted, self.differentiable, self.average_rewards, self.skip_existing
+        memory = network is None or any("is_init" in _flat(key) for key in network.in_keys)
+        return not (any(asked) or memory)
+
+    def _values(self, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
+        network = self.value_network
+        read = tensordict.select(*network.in_keys)
+        if params is None:
+            return network(read).get(self.tensor_keys.value)
+        with params.to_module(network, preserve_module_state=False):
+            return network(read).get(self.tensor_keys.value)
+
+
+class A3CLoss(A2CLoss):
+    r"""Policy gradient with n-step returns, the critic's squared error and an entropy bonus.
+
+    .. math::
+
+        L = -\log \pi(a_t \mid s_t)\,\bigl(G_t - V(s_t)\bigr) + c_v \bigl(G_t - V(s_t)\bigr)^2
+            - c_H\, \mathcal{H}\bigl(\pi(\cdot \mid s_t)\bigr)
+
+    with :math:`G_t` of :func:`n_step_returns`, and :math:`G_t - V(s_t)` constant in the first term.
+    It is TorchRL's ``A2CLoss`` with another default value estimator, :class:`NStepReturn`, which is
+    built with it and knows durations: on a macro env a step of k base steps discounts what follows
+    by gamma to the power of k. It takes segments ``[*B, T]``, within which episodes may end; an
+    ``advantage`` that is already there is used as it is, as ``OnPolicyTrainer`` does with GAE.
+
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): the policy.
+        critic_network (TensorDictModule): writes ``state_value`` ``[*B, T, 1]``.
+        gamma (float): discount per base step, in ``(0, 1]``. Default 0.99.
+        entropy_coeff (float): :math:`c_H \ge 0`, nats to return. Default 0.01, the paper's.
+        critic_coeff (float): :math:`c_v > 0`. Default 0.5: half the squared error.
+        reduction (str): ``"mean"`` (default), ``"sum"``, which is the paper's accumulation, or
+            ``"none"``. With the mean a learning rate does not depend on the segment's length.
+        loss_critic_type (str): ``"l2"`` (default), ``"l1"`` or ``"smooth_l1"``.
+        **kwargs: of ``torchrl.objectives.A2CLoss``, e.g. ``separate_losses`` or ``functional``.
+
+    Returns:
+        TensorDict with ``loss_objective``, ``loss_critic`` and ``loss_entropy``, and the detached
+        ``entropy``, nats. With ``reduction="none"`` the losses are ``[*B, T]``.
+
+    Raises:
+        ValueError: if gamma, a coefficient or the reduction is out of range.
+
+    Keys (``set_keys``): those of ``A2CLoss``, and ``duration`` (int64 ``[*B, T, 1]``, base steps,
+    default ``("next", "duration")``; 1 if absent).
+
+    Reference:
+        Mnih et al., "Asynchronous methods for deep reinforcement learning", 2016, arXiv 1602.01783;
+        Bartley, dissertation, 2023, Algorithm 2.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.modules import ProbabilisticActor, ValueOperator
+        >>> from torchrl_hmcts.objectives import A3CLoss
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(torch.nn.Linear(3, 2), ["observation"], ["logits"]),
+        ...     in_keys=["logits"], distribution_class=torch.distributions.Categorical)
+        >>> loss = A3CLoss(actor, ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"]))
+        >>> no = torch.zeros(4, 5, 1, dtype=torch.bool)
+        >>> after = TensorDict(observation=torch.randn(4, 5, 3), reward=torch.randn(4, 5, 1),
+        ...                    done=no, terminated=no, batch_size=[4, 5])
+        >>> segment = TensorDict(observation=torch.randn(4, 5, 3), next=after,
+        ...                      action=torch.zeros(4, 5, dtype=torch.int64), batch_size=[4, 5])
+        >>> sorted(loss(segment).keys())
+        ['entropy', 'loss_critic', 'loss_entropy', 'loss_objective']
+    """
+
+    @dataclass
+    class _AcceptedKeys(A2CLoss._AcceptedKeys):
+        duration: NestedKey = ("next", "duration")
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    default_value_estimator = NStepReturn
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModule,
+        *,
+        gamma: float = 0.99,
+        entropy_coeff: float = 0.01,
+        critic_coeff: float = 0.5,
+        reduction: str = "mean",
+        loss_critic_type: str = "l2",
+        **kwargs: Any,
+    ) -> None:
+        if not 0.0 < gamma <= 1.0:
+            raise ValueError(f"A3CLoss needs a gamma in (0, 1], per base step; got {gamma}.")
+        if not (math.isfinite(entropy_coeff) and entropy_coeff >= 0.0):
+            raise ValueError(
+                f"A3CLoss needs an entropy_coeff >= 0, which rewards entropy; got {entropy_coeff}."
+            )
+        if not (math.isfinite(critic_coeff) and critic_coeff > 0.0):
+            raise ValueError(
+                f"A3CLoss needs a critic_coeff > 0, since its returns rest on the critic; got "
+                f"{critic_coeff}."
+            )
+        check_reduction("A3CLoss", reduction)
+        super().__init__(
+            actor_network,
+            critic_network,
+            entropy_coeff=entropy_coeff,
+            critic_coeff=critic_coeff,
+            reduction=reduction,
+            loss_critic_type=loss_critic_type,
+            **kwargs,
+        )
+        # Built at once: built lazily it would add entries to the state dict of a run under way.
+        self.make_value_estimator(gamma=gamma)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        actions = keys.action if isinstance(keys.action, list) else [keys.action]
+        read = [*self.actor_network.in_keys, *self.critic_network.in_keys]
+        after = [keys.reward, keys.done, keys.terminated, *self.critic_network.in_keys]
+        return list(
+            dict.fromkeys([*actions, *read, *(unravel_key(("next", key)) for key in after)])
+        )
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
+        """Builds a value estimator; by default :class:`NStepReturn`, which takes a ``gamma``."""
+        value_type = self.default_value_estimator if value_type is None else value_type
+        if isinstance(value_type, type) and not isinstance(value_type, ValueEstimators):
+            hyperparams.setdefault("value_network", self.critic_network)
+        out = super().make_value_estimator(value_type, **hyperparams)
+        self._forward_value_estimator_keys()
+        return out
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        super()._forward_value_estimator_keys(**kwargs)
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)
+
+
+def _flat(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else tuple(key)

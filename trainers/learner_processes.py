@@ -1,0 +1,143 @@
+"""Processes of actor-learners: started, watched, and ended so that none is left behind."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import connection
+from typing import Any
+
+from torchrl_hmcts.trainers.actor_learner import SharedMemory, run_learner
+
+_STOP_SECONDS = 10.0
+
+
+class LearnerError(RuntimeError):
+    """A learner of an asynchronous training ended before its time.
+
+    Args:
+        message (str): what happened, with the learner's traceback.
+        learner (int): its number.
+        exitcode (int): of its process; negative for a signal.
+
+    Examples:
+        >>> LearnerError("learner 1 was killed", learner=1, exitcode=-9).learner
+        1
+    """
+
+    def __init__(self, message: str, *, learner: int, exitcode: int | None) -> None:
+        super().__init__(message)
+        self.learner, self.exitcode = learner, exitcode
+
+
+class LearnerProcesses:
+    """The processes of one training.
+
+    Args:
+        number (int): learners.
+        start_method (str): of ``multiprocessing``.
+
+    Examples:
+        >>> LearnerProcesses(2, "spawn").wait(0.0)  # none is running
+        True
+    """
+
+    def __init__(self, number: int, start_method: str) -> None:
+        self.number = number
+        self.context: Any = multiprocessing.get_context(start_method)
+        if start_method == "forkserver":
+            # Imported once; learners then start within milliseconds.
+            self.context.set_forkserver_preload(["__main__", run_learner.__module__])
+        self.running: list[tuple[Any, Any]] = []  # process, end of a pipe with its traceback
+
+    def start(self, payload: bytes, shared: SharedMemory, start_frames: int) -> None:
+        """Starts all learners.
+
+        Args:
+            payload: their settings by cloudpickle.
+            shared: what they have in common.
+            start_frames: frames done by earlier runs.
+        """
+        self.start_frames, self.board = start_frames, shared.board
+        for i in range(self.number):
+            errors, send = self.context.Pipe(duplex=False)
+            # Not daemons: those may not have processes of their own, as a ParallelEnv has.
+            process = self.context.Process(
+                target=run_learner,
+                args=(payload, shared, i, start_frames, send),
+                name=f"learner {i}",
+            )
+            with no_interrupts():
+                process.start()
+                self.running.append((process, errors))
+            send.close()
+
+    def wait(self, seconds: float) -> bool:
+        """Waits until a learner ends or the time is over.
+
+        Args:
+            seconds: at most.
+
+        Returns:
+            bool: whether all have ended as they should.
+
+        Raises:
+            LearnerError: if one has ended otherwise.
+        """
+        alive = [process.sentinel for process, _ in self.running if process.exitcode is None]
+        if alive:
+            connection.wait(alive, timeout=seconds)
+        for i, (process, errors) in enumerate(self.running):
+            if process.exitcode not in (None, 0):
+                raise self._error(i, process.exitcode, errors)
+        return all(process.exitcode == 0 for process, _ in self.running)
+
+    def stop(self, shared: SharedMemory) -> None:
+        """Ends all learners: they finish their segment, or are killed after some seconds.
+
+        Args:
+            shared: where they are asked to.
+        """
+        shared.stop[0] = 1
+        with no_interrupts():
+            deadline = time.monotonic() + _STOP_SECONDS
+            for process, errors in self.running:
+                process.join(max(0.0, deadline - time.monotonic()))
+                if process.exitcode is None:
+                    process.kill()
+                    process.join()
+                process.close()
+                errors.close()
+            self.running.clear()
+        shared.stop[0] = 0
+
+    def _error(self, learner: int, exitcode: int, errors: Any) -> LearnerError:
+        try:
+            text = errors.recv() if errors.poll(1.0) else ""
+        except EOFError:
+            text = ""
+        if exitcode < 0:
+            how = f"was killed by {signal.Signals(-exitcode).name}"
+            text = text or "It left no traceback: out of memory, or killed from outside?"
+        else:
+            how = "failed" if text else f"ended with exit code {exitcode} and no traceback"
+        frames = self.start_frames + int(self.board[:, 0].sum())
+        return LearnerError(
+            f"Learner {learner} of {self.number} {how} after {frames} frames; the others were "
+            f"stopped.\n\n{text}",
+            learner=learner,
+            exitcode=exitcode,
+        )
+
+
+@contextmanager
+def no_interrupts() -> Iterator[None]:
+    """Puts Ctrl-C off until the end; processes started meanwhile never get it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

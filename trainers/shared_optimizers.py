@@ -1,0 +1,203 @@
+"""Optimisers whose state lies in shared memory, for processes that step them without a lock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+# Those whose state after a step with zero gradients is the state they start from.
+_SHAREABLE = (
+    torch.optim.Adagrad,
+    torch.optim.Adam,
+    torch.optim.Adamax,
+    torch.optim.AdamW,
+    torch.optim.RMSprop,
+    torch.optim.SGD,
+)
+
+
+def share_optimizer(optimizer: Optimizer) -> Optimizer:
+    """Builds an optimiser's state at once, and moves it and the parameters to shared memory.
+
+    torch builds the state at the first step, so that each process would get one of its own. Here
+    parameters and state stay what they were, but every process that receives the optimiser changes
+    the same numbers when it steps. Learning rates and other settings stay each process's own.
+
+    Args:
+        optimizer (Optimizer): :class:`SharedRMSprop`, :class:`SharedAdam`, or torch's ``Adagrad``,
+            ``Adam``, ``Adamax``, ``AdamW``, ``RMSprop`` or ``SGD``. On the CPU.
+
+    Returns:
+        Optimizer: itself.
+
+    Raises:
+        TypeError: if it is another kind, whose state cannot be built beforehand.
+        ValueError: if a parameter is not on the CPU.
+
+    Examples:
+        >>> weight = torch.nn.Parameter(torch.ones(2))
+        >>> optimizer = share_optimizer(torch.optim.SGD([weight], lr=0.1, momentum=0.9))
+        >>> weight.is_shared(), optimizer.state[weight]["momentum_buffer"].is_shared()
+        (True, True)
+        >>> weight.tolist()
+        [1.0, 1.0]
+    """
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    elsewhere = {str(p.device) for p in parameters if p.device.type != "cpu"}
+    if elsewhere:
+        raise ValueError(
+            f"Learners share their parameters in the CPU's memory; these are on {elsewhere}. "
+            "Move the networks with .to('cpu') before building the optimiser."
+        )
+    if any(not optimizer.state.get(p) for p in parameters):
+        _build_state(optimizer, parameters)
+    for parameter in parameters:
+        parameter.share_memory_()
+        for entry in optimizer.state[parameter].values():
+            if isinstance(entry, Tensor):
+                entry.share_memory_()
+    return optimizer
+
+
+def _build_state(optimizer: Optimizer, parameters: list[Tensor]) -> None:
+    if not isinstance(optimizer, (SharedRMSprop, *_SHAREABLE)):
+        names = ", ".join(kind.__name__ for kind in _SHAREABLE)
+        raise TypeError(
+            f"{type(optimizer).__name__} builds its state at its first step, so that every learner "
+            f"would have one of its own. Use SharedRMSprop, SharedAdam, or one of torch.optim's "
+            f"{names}."
+        )
+    before = [p.detach().clone() for p in parameters]
+    decay = [group.get("weight_decay", 0.0) for group in optimizer.param_groups]
+    for group in optimizer.param_groups:
+        group["weight_decay"] = 0.0
+    for parameter in parameters:
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    with torch.no_grad():
+        for parameter, value in zip(parameters, before, strict=True):
+            parameter.copy_(value)
+            parameter.grad = None
+            for name, entry in optimizer.state[parameter].items():
+                if name == "step":
+                    entry.zero_()
+    for group, value in zip(optimizer.param_groups, decay, strict=True):
+        group["weight_decay"] = value
+
+
+class SharedRMSprop(Optimizer):
+    r"""RMSprop with one shared mean of squared gradients, as in A3C.
+
+    .. math::
+
+        g \leftarrow \alpha g + (1 - \alpha)\, \Delta\theta^2, \qquad
+        \theta \leftarrow \theta - \eta\, \Delta\theta / \sqrt{g + \epsilon}
+
+    Unlike ``torch.optim.RMSprop`` it has :math:`\epsilon` under the root. Processes that step it at
+    the same time may overwrite each other's share of :math:`g`, which the paper accepts.
+
+    Args:
+        params (iterable): parameters, or groups of them; moved to shared memory.
+        lr (float): :math:`\eta`. Default 7e-4.
+        alpha (float): memory of the mean, in ``[0, 1)``. Default 0.99, the paper's.
+        eps (float): :math:`\epsilon > 0`, in units of squared gradients. Default 1e-5; the paper's
+            0.1 goes with gradients summed over a segment.
+        weight_decay (float): added to the gradient times the parameter. Default 0.
+
+    Raises:
+        ValueError: if a setting is out of range.
+
+    Reference:
+        Mnih et al., "Asynchronous methods for deep reinforcement learning", 2016, arXiv 1602.01783,
+        section 4.
+
+    Examples:
+        >>> weight = torch.nn.Parameter(torch.tensor([1.0]))
+        >>> optimizer = SharedRMSprop([weight], lr=0.1, alpha=0.75, eps=1e-8)
+        >>> weight.grad = torch.tensor([2.0])
+        >>> optimizer.step()
+        >>> weight.item(), optimizer.state[weight]["square_avg"].item()
+        (0.800000011920929, 1.0)
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float = 7e-4,
+        alpha: float = 0.99,
+        eps: float = 1e-5,
+        weight_decay: float = 0.0,
+    ) -> None:
+        if not lr >= 0.0:
+            raise ValueError(f"SharedRMSprop needs a learning rate lr >= 0; got {lr}.")
+        if not 0.0 <= alpha < 1.0:
+            raise ValueError(f"SharedRMSprop needs alpha in [0, 1), its memory; got {alpha}.")
+        if not eps > 0.0:
+            raise ValueError(f"SharedRMSprop needs eps > 0, which it divides by; got {eps}.")
+        if not weight_decay >= 0.0:
+            raise ValueError(f"SharedRMSprop needs weight_decay >= 0; got {weight_decay}.")
+        super().__init__(
+            params, {"lr": lr, "alpha": alpha, "eps": eps, "weight_decay": weight_decay}
+        )
+        share_optimizer(self)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """Changes the parameters by their gradients.
+
+        Args:
+            closure (callable, optional): computes the loss anew, with gradients, and returns it.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            alpha, decay = group["alpha"], group["weight_decay"]
+            for parameter in group["params"]:
+                gradient = parameter.grad
+                if gradient is None:
+                    continue
+                if decay:
+                    gradient = gradient.add(parameter, alpha=decay)
+                state = self.state[parameter]
+                if not state:
+                    state["square_avg"] = torch.zeros_like(parameter)
+                mean = state["square_avg"]
+                mean.mul_(alpha).addcmul_(gradient, gradient, value=1.0 - alpha)
+                # The mean is read once: another process may be writing it.
+                parameter.addcdiv_(gradient, (mean + group["eps"]).sqrt_(), value=-group["lr"])
+        return loss
+
+
+class SharedAdam(torch.optim.Adam):
+    """torch's Adam with its moments and step count in shared memory.
+
+    Args:
+        params (iterable): parameters, or groups of them; moved to shared memory.
+        lr (float): learning rate. Default 1e-3.
+        fused (bool): one call for all parameters of a group; on the CPU about 3 times as fast.
+            Default ``True``.
+        **kwargs: of ``torch.optim.Adam`` (``betas``, ``eps``, ``weight_decay``, ``amsgrad``).
+
+    Reference:
+        Kingma and Ba, "Adam: a method for stochastic optimization", 2015, arXiv 1412.6980.
+
+    Examples:
+        >>> weight = torch.nn.Parameter(torch.tensor([1.0]))
+        >>> optimizer = SharedAdam([weight], lr=0.5)
+        >>> weight.grad = torch.tensor([3.0])
+        >>> _ = optimizer.step()
+        >>> weight.item(), optimizer.state[weight]["step"].is_shared()
+        (0.5, True)
+    """
+
+    def __init__(
+        self, params: Iterable[Any], lr: float = 1e-3, *, fused: bool = True, **kwargs: Any
+    ) -> None:
+        super().__init__(params, lr=lr, fused=fused, **kwargs)
+        share_optimizer(self)
