@@ -12,6 +12,7 @@ from torchrl_hmcts.planners.evaluators import (
     RolloutEvaluator,
     ValueEvaluator,
 )
+from torchrl_hmcts.planners.goals import GoalPlanner
 from torchrl_hmcts.planners.mcts import MCTSPlanner, SearchProgress
 from torchrl_hmcts.planners.model_control import ModelBasedControl
 from torchrl_hmcts.planners.noise import DirichletNoise
@@ -30,6 +31,7 @@ __all__ = [
     "UCT",
     "BestPlan",
     "DirichletNoise",
+    "GoalPlanner",
     "Gumbel",
     "HierarchicalPolicy",
     "HighestValue",

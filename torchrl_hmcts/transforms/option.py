@@ -348,9 +348,10 @@ class OptionTransform(Transform):
         input_spec["full_action_spec"] = spec
         state = input_spec.get("full_state_spec", None)
         if not self._fitted().batch_locked and state is not None and not state.is_empty():
-            # The worker's first step reads what the env showed: a stored state needs it.
+            # The first step reads and hands out what the env showed: a stored state needs it.
             observed = self.parent.full_observation_spec
-            for key in map(unravel_key, getattr(self.worker, "in_keys", ())):
+            handed = () if self.trajectory is None else self.trajectory.keys
+            for key in map(unravel_key, (*getattr(self.worker, "in_keys", ()), *handed)):
                 if key in observed.keys(True, True) and key not in state.keys(True, True):
                     state[key] = observed[key].clone()
         return input_spec
