@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from torchrl_hmcts.envs.atari_pool import AtariOptionPool
+from torchrl_hmcts.envs.atari_ram import AtariRAMEnv
+from torchrl_hmcts.envs.atari_workers import OptionWorker, RepeatActions, SharedMLP
 from torchrl_hmcts.envs.deepmind_lab import DeepMindLabEnv
 from torchrl_hmcts.envs.gridworld import GridworldMazeEnv
 from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
 from torchrl_hmcts.envs.lab_actions import LAB_ACTIONS
+from torchrl_hmcts.envs.lab_first_person import draw_first_person
 from torchrl_hmcts.envs.lab_maze import LabMazeEnv
 from torchrl_hmcts.envs.lab_mazes import lab_maze
 from torchrl_hmcts.envs.lab_recordings import replay_recording
@@ -24,13 +28,19 @@ from torchrl_hmcts.envs.rendering import draw_maze
 from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 
 __all__ = [
+    "AtariOptionPool",
+    "AtariRAMEnv",
     "DeepMindLabEnv",
     "GridworldMazeEnv",
     "LAB_ACTIONS",
     "LabMazeEnv",
+    "OptionWorker",
+    "RepeatActions",
+    "SharedMLP",
     "TorchRLGymnasiumEnv",
     "WaterworldMazeEnv",
     "check_mazes",
+    "draw_first_person",
     "draw_maze",
     "free_tiles",
     "generate_mazes",

@@ -57,6 +57,8 @@ def test_all_three_folders_are_reached() -> None:
 def test_the_examples_of_a_module_run(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if ".envs.atari_" in name:
+        pytest.importorskip("ale_py")
     module = importlib.import_module(name)
     assert module.__doc__, f"{name} has no docstring"
     monkeypatch.chdir(tmp_path)  # an example may write files

@@ -642,10 +642,10 @@ def _as_tensor(value: Tensor, name: str) -> Tensor:
 
 
 def _option_gamma(env: EnvBase) -> float:
-    """The discount of the env's OptionTransform, the last one if there are several; else 0.99."""
+    """The discount of the env's last OptionTransform, or of an env with options; else 0.99."""
     transform = getattr(env, "transform", None)
     transforms = transform if isinstance(transform, Compose) else [transform]
-    for candidate in reversed(list(transforms)):
+    for candidate in (*reversed(list(transforms)), getattr(env, "base_env", env)):
         gamma = getattr(candidate, "gamma", None)
         if gamma is not None and hasattr(candidate, "num_options"):
             return float(gamma)

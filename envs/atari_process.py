@@ -1,0 +1,345 @@
+"""Processes that run options on emulators, one emulator each, fed through shared memory.
+
+Jobs are slots of a shared array: a state, an option and a seed go in, the outcome comes back in the
+same slot. What goes through pipes is the number of a slot, once per option: all processes read from
+one pipe, so that whoever is free takes the next.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import multiprocessing
+import os
+import select
+import signal
+import traceback
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_hmcts.envs.atari_emulator import AtariEmulator
+from torchrl_hmcts.envs.atari_workers import OptionWorker
+
+NUM_SLOTS = 128
+"""Options that can be under way at once; more are run in several goes."""
+
+_NUMBER = np.dtype("<i4")
+_MAX_MESSAGE = 4000  # of an error; what a pipe takes at once
+_DEATHS_IN_A_ROW = 5
+_PRELOAD = __name__.replace("process", "preload")
+
+
+@dataclass(frozen=True)
+class OptionRun:
+    """How options are run.
+
+    Attributes:
+        emulator: keywords of :class:`AtariEmulator`.
+        max_steps: steps after which an option ends.
+        gamma: discount per step.
+        end_on_life_loss: whether an option ends when a life is lost.
+        record: whether the steps inside the option are kept.
+    """
+
+    emulator: dict[str, Any]
+    max_steps: int
+    gamma: float
+    end_on_life_loss: bool = False
+    record: bool = False
+
+
+def slot_type(width: int, run: OptionRun) -> np.dtype:
+    """Return the type of a job and its outcome, for states of ``width`` bytes."""
+    fields: list[Any] = [
+        ("state", np.uint8, (width,)),  # in
+        ("option", np.int64),
+        ("seed", np.int64),
+        ("after", np.uint8, (width,)),  # out
+        ("ram", np.uint8, (128,)),
+        ("reward", np.float64),  # discounted sum
+        ("life_losses", np.float64),  # discounted sum
+        ("duration", np.int64),
+        ("lives", np.int64),
+        ("episode_frame", np.int64),
+        ("terminated", np.bool_),
+        ("truncated", np.bool_),
+    ]
+    if run.record:
+        fields += [
+            ("inner_ram", np.uint8, (run.max_steps, 128)),  # before each action
+            ("inner_action", np.int64, (run.max_steps,)),
+            ("inner_reward", np.float32, (run.max_steps,)),
+        ]
+    return np.dtype(fields, align=True)
+
+
+def run_option(
+    emulator: AtariEmulator,
+    worker: OptionWorker,
+    run: OptionRun,
+    slots: np.ndarray,
+    index: int,
+    frames: np.ndarray,
+) -> None:
+    """Run the option in one slot to its end and write the outcome.
+
+    Args:
+        emulator: set to the slot's state first.
+        worker: chooses the actions.
+        run: when the option ends, and what is kept.
+        slots: ``[S]`` of :func:`slot_type`.
+        index: which slot.
+        frames: int64 ``[1]``, counted up by the frames emulated, step by step.
+    """
+    slot = slots[index]
+    option = int(slot["option"])
+    seed = _mixed(int(slot["seed"]), option, slots["state"][index])
+    generator = np.random.default_rng(seed)
+    ends = getattr(worker, "ends", None)
+    before = emulator.num_frames
+    ram = slots["ram"][index]
+    emulator.set_state(slots["state"][index], seed & 0x7FFFFFFF)
+    emulator.read_ram(ram)
+    reward = life_losses = 0.0
+    discount = 1.0
+    for step in range(run.max_steps):
+        action = worker.act(ram, option, generator)
+        gained, lost = emulator.act(action)
+        frames[0] += emulator.num_frames - before
+        before = emulator.num_frames
+        if run.record:
+            slots["inner_ram"][index, step] = ram
+            slots["inner_action"][index, step] = action
+            slots["inner_reward"][index, step] = gained
+        emulator.read_ram(ram)
+        reward += discount * gained
+        life_losses += discount * lost
+        discount *= run.gamma
+        if (
+            (lost and run.end_on_life_loss)
+            or emulator.ale.game_over()
+            or (ends is not None and ends(ram, option, step + 1))
+        ):
+            break
+    slot["duration"] = step + 1
+    slot["reward"], slot["life_losses"] = reward, life_losses
+    slot["lives"], slot["episode_frame"] = emulator.lives, emulator.episode_frame
+    slot["terminated"], slot["truncated"] = emulator.terminated, emulator.truncated
+    slots["after"][index] = emulator.state()
+
+
+def _mixed(seed: int, option: int, state: np.ndarray) -> int:
+    """What an option draws its random numbers from: a function of its three arguments."""
+    numbers = seed.to_bytes(8, "little") + option.to_bytes(4, "little")
+    digest = hashlib.blake2b(numbers + state.tobytes(), digest_size=8).digest()
+    return int.from_bytes(digest, "little")
+
+
+@dataclass
+class Channel:
+    """What the processes share with their owner."""
+
+    slots: Tensor  # uint8, the memory of the slots
+    frames: Tensor  # [P] int64, frames emulated by each
+    jobs: Any = None  # ends of pipes
+    results: Any = None
+    errors: Any = None
+
+    def views(self, slot: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Return slots and frames as arrays that share their memory."""
+        return self.slots.numpy().view(slot), self.frames.numpy()
+
+
+def serve(rank: int, run: OptionRun, worker: OptionWorker, channel: Channel) -> None:
+    """Run options until the owner closes the pipe of jobs or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the owner's to handle
+    torch.set_num_threads(1)
+    jobs, results = channel.jobs.fileno(), channel.results.fileno()
+    try:
+        emulator = AtariEmulator(**run.emulator)
+        slots, frames = channel.views(slot_type(emulator.states.width, run))
+        while message := os.read(jobs, _NUMBER.itemsize):
+            index = int.from_bytes(message, "little")
+            run_option(emulator, worker, run, slots, index, frames[rank : rank + 1])
+            os.write(results, message)
+    except BrokenPipeError:  # the owner has gone
+        pass
+    except Exception:
+        text = f"process {rank}: {traceback.format_exc()[-_MAX_MESSAGE:]}"
+        with contextlib.suppress(BrokenPipeError):
+            os.write(channel.errors.fileno(), text.encode()[:_MAX_MESSAGE])
+
+
+@dataclass
+class _Running:
+    """Processes that run, and the owner's ends of their pipes."""
+
+    processes: list[Any]
+    jobs: Any
+    results: Any
+    errors: Any
+    poll: Any = field(default_factory=lambda: select.poll())
+
+
+class EmulatorProcesses:
+    """Runs the options in the slots on several processes.
+
+    A process that dies, by a signal or a crash of the emulator, costs what was under way: all
+    processes are started anew, and the options without an outcome run again. An error that is
+    raised in a process, e.g. by the worker, is raised here.
+
+    Args:
+        num_processes: P.
+        width: bytes of a state.
+        run: how options are run.
+        worker: sent to the processes once; what it shares with them (tensors in shared memory)
+            stays shared.
+        start_method: ``"forkserver"`` or ``"spawn"``.
+
+    Raises:
+        RuntimeError: in :meth:`run_slots`, if the worker fails or processes die again and again.
+    """
+
+    def __init__(
+        self,
+        num_processes: int,
+        width: int,
+        run: OptionRun,
+        worker: OptionWorker,
+        start_method: str = "forkserver",
+    ) -> None:
+        self.num_processes = num_processes
+        self.run, self.worker = run, worker
+        self.num_restarts = 0
+        """Processes that died and were started anew."""
+        self._context: Any = multiprocessing.get_context(start_method)
+        if start_method == "forkserver":  # imports once, so that a process starts in no time
+            self._context.set_forkserver_preload([_PRELOAD])
+        slot = slot_type(width, run)
+        memory = torch.zeros(NUM_SLOTS * slot.itemsize, dtype=torch.uint8).share_memory_()
+        frames = torch.zeros(num_processes, dtype=torch.int64).share_memory_()
+        self._memory = Channel(memory, frames)
+        self.slots, self._frames = self._memory.views(slot)
+        self._running: _Running | None = None
+
+    @property
+    def num_frames(self) -> int:
+        """Frames emulated by all processes, those of options that were lost included."""
+        return int(self._frames.sum())
+
+    @property
+    def pids(self) -> list[int]:
+        """Ids of the processes that run."""
+        return [] if self._running is None else [p.pid for p in self._running.processes]
+
+    def start(self) -> None:
+        """Start the processes, if they do not run."""
+        if self._running is not None:
+            return
+        theirs, ours = [], []
+        for sent_by_us in (True, False, False):
+            reader, writer = self._context.Pipe(duplex=False)
+            theirs.append(reader if sent_by_us else writer)
+            ours.append(writer if sent_by_us else reader)
+        channel = Channel(self._memory.slots, self._memory.frames, *theirs)
+        running = _Running([], *ours)
+        running.poll.register(running.results.fileno(), select.POLLIN)
+        try:
+            for rank in range(self.num_processes):
+                process = self._context.Process(
+                    target=serve, args=(rank, self.run, self.worker, channel), daemon=True
+                )
+                process.start()
+                running.processes.append(process)
+                running.poll.register(process.sentinel, select.POLLIN)
+        except BaseException:
+            self._running = running
+            self.stop()
+            raise
+        finally:
+            for end in theirs:
+                end.close()
+        self._running = running
+
+    def run_slots(self, count: int) -> None:
+        """Run the options in the first ``count`` slots."""
+        if not count:
+            return
+        try:
+            waiting, deaths = set(range(count)), 0
+            while waiting:
+                before = len(waiting)
+                self.start()
+                dead = self._run(waiting)
+                deaths = len(dead) if len(waiting) < before else deaths + len(dead)
+                self.num_restarts += len(dead)
+                if waiting and deaths >= _DEATHS_IN_A_ROW:
+                    raise RuntimeError(
+                        f"{deaths} processes of the pool died one after the other without an "
+                        f"outcome, with the exit codes {dead} (a negative one is a signal). If "
+                        f"they die at once, put what the script does under "
+                        f"`if __name__ == '__main__':`, as multiprocessing needs it."
+                    )
+        except BaseException:  # e.g. an interrupt: outcomes still under way are nobody's
+            self.stop()
+            raise
+
+    def _run(self, waiting: set[int]) -> list[int | None]:
+        """Run what is waiting until all is done or a process dies; return their exit codes."""
+        running = self._running
+        assert running is not None
+        results = running.results.fileno()
+        with contextlib.suppress(BrokenPipeError):  # all have died
+            os.write(running.jobs.fileno(), np.array(sorted(waiting), _NUMBER).tobytes())
+        while waiting:
+            ready = [fd for fd, _ in running.poll.poll()]
+            if results in ready:
+                waiting.difference_update(_numbers(results))
+            if results not in ready or len(ready) > 1:
+                return self._bury(running, waiting)
+        return []
+
+    def _bury(self, running: _Running, waiting: set[int]) -> list[int | None]:
+        """Take what was finished, and stop those that live: who had what cannot be known."""
+        if running.errors.poll():
+            text = os.read(running.errors.fileno(), _MAX_MESSAGE).decode(errors="replace")
+            if text:
+                raise RuntimeError(f"An option failed in {text}")
+        codes = [p.exitcode for p in running.processes if not p.is_alive()]
+        self.stop(collect=waiting)
+        return codes
+
+    def stop(self, *, collect: set[int] | None = None) -> None:
+        """Stop the processes; they start again when needed.
+
+        Args:
+            collect: takes out of this set what they had finished.
+        """
+        running, self._running = self._running, None
+        if running is None:
+            return
+        running.jobs.close()
+        for process in running.processes:
+            process.kill()
+        for process in running.processes:
+            process.join(5.0)
+        while collect is not None and running.results.poll():
+            numbers = _numbers(running.results.fileno())
+            if not numbers:
+                break
+            collect.difference_update(numbers)
+        for process in running.processes:
+            with contextlib.suppress(ValueError):
+                process.close()
+        running.results.close()
+        running.errors.close()
+
+
+def _numbers(pipe: int) -> list[int]:
+    """The numbers of slots that wait in a pipe, none at its end."""
+    message = os.read(pipe, NUM_SLOTS * _NUMBER.itemsize)
+    return np.frombuffer(message, _NUMBER).tolist() if message else []
