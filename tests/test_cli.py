@@ -1,0 +1,77 @@
+"""The command line: experiments by name, their keys, and what it says when something is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+
+from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.config import DemoConfig
+from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment, find_experiment
+from torchrl_hmcts.trainers.experiments.registry import field_docs
+
+ALL = [*EXPERIMENTS.values()]
+
+
+@pytest.mark.parametrize("experiment", ALL, ids=lambda e: e.name)
+def test_every_key_of_an_experiment_has_a_default_and_a_sentence(experiment: Experiment) -> None:
+    meanings = field_docs(experiment.config_class)
+    for field in fields(experiment.config_class):
+        assert meanings[field.name].endswith("."), field.name
+    assert experiment.config_class().out == f"runs/{experiment.name}"
+    assert callable(experiment.function)
+
+
+def test_the_list_names_every_experiment(capsys) -> None:
+    assert main(["list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(f"  {name} " in printed for name in EXPERIMENTS)
+
+
+def test_the_keys_of_an_experiment_are_listed_with_defaults_and_meaning(capsys) -> None:
+    assert main(["list", "waterworld_goals"]) == 0
+    printed = capsys.readouterr().out
+    assert "  goal_met_threshold=0.5\n      Tiles within which a goal is met." in printed
+    assert "  gamma=0.99\n      Discount per base step." in printed  # of the class it extends
+
+
+@pytest.mark.parametrize("verb", [["list", "labmase"], ["train", "experiment=labmase"]])
+def test_an_unknown_experiment_is_refused_with_the_nearest(capsys, verb: list[str]) -> None:
+    assert main(verb) == 2
+    assert "Did you mean: labmaze" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["seed=1"], ["experiment=labmaze", "experiment=labmaze"]])
+def test_train_wants_one_experiment(capsys, words: list[str]) -> None:
+    assert main(["train", *words]) == 2
+    assert "say once which experiment" in capsys.readouterr().err
+
+
+def test_an_unknown_key_of_an_experiment_is_refused_with_the_nearest(capsys) -> None:
+    assert main(["train", "experiment=waterworld_goals", "num_lerners=3"]) == 2
+    error = capsys.readouterr().err
+    assert "hmcts train experiment=waterworld_goals:" in error
+    assert "Did you mean: num_learners" in error
+
+
+def test_ctrl_c_ends_with_how_to_go_on(capsys, monkeypatch) -> None:
+    def interrupted(config) -> dict:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.waterworld.run_waterworld", interrupted)
+    assert main(["train", "experiment=waterworld_a3c", "out=runs/mine"]) == 130
+    assert "hmcts train experiment=waterworld_a3c out=runs/mine resume=true" in (
+        capsys.readouterr().err
+    )
+
+
+def test_the_demo_lists_its_keys_with_their_meaning(capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["demo", "--help"])
+    assert stop.value.code == 0
+    assert f"  gamma={DemoConfig().gamma}\n      Discount per base step." in capsys.readouterr().out
+
+
+def test_an_experiment_is_found_by_name() -> None:
+    assert find_experiment("labmaze").name == "labmaze"

@@ -1,0 +1,126 @@
+"""The experiments by name. Nothing heavy is imported before one of them runs."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib
+import inspect
+import textwrap
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One experiment: what it shows, how it is set up, and what runs it.
+
+    Args:
+        name: as in ``hmcts train experiment=NAME``.
+        summary: one line for the list.
+        config: dataclass of its keys, as ``".module:Class"``, relative to this package.
+        run: function of that configuration which returns the figures, as ``".module:function"``.
+
+    Example:
+        >>> find_experiment("waterworld_goals").config_class(seed=3).seed
+        3
+    """
+
+    name: str
+    summary: str
+    config: str
+    run: str
+
+    @property
+    def config_class(self) -> Any:
+        """The dataclass of the experiment's keys."""
+        return _load(self.config)
+
+    @property
+    def function(self) -> Callable[[Any], dict[str, Any]]:
+        """What runs it; loads torch and all that the experiment needs."""
+        run: Callable[[Any], dict[str, Any]] = _load(self.run)
+        return run
+
+    def __call__(self, config: Any) -> dict[str, Any]:
+        """Run the experiment; return its figures."""
+        return self.function(config)
+
+    def describe(self) -> str:
+        """Return its keys with their defaults and meaning, a line or two each."""
+        meanings = field_docs(self.config_class)
+        lines = []
+        for field in fields(self.config_class):
+            lines.append(f"  {field.name}={field.default}")
+            lines += textwrap.wrap(
+                meanings.get(field.name, ""), 92, initial_indent=" " * 6, subsequent_indent=" " * 6
+            )
+        return "\n".join(lines)
+
+
+EXPERIMENTS = {
+    experiment.name: experiment
+    for experiment in (
+        Experiment(
+            "waterworld_goals",
+            "chapter 3's goal-based agent: tree search over tiles sets goals, A3C reaches them",
+            ".waterworld_config:WaterworldGoalsConfig",
+            ".waterworld:run_waterworld",
+        ),
+        Experiment(
+            "waterworld_a3c",
+            "chapter 3's comparison: A3C alone on the same mazes, network and budget",
+            ".waterworld_config:WaterworldA3CConfig",
+            ".waterworld:run_waterworld",
+        ),
+        Experiment(
+            "labmaze",
+            "chapter 4: tree search over skills learned by DIAYN in DeepMind Lab's random maze",
+            ".labmaze_config:LabMazeConfig",
+            ".labmaze:run_labmaze",
+        ),
+    )
+}
+
+
+def find_experiment(name: str) -> Experiment:
+    """Return an experiment by name.
+
+    Args:
+        name: one of ``EXPERIMENTS``.
+
+    Raises:
+        ValueError: if there is none of that name; the nearest are named.
+    """
+    if name not in EXPERIMENTS:
+        near = difflib.get_close_matches(name, EXPERIMENTS, n=3, cutoff=0.4) or EXPERIMENTS
+        raise ValueError(f"Unknown experiment {name!r}. Did you mean: {', '.join(near)}?")
+    return EXPERIMENTS[name]
+
+
+def field_docs(config_class: type) -> dict[str, str]:
+    """Return the sentence below each field of a configuration, by the field's name.
+
+    Args:
+        config_class: a dataclass; fields of its base classes are included.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.config import DemoConfig
+        >>> field_docs(DemoConfig)["gamma"]
+        'Discount per base step.'
+    """
+    docs: dict[str, str] = {}
+    for owner in reversed(config_class.__mro__[:-1]):
+        tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))
+        body = tree.body[0].body  # type: ignore[attr-defined]
+        for field, below in zip(body, body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                assert isinstance(field.target, ast.Name)
+                docs[field.target.id] = " ".join(ast.literal_eval(below.value).split())
+    return docs
+
+
+def _load(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module, __package__), name)
