@@ -67,6 +67,8 @@ class HMCTSTrainer(ResumableTrainer):
         make_options (callable): ``make_options(worker, num_skills, option_steps,
             trajectory_keys=...)`` builds the ``OptionTransform``. Default: the class itself; pass a
             ``functools.partial`` of it for a discount or a termination.
+        make_recorder (callable): ``make_recorder(keys)`` builds the two recorders. Default: the
+            class itself; pass a ``functools.partial`` of it for another ``position_key``.
         make_planner (callable): ``make_planner(simulator, tree_policy=UCT(c_p), seed=...)`` builds
             the planner, e.g. ``partial(MCTSPlanner, novelty=..., budget=...)``. Bound its budget:
             an untrained worker finds few plans. Default: :class:`MCTSPlanner` with 50 expansions.
@@ -139,6 +141,7 @@ class HMCTSTrainer(ResumableTrainer):
         dataset_fraction: float | None = None,
         make_simulator: Callable[[], EnvBase] | None = None,
         make_options: Callable[..., OptionTransform] = OptionTransform,
+        make_recorder: Callable[..., OptionRecorder] = OptionRecorder,
         make_planner: Callable[..., MCTSPlanner] | None = None,
         worker: TensorDictModuleBase | None = None,
         test_worker: TensorDictModuleBase | None = None,
@@ -184,7 +187,7 @@ class HMCTSTrainer(ResumableTrainer):
         if test_worker is None:
             test_worker = SkillPolicy(actor, deterministic=True)
         num_skills = worker.num_skills if hasattr(worker, "num_skills") else actor.num_skills
-        recorders = OptionRecorder(keys), OptionRecorder(keys)
+        recorders = make_recorder(keys), make_recorder(keys)
 
         def make_macro(make: Callable[[], EnvBase], recorder: OptionRecorder) -> TransformedEnv:
             base = make()

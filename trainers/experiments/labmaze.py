@@ -1,0 +1,221 @@
+"""Chapter 4's experiment: tree search over learned skills in DeepMind Lab's random maze."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tqdm import tqdm
+
+from torchrl_hmcts import __version__
+from torchrl_hmcts.envs import draw_first_person
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import MCTSPlanner, Plan
+from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
+from torchrl_hmcts.trainers.lab_evaluation import (
+    make_maze_env,
+    make_planner,
+    solve_mazes,
+    solve_with_wrong_model,
+    wrong_models,
+)
+from torchrl_hmcts.trainers.lab_figures import (
+    frames_curve,
+    plot_frames_curves,
+    plot_mazes,
+    plot_search,
+    plot_skill_fan,
+    write_episode_gif,
+)
+from torchrl_hmcts.trainers.lab_script import ShortestPathScript
+from torchrl_hmcts.trainers.lab_training import TrainedWorker, curve_script_frames, train_worker
+from torchrl_hmcts.trainers.lab_worker import held_out_seeds, make_starts
+from torchrl_hmcts.trainers.plots import plot_losses
+from torchrl_hmcts.trainers.report import write_page
+
+_TOY: dict[str, Any] = {
+    "mazes": 4,
+    "train_frames": 4_096,
+    "init_options": 8,
+    "round_expansions": 1,
+    "expansions": 16,
+    "improve_expansions": 4,
+    "curve_mazes": 2,
+    "curve_points": 1,
+    "robust_mazes": 2,
+    "max_frames": 300,
+}
+_STATE = ("maze_index", "position", "velocity", "turned", "level")
+
+_PICTURES = {
+    "episode.gif": "A test maze as it was solved: the plan (pale; colours are skills), the worker "
+    "that carries it out, and what the player sees.",
+    "solving.png": "Figure 4.10: frames of an episode in held-out mazes while the worker learns; "
+    "an episode that is not solved counts with all its frames.",
+    "skills.png": "Figure 4.5: the skills, 10 mini-episodes of 100 frames for each.",
+    "losses.png": "Figures 4.6 to 4.9: training of the worker: actor, both critics, discriminator.",
+    "search.png": "The search for that plan: every place an option led to (grey: refused by the "
+    "novelty test), and the tree.",
+    "mazes.png": 'Figure 4.4: four test mazes, as text (goal "G", walls "*") and from above.',
+    "view.png": "Figure 4.3: what the player sees (drawn by this package, not by DeepMind Lab).",
+}
+
+
+def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
+    """Run ``hmcts train experiment=labmaze`` and return its figures, as in ``metrics.json``.
+
+    Args:
+        config: see :class:`~torchrl_hmcts.trainers.experiments.labmaze_config.LabMazeConfig`.
+
+    Returns:
+        The figures; lengths of episodes and of training are in frames.
+
+    Reference:
+        Dissertation, chapter 4.
+    """
+    if config.toy:
+        config = dataclasses.replace(config, **_TOY)
+    torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
+    out = Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    begin = time.perf_counter()
+    print(f"Learning {config.num_skills} skills in {config.train_frames:,} frames ...", flush=True)
+    trained = train_worker(
+        config,
+        save_dir=out / "checkpoints",
+        progress=lambda total: tqdm(total=total if total < 2**31 - 1000 else None, disable=None),
+    )
+    curve = frames_curve(trained.tests, config.frames_per_step, config.max_frames)
+    _write_curves(trained, curve, config, out / "curves.csv")
+    worker = trained.policy
+    print(f"Solving {config.mazes} mazes of {config.size} x {config.size} ...", flush=True)
+    test = solve_mazes(config, worker)
+    print("Solving mazes whose clock and friction are not the model's ...", flush=True)
+    robust = {
+        name: solve_with_wrong_model(
+            config, worker, mazes=min(config.mazes, config.robust_mazes), **real
+        )
+        for name, real in list(wrong_models(config.robust_error).items())[:2]
+    }
+    metrics: dict[str, Any] = {
+        "seed": config.seed,
+        "algorithm": config.algorithm,
+        "training_frames": trained.steps * config.frames_per_step,
+        "training_base_steps": trained.steps,
+        "training_rounds": trained.rounds,
+        "training_cpu_seconds": trained.seconds,
+        "test": test,
+        "wrong_model": robust,
+        "config": dataclasses.asdict(config),
+        "versions": {
+            "torchrl_hmcts": __version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
+    }
+    print("Drawing ...", flush=True)
+    draw(config, trained, out, unsolved=test["unsolved"])
+    metrics["seconds"] = round(time.perf_counter() - begin, 1)
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    title = "DeepMind Lab's random maze, by planning over learned skills"
+    write_page(out / "index.html", title=title, metrics=metrics, pictures=_PICTURES)
+    print(
+        f"{test['solved']} of {test['mazes']} mazes solved at the first trial, in "
+        f"{test['frames']['mean']:.0f} frames (a script on the shortest path: "
+        f"{test['script_frames']['mean']:.0f}). Pictures and figures: {out / 'index.html'}"
+    )
+    return metrics
+
+
+def draw(
+    config: LabMazeConfig, trained: TrainedWorker, out: Path, *, unsolved: list[int] | None = None
+) -> None:
+    """Draw all figures of a run into a folder.
+
+    Args:
+        config: of the experiment.
+        trained: its worker.
+        out: folder.
+        unsolved: test mazes that are not to be shown as solved.
+    """
+    worker, seeds = trained.policy, held_out_seeds(max(4, config.mazes), config.size)
+    model = make_maze_env(config, worker, seeds)
+    real = make_maze_env(config, worker, seeds, trajectory_keys=_STATE)
+    env = real.base_env
+    plot_mazes(env, out / "mazes.png")
+    sampling = SkillPolicy(
+        trained.loss.actor_network, generator=torch.Generator().manual_seed(config.seed)
+    )
+    plot_skill_fan(sampling, env, out / "skills.png", num_skills=config.num_skills)
+    plot_losses(trained.history, trained.steps, out / "losses.png")
+    curve = frames_curve(trained.tests, config.frames_per_step, env.max_frames)
+    name = "Algorithm 3" if config.algorithm == "hmcts" else "DIAYN"
+    plot_frames_curves(
+        [curve],
+        out / "solving.png",
+        title=f"{name}: {config.curve_mazes} held-out mazes of 9 x 9",
+        script=curve_script_frames(config),
+    )
+    starts = make_starts(env, config.seed)
+    lengths = ShortestPathScript(env).path_lengths(starts)
+    shown = [i for i in np.argsort(lengths, kind="stable") if i not in (unsolved or ())]
+    start = starts[int(shown[int(0.85 * (len(shown) - 1))]) if shown else 0]
+    planner = make_planner(config, model)
+    plan, states, options = play_plan(planner, real, start)
+    assert planner.last_search is not None
+    plot_search(planner.last_search, env, out / "search.png")
+    write_episode_gif(env, states, options, plan, out / "episode.gif")
+    iio.imwrite(out / "view.png", draw_first_person(env, states[0], width=640, height=480))
+
+
+def play_plan(
+    planner: MCTSPlanner, real: Any, start: TensorDictBase
+) -> tuple[Plan, list[TensorDictBase], list[int]]:
+    """Plan from a start and carry the plan out; return the state after every base step.
+
+    Args:
+        planner: over the worker's options.
+        real: macro env that hands out the state of its base steps.
+        start: state without batch dimensions.
+
+    Returns:
+        The plan, the states ``[T + 1]`` and the options ``[T]`` of the base steps.
+    """
+    plan = planner.plan(start)
+    state, states, options = start, [start.select(*_STATE)], []
+    for option in plan.options[: int(plan.lengths)]:
+        after = real.step(state.clone().set("option", option))["next"]
+        duration = int(after["duration"])
+        states += list(after["trajectory"][1:duration].select(*_STATE).unbind(0))
+        states.append(after.select(*_STATE))
+        options += [int(option)] * duration
+        if bool(after["done"]):
+            break
+        state = after.exclude("trajectory", "reward")
+    return plan, states, options
+
+
+def _write_curves(
+    trained: TrainedWorker, curve: dict[str, list[float]], config: LabMazeConfig, path: Path
+) -> None:
+    """All curves, a value a row."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("curve", "training_frames", "value"))
+        total = trained.steps * config.frames_per_step
+        for name in ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator"):
+            values = trained.history[name]
+            for i, value in enumerate(values):
+                writer.writerow((name, round(total * (i + 1) / len(values)), value))
+        for name in ("frames", "solved", "solved_frames"):
+            for frames, value in zip(curve["training_steps"], curve[name], strict=True):
+                writer.writerow((name, round(frames), value))

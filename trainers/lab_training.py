@@ -1,0 +1,224 @@
+"""Training of the lab maze's worker, by Algorithm 3 or by DIAYN alone, and its curve on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.objectives import DiscreteSkillSACLoss
+from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.trainers.curves import Curves
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer, Progress
+from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
+from torchrl_hmcts.trainers.experiments.labmaze_config import (
+    BATCH_STEPS,
+    LabMazeConfig,
+)
+from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
+from torchrl_hmcts.trainers.lab_evaluation import make_maze_env, make_planner
+from torchrl_hmcts.trainers.lab_script import ShortestPathScript
+from torchrl_hmcts.trainers.lab_worker import (
+    CURVE_SEED,
+    PLACE_KEY,
+    held_out_seeds,
+    make_lab_env,
+    make_training_env,
+    make_worker_loss,
+)
+from torchrl_hmcts.trainers.resume import ResumableTrainer
+from torchrl_hmcts.trainers.rounds import RoundRecords, seeded
+from torchrl_hmcts.transforms import OptionRecorder, OptionTransform
+
+_CURVE_EXPANSIONS = 300  # of a search while the worker learns
+
+
+@dataclass
+class TrainedWorker:
+    """A worker and how it became what it is.
+
+    ``loss`` with its networks; ``history`` of all logged curves; ``tests`` in held-out mazes;
+    ``steps`` base steps of training, simulated ones included; ``rounds`` of Algorithm 3;
+    ``seconds`` of the processor, tests included.
+    """
+
+    loss: DiscreteSkillSACLoss
+    history: Mapping[str, list[float]]
+    tests: RoundRecords
+    steps: int
+    rounds: int
+    seconds: float
+
+    @property
+    def policy(self) -> SkillPolicy:
+        """The worker with its most probable actions."""
+        return SkillPolicy(self.loss.actor_network, deterministic=True)
+
+
+def train_worker(
+    config: LabMazeConfig,
+    *,
+    save_dir: str | Path | None = None,
+    progress: Callable[..., Progress] | None = None,
+) -> TrainedWorker:
+    """Train a worker as the configuration says.
+
+    Args:
+        config: of the experiment; with ``resume`` it goes on from the newest checkpoint.
+        save_dir: folder of the checkpoints. Default: none are written.
+        progress: makes a progress bar, e.g. ``tqdm.tqdm``.
+
+    Reference:
+        Dissertation, algorithm 3 and figures 4.6 to 4.10.
+    """
+    begin = time.process_time()
+    loss = make_worker_loss(config.num_skills, seed=config.seed)
+    make = _make_hmcts if config.algorithm == "hmcts" else _make_diayn
+    trainer, tests = make(config, loss, save_dir, progress)
+    if config.resume and save_dir is not None and any(Path(save_dir).glob("*")):
+        trainer.load(save_dir)
+    trainer.train()
+    return TrainedWorker(
+        loss,
+        Curves(trainer.history),
+        tests,
+        trainer.collected_frames,
+        len(trainer.records) if isinstance(trainer, HMCTSTrainer) else 0,
+        round(time.process_time() - begin, 1),
+    )
+
+
+def curve_script_frames(config: LabMazeConfig) -> float:
+    """Return the mean frames of a script on the shortest path where the worker is tried."""
+    env = make_lab_env(held_out_seeds(config.curve_mazes, first=CURVE_SEED))
+    env.set_seed(config.seed)
+    starts = env.reset(TensorDict(batch_size=[config.curve_mazes]))
+    return float(np.mean(ShortestPathScript(env).frames(starts)))
+
+
+def _make_hmcts(
+    config: LabMazeConfig,
+    loss: DiscreteSkillSACLoss,
+    save_dir: str | Path | None,
+    progress: Callable[..., Progress] | None,
+) -> tuple[ResumableTrainer, RoundRecords]:
+    make_env = partial(make_lab_env, num_steps=config.frames_per_step, max_frames=config.max_frames)
+    options = config.num_skills * config.option_steps
+    batch = config.retrain_interval * config.round_expansions * options
+    expected = max(1, (config.train_steps - config.init_options * config.option_steps) // batch)
+    trainer = HMCTSTrainer(
+        make_env,
+        loss,
+        rounds=2**31,  # ended by total_frames
+        num_init_samples=config.init_options,
+        retrain_interval=config.retrain_interval,
+        option_steps=config.option_steps,
+        make_options=partial(OptionTransform, gamma=config.gamma),
+        make_recorder=partial(OptionRecorder, position_key=PLACE_KEY),
+        make_planner=partial(
+            MCTSPlanner,
+            novelty=RadiusNovelty(PLACE_KEY, config.novelty_radius),
+            budget=SearchBudget(expansions=config.round_expansions),
+        ),
+        make_test_env=partial(make_env, held_out_seeds(config.curve_mazes, first=CURVE_SEED)),
+        make_test_planner=partial(
+            MCTSPlanner,
+            novelty=RadiusNovelty(PLACE_KEY, config.novelty_radius, shorter_paths=True),
+            budget=_curve_budget(config),
+            leaves_per_wave=config.leaves_per_wave,
+        ),
+        test_rounds=config.curve_mazes,
+        test_interval=max(1, round(expected / config.curve_points)),
+        updates_per_step=config.updates_per_step,
+        total_frames=config.train_steps,
+        save_dir=save_dir,
+        progress=progress,
+        seed=config.seed,
+    )
+    return trainer, trainer.test_records
+
+
+def _make_diayn(
+    config: LabMazeConfig,
+    loss: DiscreteSkillSACLoss,
+    save_dir: str | Path | None,
+    progress: Callable[..., Progress] | None,
+) -> tuple[ResumableTrainer, RoundRecords]:
+    env = make_training_env(
+        num_skills=config.num_skills,
+        skill_steps=config.skill_steps,
+        num_steps=config.frames_per_step,
+    )
+    interval = max(BATCH_STEPS, config.train_steps // config.curve_points)
+    trainer = DIAYNTrainer(
+        env,
+        loss,
+        total_frames=config.train_steps,
+        frames_per_batch=BATCH_STEPS,
+        updates_per_batch=max(1, round(config.updates_per_step * BATCH_STEPS)),
+        save_dir=save_dir,
+        save_trainer_interval=interval,
+        progress=progress,
+        seed=config.seed,
+    )
+    tests = CurveTests(trainer, config, interval)
+    return trainer, tests.records
+
+
+def _curve_budget(config: LabMazeConfig) -> SearchBudget:
+    return SearchBudget(
+        expansions=min(_CURVE_EXPANSIONS, config.expansions),
+        improve_expansions=config.improve_expansions,
+    )
+
+
+class CurveTests:
+    """Tries the worker in held-out mazes while a ``DIAYNTrainer`` trains it, for Figure 4.10.
+
+    Random numbers of the training are not touched.
+
+    Args:
+        trainer: whose loss has the actor.
+        config: of the experiment.
+        interval: base steps between two tests; there is one before and one after the training.
+    """
+
+    def __init__(self, trainer: DIAYNTrainer, config: LabMazeConfig, interval: int) -> None:
+        self.trainer, self.config, self.interval = trainer, config, interval
+        self.records = RoundRecords()
+        self._at = -1  # base steps at the latest test
+        worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
+        mazes = held_out_seeds(config.curve_mazes, first=CURVE_SEED)
+        self.model, self.real = (make_maze_env(config, worker, mazes, 9) for _ in range(2))
+        self.real.set_seed(config.seed)
+        self.starts = self.real.reset(TensorDict(batch_size=[config.curve_mazes]))
+        trainer.register_op("setup", self)
+        trainer.register_op("post_steps_log", self)
+        trainer.register_module("curve_tests", self)
+
+    def __call__(self, batch: TensorDictBase | None = None) -> None:
+        steps = self.trainer.collected_frames
+        due = self._at < 0 or steps - self._at >= self.interval
+        if not due and not self._at < steps >= self.trainer.total_frames:
+            return
+        self._at = steps
+        with seeded(self.config.seed, "test", 0):
+            planner = make_planner(
+                self.config, self.model, expansions=_curve_budget(self.config).expansions
+            )
+            results = plan_and_carry_out(planner, self.real, self.starts)
+        self.records.add(results, np.arange(len(results.solved)), steps)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"at": self._at, "records": self.records.state_dict()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        self._at = int(state_dict["at"])
+        self.records.load_state_dict(state_dict["records"])
