@@ -87,7 +87,7 @@ def test_an_experiment_writes_its_folder_and_goes_on_from_it(name: str, tmp_path
     assert main(words) == 0
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["seed"] == 2
-    assert metrics["train_base_steps"] == 4_160  # 13 segments of 16 mazes and 20 steps
+    assert metrics["train_base_steps"] == 4_480  # 7 segments of 32 mazes and 20 steps
     assert metrics["test"]["mazes"] == 3
     assert ("num_plans_mean" in metrics["test"]) == (name == "waterworld_goals")
     rows = (tmp_path / "curves.csv").read_text().splitlines()
@@ -98,7 +98,7 @@ def test_an_experiment_writes_its_folder_and_goes_on_from_it(name: str, tmp_path
         assert f'src="{picture.name}"' in page
     assert (tmp_path / "learning.png").stat().st_size > 1000
     assert main([*words, "resume=true"]) == 0  # nothing is left to train
-    assert json.loads((tmp_path / "metrics.json").read_text())["train_base_steps"] == 4_160
+    assert json.loads((tmp_path / "metrics.json").read_text())["train_base_steps"] == 4_480
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from torchrl_hmcts.trainers.solving_curves import band
 
 _DPI = 110
 _COLOR, _SCRIPT_COLOR = "#1d4ed8", "#d97706"
+_SCRIPT_LABEL = "script on the shortest path"
 
 
 def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 1, 2, 3)) -> None:
@@ -187,11 +188,8 @@ def plot_frames_curves(
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         axes.spines[["top", "right"]].set_visible(False)
-    left.axhline(script, color=_SCRIPT_COLOR, linestyle="--", linewidth=1.4)
-    left.annotate(
-        "script on the shortest path", (1.0, script), xycoords=("axes fraction", "data"),
-        xytext=(0, 4), textcoords="offset points", ha="right", color=_SCRIPT_COLOR, fontsize=9,
-    )  # fmt: skip
+    left.axhline(script, color=_SCRIPT_COLOR, linestyle="--", linewidth=1.4, label=_SCRIPT_LABEL)
+    left.legend(frameon=False, fontsize=9, loc="upper right")
     left.set_ylim(bottom=0)
     left.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     left.set_title("frames of an episode, mean", fontsize=10, loc="left")

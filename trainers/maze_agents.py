@@ -108,6 +108,7 @@ class MazeTest:
         """Return how many were solved, and the base steps of these episodes and of all.
 
         Example:
+            >>> from tensordict import TensorDict
             >>> solved, steps = torch.tensor([True, False]), torch.tensor([30, 100])
             >>> summary = MazeTest(solved, steps, TensorDict(batch_size=[2])).summary()
             >>> summary["solved_share"], summary["base_steps_mean"], summary["base_steps_mean_all"]
