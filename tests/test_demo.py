@@ -10,7 +10,7 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.config import DemoConfig, parse_overrides
-from torchrl_hmcts.trainers.report import write_page
+from torchrl_hmcts.trainers.figures.report import write_page
 
 TIMES = ("seconds", "config", "versions")
 

@@ -29,8 +29,8 @@ from torchrl.trainers.algorithms import SACTrainer
 from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, METRAEncoderLoss
 from torchrl_hmcts.testing import PointMassEnv
-from torchrl_hmcts.trainers.coverage import StateCoverage
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
+from torchrl_hmcts.trainers.skills.coverage import StateCoverage
 from torchrl_hmcts.transforms import (
     DIAYNReward,
     DisplacementTransform,

@@ -20,7 +20,7 @@ from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.growing import GrowSkills, SearchCoverage, num_places
+from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
     OptionTransform,

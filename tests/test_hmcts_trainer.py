@@ -25,11 +25,11 @@ from torchrl.data import (
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
-from torchrl_hmcts.trainers.dataset import load_dataset
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-from torchrl_hmcts.trainers.rounds import RoundRecords, seeded
+from torchrl_hmcts.trainers.skills.dataset import load_dataset
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 
 STEPS = torch.tensor([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]])
 

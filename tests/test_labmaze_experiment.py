@@ -19,16 +19,16 @@ from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import find_experiment
 from torchrl_hmcts.trainers.experiments.labmaze import run_labmaze
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.lab_evaluation import (
+from torchrl_hmcts.trainers.figures.lab_figures import frames_curve
+from torchrl_hmcts.trainers.lab.evaluation import (
     _with_second_search,
     solve_mazes,
     solve_with_wrong_model,
     wrong_models,
 )
-from torchrl_hmcts.trainers.lab_figures import frames_curve
-from torchrl_hmcts.trainers.lab_script import ShortestPathScript
-from torchrl_hmcts.trainers.lab_training import train_worker
-from torchrl_hmcts.trainers.lab_worker import (
+from torchrl_hmcts.trainers.lab.script import ShortestPathScript
+from torchrl_hmcts.trainers.lab.training import train_worker
+from torchrl_hmcts.trainers.lab.worker import (
     TRAINING_MAZES,
     held_out_seeds,
     make_lab_env,
@@ -36,7 +36,7 @@ from torchrl_hmcts.trainers.lab_worker import (
     make_starts,
     make_worker_loss,
 )
-from torchrl_hmcts.trainers.rounds import RoundRecords
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 
 ROOM = ["*" * 9, "*P      *", *["*       *"] * 6, "*" * 9]
 CORRIDOR = ["*******", "*P   G*", "*******"]

@@ -15,7 +15,7 @@ from torchrl_hmcts.trainers.experiments.waterworld_config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
-from torchrl_hmcts.trainers.maze_agents import MazeNetwork, make_maze_networks, play_mazes
+from torchrl_hmcts.trainers.waterworld.agents import MazeNetwork, make_maze_networks, play_mazes
 
 
 @pytest.fixture

@@ -7,39 +7,43 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchrl_hmcts.trainers.a3c import A3CTrainer
+    from torchrl_hmcts.trainers.asynchronous.learner_processes import LearnerError
+    from torchrl_hmcts.trainers.asynchronous.shared_optimizers import (
+        SharedAdam,
+        SharedRMSprop,
+        share_optimizer,
+    )
     from torchrl_hmcts.trainers.config import DemoConfig
-    from torchrl_hmcts.trainers.coverage import StateCoverage
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
     from torchrl_hmcts.trainers.expert_iteration import (
         ExpertIterationTrainer,
         SearchCollector,
         make_guided_planner,
     )
-    from torchrl_hmcts.trainers.goal_episodes import GoalEpisodes, GoalTrack, run_goal_episodes
-    from torchrl_hmcts.trainers.goal_planning import (
-        TilePlanner,
-        make_goal_env,
-        make_tile_planner,
-    )
-    from torchrl_hmcts.trainers.growing import GrowSkills, SearchCoverage, num_places
-    from torchrl_hmcts.trainers.hindsight import HindsightTransitions, MazeView
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-    from torchrl_hmcts.trainers.learner_processes import LearnerError
-    from torchrl_hmcts.trainers.maze_networks import MazeNetwork, shortest_distances
     from torchrl_hmcts.trainers.resume import GeneratorStates, ResumableTrainer, RunningEpisodes
-    from torchrl_hmcts.trainers.scripted_expert import ScriptedExpert
-    from torchrl_hmcts.trainers.shared_optimizers import (
-        SharedAdam,
-        SharedRMSprop,
-        share_optimizer,
-    )
-    from torchrl_hmcts.trainers.termination import (
+    from torchrl_hmcts.trainers.skills.coverage import StateCoverage
+    from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
+    from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
+    from torchrl_hmcts.trainers.skills.termination import (
         TerminationConfig,
         TerminationResult,
         collect_option_steps,
         learn_termination,
         make_terminating_env,
     )
+    from torchrl_hmcts.trainers.waterworld.goal_episodes import (
+        GoalEpisodes,
+        GoalTrack,
+        run_goal_episodes,
+    )
+    from torchrl_hmcts.trainers.waterworld.goal_planning import (
+        TilePlanner,
+        make_goal_env,
+        make_tile_planner,
+    )
+    from torchrl_hmcts.trainers.waterworld.networks import MazeNetwork, shortest_distances
+    from torchrl_hmcts.trainers.waterworld.scripted_expert import ScriptedExpert
 
 __all__ = [
     "A3CTrainer",
@@ -86,36 +90,36 @@ _MODULES = {
     "DemoConfig": "config",
     "ExpertIterationTrainer": "expert_iteration",
     "GeneratorStates": "resume",
-    "GoalEpisodes": "goal_episodes",
-    "GoalTrack": "goal_episodes",
-    "GrowSkills": "growing",
+    "GoalEpisodes": "waterworld.goal_episodes",
+    "GoalTrack": "waterworld.goal_episodes",
+    "GrowSkills": "skills.growing",
     "HMCTSTrainer": "hmcts",
-    "HindsightTransitions": "hindsight",
-    "LearnerError": "learner_processes",
-    "MazeNetwork": "maze_networks",
-    "MazeView": "hindsight",
+    "HindsightTransitions": "skills.hindsight",
+    "LearnerError": "asynchronous.learner_processes",
+    "MazeNetwork": "waterworld.networks",
+    "MazeView": "skills.hindsight",
     "ResumableTrainer": "resume",
     "RunningEpisodes": "resume",
-    "ScriptedExpert": "scripted_expert",
+    "ScriptedExpert": "waterworld.scripted_expert",
     "SearchCollector": "expert_iteration",
-    "SearchCoverage": "growing",
-    "SharedAdam": "shared_optimizers",
-    "SharedRMSprop": "shared_optimizers",
-    "StateCoverage": "coverage",
-    "TerminationConfig": "termination",
-    "TerminationResult": "termination",
-    "TilePlanner": "goal_planning",
-    "collect_option_steps": "termination",
-    "learn_termination": "termination",
-    "make_goal_env": "goal_planning",
+    "SearchCoverage": "skills.growing",
+    "SharedAdam": "asynchronous.shared_optimizers",
+    "SharedRMSprop": "asynchronous.shared_optimizers",
+    "StateCoverage": "skills.coverage",
+    "TerminationConfig": "skills.termination",
+    "TerminationResult": "skills.termination",
+    "TilePlanner": "waterworld.goal_planning",
+    "collect_option_steps": "skills.termination",
+    "learn_termination": "skills.termination",
+    "make_goal_env": "waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
     "make_skill_optimizer": "diayn",
-    "make_terminating_env": "termination",
-    "make_tile_planner": "goal_planning",
-    "num_places": "growing",
-    "share_optimizer": "shared_optimizers",
-    "run_goal_episodes": "goal_episodes",
-    "shortest_distances": "maze_networks",
+    "make_terminating_env": "skills.termination",
+    "make_tile_planner": "waterworld.goal_planning",
+    "num_places": "skills.growing",
+    "share_optimizer": "asynchronous.shared_optimizers",
+    "run_goal_episodes": "waterworld.goal_episodes",
+    "shortest_distances": "waterworld.networks",
 }
 
 

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 
-from torchrl_hmcts.trainers.actor_learner import (
+from torchrl_hmcts.trainers.asynchronous.actor_learner import (
     ActorLearner,
     LearnerSettings,
     SharedMemory,
@@ -26,10 +26,14 @@ from torchrl_hmcts.trainers.actor_learner import (
     board_columns,
     trained_parameters,
 )
-from torchrl_hmcts.trainers.learner_log import LearnerLog
-from torchrl_hmcts.trainers.learner_processes import LearnerProcesses
+from torchrl_hmcts.trainers.asynchronous.learner_log import LearnerLog
+from torchrl_hmcts.trainers.asynchronous.learner_processes import LearnerProcesses
+from torchrl_hmcts.trainers.asynchronous.shared_optimizers import (
+    SharedAdam,
+    SharedRMSprop,
+    share_optimizer,
+)
 from torchrl_hmcts.trainers.resume import HistoryState
-from torchrl_hmcts.trainers.shared_optimizers import SharedAdam, SharedRMSprop, share_optimizer
 
 MakeOptimizer = Callable[[list[nn.Parameter]], Optimizer]
 

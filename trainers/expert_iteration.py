@@ -64,7 +64,7 @@ def make_guided_planner(
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
         >>> from torchrl_hmcts.trainers.expert_iteration import make_guided_planner
-        >>> from torchrl_hmcts.trainers.maze_networks import MazeNetwork
+        >>> from torchrl_hmcts.trainers.waterworld.networks import MazeNetwork
         >>> env = WaterworldMazeEnv(observation=False)  # plans base steps, for example
         >>> make_guided_planner(env, MazeNetwork(env.mazes)).num_options
         4

@@ -23,10 +23,10 @@ from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.trainers.config import parse_overrides
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.experiments import find_experiment
-from torchrl_hmcts.trainers.goal_planning import make_goal_env
-from torchrl_hmcts.trainers.learning_curves import plot_learning_curves
-from torchrl_hmcts.trainers.maze_agents import play_mazes
-from torchrl_hmcts.trainers.scripted_expert import ScriptedExpert
+from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
+from torchrl_hmcts.trainers.waterworld.agents import play_mazes
+from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
+from torchrl_hmcts.trainers.waterworld.scripted_expert import ScriptedExpert
 
 NAMES = {"waterworld_goals": "goal-based agent", "waterworld_a3c": "A3C without goals"}
 

@@ -40,9 +40,9 @@ from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
-from torchrl_hmcts.trainers.growing import GrowSkills, SearchCoverage
-from torchrl_hmcts.trainers.skill_figures import search_coverage
-from torchrl_hmcts.trainers.worker import make_option_env
+from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
+from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
     SkillMaskTransform,

@@ -27,9 +27,9 @@ from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
+from torchrl_hmcts.trainers.figures.solving_curves import plot_solving_curves
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-from torchrl_hmcts.trainers.solving_curves import plot_solving_curves
-from torchrl_hmcts.trainers.worker import make_option_env, make_training_env
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
 NUM_SKILLS, OPTION_STEPS, RADIUS = 4, 25, 0.7
 make_env = partial(WaterworldMazeEnv, observation=False)

@@ -28,14 +28,14 @@ import torch
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.lab_evaluation import (
+from torchrl_hmcts.trainers.figures.lab_figures import frames_curve, plot_frames_curves
+from torchrl_hmcts.trainers.lab.evaluation import (
     solve_mazes,
     solve_with_wrong_model,
     wrong_models,
 )
-from torchrl_hmcts.trainers.lab_figures import frames_curve, plot_frames_curves
-from torchrl_hmcts.trainers.lab_training import curve_script_frames, train_worker
-from torchrl_hmcts.trainers.lab_worker import make_worker_loss
+from torchrl_hmcts.trainers.lab.training import curve_script_frames, train_worker
+from torchrl_hmcts.trainers.lab.worker import make_worker_loss
 
 ERROR = 0.05
 

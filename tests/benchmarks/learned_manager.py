@@ -33,8 +33,8 @@ from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer, make_guided_planner
-from torchrl_hmcts.trainers.maze_networks import MazeNetwork
-from torchrl_hmcts.trainers.worker import make_option_env
+from torchrl_hmcts.trainers.waterworld.networks import MazeNetwork
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 
 OPTION_STEPS, RADIUS, GAMMA = 25, 0.7, 0.99  # those of the demo
 MAIN = "learned, expand one, novelty 0.2"  # the one that is followed over the iterations
@@ -189,7 +189,7 @@ def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
 def load_worker(path: str) -> Any:
     """Read a worker's loss that was trained before; only to try this script out quickly."""
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-    from torchrl_hmcts.trainers.worker import make_training_env
+    from torchrl_hmcts.trainers.waterworld.worker import make_training_env
 
     loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=0)
     loss.load_state_dict(torch.load(path, weights_only=True))

@@ -29,15 +29,15 @@ from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillPolicy
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.demo import train_worker
-from torchrl_hmcts.trainers.option_model import (
+from torchrl_hmcts.trainers.waterworld.option_model import (
     OptionModelConfig,
     error_by_horizon,
     make_model_env,
     record_transitions,
     train_option_model,
 )
-from torchrl_hmcts.trainers.real_episodes import EpisodesInEachMaze, act
-from torchrl_hmcts.trainers.worker import make_option_env
+from torchrl_hmcts.trainers.waterworld.real_episodes import EpisodesInEachMaze, act
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 from torchrl_hmcts.transforms import OptionTransform
 
 OPTION_STEPS, GAMMA, TIME_LIMIT = 25, 0.99, 1_000

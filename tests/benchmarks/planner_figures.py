@@ -35,7 +35,7 @@ from torchrl_hmcts.planners import (
 )
 from torchrl_hmcts.planners.tree import EDGE, NODE
 from torchrl_hmcts.trainers.demo import make_starts
-from torchrl_hmcts.trainers.worker import make_option_env
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 
 clock = time.thread_time
 

@@ -34,13 +34,13 @@ from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
-from torchrl_hmcts.trainers.termination import (
+from torchrl_hmcts.trainers.skills.termination import (
     TerminationConfig,
     collect_option_steps,
     learn_termination,
     make_terminating_env,
 )
-from torchrl_hmcts.trainers.worker import make_option_env
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 
 TUNING_LIMIT = 10_000  # simulated base steps of a search in training mazes
 SETTINGS: dict[str, list[dict[str, Any]]] = {
@@ -67,7 +67,7 @@ class Workers:
             _, loss = train_worker(DemoConfig(seed=seed))
         else:
             from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-            from torchrl_hmcts.trainers.worker import make_training_env
+            from torchrl_hmcts.trainers.waterworld.worker import make_training_env
 
             loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=seed)
             loss.load_state_dict(torch.load(str(weights).format(seed=seed)))

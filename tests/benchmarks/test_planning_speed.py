@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.trainers.demo import make_starts
-from torchrl_hmcts.trainers.worker import make_option_env
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 
 pytestmark = pytest.mark.benchmark
 

@@ -23,8 +23,8 @@ from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
-from torchrl_hmcts.trainers.skill_figures import search_coverage, skill_figures
-from torchrl_hmcts.trainers.worker import make_option_env
+from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
+from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 
 RADIUS = 0.7  # of the novelty test, tiles, in all benchmarks of skills
 

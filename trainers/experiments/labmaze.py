@@ -21,14 +21,7 @@ from torchrl_hmcts.envs import draw_first_person
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.lab_evaluation import (
-    make_maze_env,
-    make_planner,
-    solve_mazes,
-    solve_with_wrong_model,
-    wrong_models,
-)
-from torchrl_hmcts.trainers.lab_figures import (
+from torchrl_hmcts.trainers.figures.lab_figures import (
     frames_curve,
     plot_frames_curves,
     plot_mazes,
@@ -36,11 +29,18 @@ from torchrl_hmcts.trainers.lab_figures import (
     plot_skill_fan,
     write_episode_gif,
 )
-from torchrl_hmcts.trainers.lab_script import ShortestPathScript
-from torchrl_hmcts.trainers.lab_training import TrainedWorker, curve_script_frames, train_worker
-from torchrl_hmcts.trainers.lab_worker import held_out_seeds, make_starts
-from torchrl_hmcts.trainers.plots import plot_losses
-from torchrl_hmcts.trainers.report import write_page
+from torchrl_hmcts.trainers.figures.plots import plot_losses
+from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.lab.evaluation import (
+    make_maze_env,
+    make_planner,
+    solve_mazes,
+    solve_with_wrong_model,
+    wrong_models,
+)
+from torchrl_hmcts.trainers.lab.script import ShortestPathScript
+from torchrl_hmcts.trainers.lab.training import TrainedWorker, curve_script_frames, train_worker
+from torchrl_hmcts.trainers.lab.worker import held_out_seeds, make_starts
 
 _TOY: dict[str, Any] = {
     "mazes": 4,

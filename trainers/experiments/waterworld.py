@@ -27,12 +27,12 @@ from torchrl_hmcts.trainers.experiments.waterworld_config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
-from torchrl_hmcts.trainers.goal_episodes import run_goal_episodes
-from torchrl_hmcts.trainers.goal_figures import plot_goals, plot_tile_search, write_goal_gif
-from torchrl_hmcts.trainers.goal_planning import make_goal_env
-from torchrl_hmcts.trainers.learning_curves import plot_learning_curves
-from torchrl_hmcts.trainers.maze_agents import make_maze_networks, play_mazes
-from torchrl_hmcts.trainers.report import write_page
+from torchrl_hmcts.trainers.figures.goal_figures import plot_goals, plot_tile_search, write_goal_gif
+from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
+from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.waterworld.agents import make_maze_networks, play_mazes
+from torchrl_hmcts.trainers.waterworld.goal_episodes import run_goal_episodes
+from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
 
 _GOAL_KEYS = (
     "num_goals",

@@ -25,7 +25,7 @@ from torchrl_hmcts.modules import (
     TerminationNetwork,
 )
 from torchrl_hmcts.objectives import IntraOptionQLoss, OptionTerminationLoss
-from torchrl_hmcts.trainers.hindsight import HindsightTransitions, MazeView
+from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
 from torchrl_hmcts.transforms import OptionTransform, SkillTransform, StallTransform
 
 _STALL_TOLERANCE = 0.005  # tiles per base step, a twentieth of the top speed

@@ -23,8 +23,8 @@ from torchrl_hmcts.planners import (
     SearchBudget,
 )
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
-from torchrl_hmcts.trainers.lab_script import ShortestPathScript
-from torchrl_hmcts.trainers.lab_worker import (
+from torchrl_hmcts.trainers.lab.script import ShortestPathScript
+from torchrl_hmcts.trainers.lab.worker import (
     PLACE_KEY,
     held_out_seeds,
     make_option_env,
@@ -43,7 +43,7 @@ def make_planner(config: LabMazeConfig, simulator: EnvBase, **changes: Any) -> M
 
     Args:
         config: of the experiment.
-        simulator: the model, see :func:`~torchrl_hmcts.trainers.lab_worker.make_option_env`.
+        simulator: the model, see :func:`~torchrl_hmcts.trainers.lab.worker.make_option_env`.
         **changes: of the :class:`~torchrl_hmcts.planners.SearchBudget`.
     """
     budget = {"expansions": config.expansions, "improve_expansions": config.improve_expansions}

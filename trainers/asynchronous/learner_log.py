@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from torchrl_hmcts.trainers.actor_learner import COUNTERS
+from torchrl_hmcts.trainers.asynchronous.actor_learner import COUNTERS
 
 
 class LearnerLog:

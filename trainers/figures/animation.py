@@ -10,7 +10,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
-from torchrl_hmcts.trainers.plots import option_rgb
+from torchrl_hmcts.trainers.figures.plots import option_rgb
 
 if TYPE_CHECKING:
     from torchrl_hmcts.trainers.demo import Episode

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import Any
 
-from torchrl_hmcts.trainers.actor_learner import SharedMemory, run_learner
+from torchrl_hmcts.trainers.asynchronous.actor_learner import SharedMemory, run_learner
 
 _STOP_SECONDS = 10.0
 

@@ -45,7 +45,7 @@ class StateCoverage(TrainerHookBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_hmcts.trainers.coverage import StateCoverage
+        >>> from torchrl_hmcts.trainers.skills.coverage import StateCoverage
         >>> coverage = StateCoverage(cell_side=1.0, window=2)
         >>> def visit(*x):
         ...     moved = torch.tensor(x).unsqueeze(-1)

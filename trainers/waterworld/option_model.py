@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import OptionModel, OptionModelEnv
 from torchrl_hmcts.objectives import OptionModelLoss
-from torchrl_hmcts.trainers.maze_window import MazeWindow
+from torchrl_hmcts.trainers.waterworld.maze_window import MazeWindow
 from torchrl_hmcts.transforms import OptionTransform
 
 _ROOT_KEYS = ["observation", "position", "velocity", "target", "option", "maze_index", "step_count"]

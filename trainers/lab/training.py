@@ -15,7 +15,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.objectives import DiscreteSkillSACLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.curves import Curves
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer, Progress
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
 from torchrl_hmcts.trainers.experiments.labmaze_config import (
@@ -23,9 +22,9 @@ from torchrl_hmcts.trainers.experiments.labmaze_config import (
     LabMazeConfig,
 )
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-from torchrl_hmcts.trainers.lab_evaluation import make_maze_env, make_planner
-from torchrl_hmcts.trainers.lab_script import ShortestPathScript
-from torchrl_hmcts.trainers.lab_worker import (
+from torchrl_hmcts.trainers.lab.evaluation import make_maze_env, make_planner
+from torchrl_hmcts.trainers.lab.script import ShortestPathScript
+from torchrl_hmcts.trainers.lab.worker import (
     CURVE_SEED,
     PLACE_KEY,
     held_out_seeds,
@@ -34,7 +33,8 @@ from torchrl_hmcts.trainers.lab_worker import (
     make_worker_loss,
 )
 from torchrl_hmcts.trainers.resume import ResumableTrainer
-from torchrl_hmcts.trainers.rounds import RoundRecords, seeded
+from torchrl_hmcts.trainers.skills.curves import Curves
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform
 
 _CURVE_EXPANSIONS = 300  # of a search while the worker learns

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.trainers.evaluation import spread
-from torchrl_hmcts.trainers.maze_agents import play_mazes
+from torchrl_hmcts.trainers.waterworld.agents import play_mazes
 
 
 @dataclass
@@ -98,8 +98,8 @@ def run_goal_episodes(
     """Carry a worker's policy out from every start to the end of its episode, all side by side.
 
     Args:
-        env: a worker's env, as :func:`~torchrl_hmcts.trainers.goal_planning.make_goal_env` makes
-            it, of no batch size.
+        env: a worker's env, as :func:`~torchrl_hmcts.trainers.make_goal_env` makes it, of no batch
+            size.
         policy: reads a root and writes the action.
         starts: states ``[M]``, e.g. :func:`~torchrl_hmcts.trainers.demo.make_starts`; they are
             given fresh plans.
@@ -112,8 +112,8 @@ def run_goal_episodes(
 
     Example:
         >>> from torchrl_hmcts.trainers.demo import make_starts
-        >>> from torchrl_hmcts.trainers.goal_planning import make_goal_env
-        >>> from torchrl_hmcts.trainers.scripted_expert import ScriptedExpert
+        >>> from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
+        >>> from torchrl_hmcts.trainers.waterworld.scripted_expert import ScriptedExpert
         >>> env = make_goal_env(seed=0)
         >>> starts = make_starts(env.base_env, 4, seed=0)
         >>> run_goal_episodes(env, ScriptedExpert(), starts).solved.tolist()

@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
 
-from torchrl_hmcts.trainers.solving_curves import Curve, band
+from torchrl_hmcts.trainers.figures.solving_curves import Curve, band
 
 _COLORS = ("#1d4ed8", "#d97706", "#16a34a", "#7c3aed")
 _DPI = 110

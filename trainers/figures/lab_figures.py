@@ -21,9 +21,9 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person
 from torchrl_hmcts.planners import Plan, Search
 from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers.plots import option_rgb
-from torchrl_hmcts.trainers.rounds import RoundRecords
-from torchrl_hmcts.trainers.solving_curves import band
+from torchrl_hmcts.trainers.figures.plots import option_rgb
+from torchrl_hmcts.trainers.figures.solving_curves import band
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 
 _DPI = 110
 _COLOR, _SCRIPT_COLOR = "#1d4ed8", "#d97706"

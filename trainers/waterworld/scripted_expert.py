@@ -43,7 +43,7 @@ class ScriptedExpert(TensorDictModuleBase):
 
     Example:
         >>> import torch
-        >>> from torchrl_hmcts.trainers.goal_planning import make_goal_env
+        >>> from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
         >>> env = make_goal_env(seed=0)
         >>> data = env.rollout(1000, policy=ScriptedExpert())
         >>> data["next", "task_reward"].sum().item()

@@ -18,8 +18,8 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.envs.rendering import PLAYER_COLOR, TARGET_COLOR
 from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers.goal_episodes import GoalTrack
-from torchrl_hmcts.trainers.goal_planning import make_tile_planner
+from torchrl_hmcts.trainers.waterworld.goal_episodes import GoalTrack
+from torchrl_hmcts.trainers.waterworld.goal_planning import make_tile_planner
 
 _DPI = 110
 _TRAIL_COLOR = (147, 178, 245)  # the player's blue, pale
@@ -39,8 +39,7 @@ def draw_goals(
     Args:
         env: draws the maze.
         start: first state of the episode, without batch dimensions.
-        track: the episode, as :func:`~torchrl_hmcts.trainers.goal_episodes.run_goal_episodes`
-            records it.
+        track: the episode, as ``run_goal_episodes(..., record=True)`` records it.
         step: base step, 0 to L.
         tile_pixels: pixels per tile.
 

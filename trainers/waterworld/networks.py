@@ -63,7 +63,7 @@ class MazeNetwork(TensorDictModuleBase):
     Example:
         >>> import torch
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
-        >>> from torchrl_hmcts.trainers.maze_networks import MazeNetwork
+        >>> from torchrl_hmcts.trainers.waterworld.networks import MazeNetwork
         >>> env = WaterworldMazeEnv(batch_size=[3])
         >>> td = MazeNetwork(env.mazes)(env.reset())
         >>> td["logits"].shape, td["state_value"].shape

@@ -46,7 +46,7 @@ class SearchCoverage:
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
         >>> from torchrl_hmcts.testing import ChainEnv
-        >>> from torchrl_hmcts.trainers.growing import SearchCoverage
+        >>> from torchrl_hmcts.trainers.skills.growing import SearchCoverage
         >>> env = ChainEnv(length=5)
         >>> planner = MCTSPlanner(
         ...     env,
@@ -166,7 +166,7 @@ class GrowSkills(TrainerHookBase):
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
         >>> from torchrl_hmcts.modules import GrowingSkillPrior
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-        >>> from torchrl_hmcts.trainers.growing import GrowSkills
+        >>> from torchrl_hmcts.trainers.skills.growing import GrowSkills
         >>> from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
         >>> prior = GrowingSkillPrior(8, num_active=2)
         >>> env = TransformedEnv(

@@ -1,0 +1,1 @@
+"""What asynchronous training is made of: learners, their processes, shared optimisers, the log."""

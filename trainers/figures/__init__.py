@@ -1,0 +1,1 @@
+"""Pictures and pages of runs, by the dissertation's figures."""

@@ -1,0 +1,1 @@
+"""What the experiments in Waterworld's mazes are made of: envs, networks, tests, an expert."""
