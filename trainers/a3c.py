@@ -33,7 +33,7 @@ from torchrl_hmcts.trainers.asynchronous.shared_optimizers import (
     SharedRMSprop,
     share_optimizer,
 )
-from torchrl_hmcts.trainers.resume import HistoryState
+from torchrl_hmcts.trainers.resume import HistoryState, newest_checkpoint
 
 MakeOptimizer = Callable[[list[nn.Parameter]], Optimizer]
 
@@ -347,15 +347,7 @@ class A3CTrainer:
             FileNotFoundError: if there is no checkpoint.
             CheckpointError: if the checkpoint does not fit, e.g. other networks or optimiser.
         """
-        found: Path | None = Path(path)
-        if not Checkpoint.is_checkpoint(path):
-            found = CheckpointRotation(path, keep_last=1).latest()
-        if found is None:
-            raise FileNotFoundError(
-                f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to go on "
-                "with, or one of the checkpoint folders in it."
-            )
-        self._checkpoint.load(found)
+        self._checkpoint.load(newest_checkpoint(path))
         return self
 
     # Running learners

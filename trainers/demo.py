@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import platform
 import time
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_hmcts import __version__
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudget
@@ -23,7 +21,7 @@ from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.figures.animation import write_episode_gif
 from torchrl_hmcts.trainers.figures.plots import plot_losses, plot_search, plot_skill_fan
-from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.figures.report import versions, write_page
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
 
@@ -257,11 +255,7 @@ def _summarise(
         "episode_base_steps_median": median([episodes[i].base_steps for i in solved]),
         "episode_base_steps_over_shortest": round(median(per_tile), 2),
         "config": dataclasses.asdict(config),
-        "versions": {
-            "torchrl_hmcts": __version__,
-            "torch": torch.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
     }
 
 

@@ -256,16 +256,28 @@ class ResumableTrainer(Trainer):
             FileNotFoundError: if there is no checkpoint.
             CheckpointError: if the checkpoint does not fit, e.g. another number of copies.
         """
-        found: Path | None = Path(path)
-        if not Checkpoint.is_checkpoint(path):
-            found = CheckpointRotation(path, keep_last=1).latest()
-        if found is None:
-            raise FileNotFoundError(
-                f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to go on "
-                "with, or one of the checkpoint folders in it."
-            )
-        self.load_from_file(found)
+        self.load_from_file(newest_checkpoint(path))
         return self
+
+
+def newest_checkpoint(path: str | Path) -> Path:
+    """Returns the checkpoint that a path names.
+
+    Args:
+        path (path): a checkpoint, or a folder of checkpoints, of which the newest is taken.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    if Checkpoint.is_checkpoint(path):
+        return Path(path)
+    found = CheckpointRotation(path, keep_last=1).latest()
+    if found is None:
+        raise FileNotFoundError(
+            f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to go on "
+            "with, or one of the checkpoint folders in it."
+        )
+    return Path(found)
 
 
 class DetachedStepper(DefaultOptimizationStepper):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import platform
 import time
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import torch
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
-from torchrl_hmcts import __version__
 from torchrl_hmcts.envs import draw_first_person
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
@@ -30,7 +28,7 @@ from torchrl_hmcts.trainers.figures.lab_figures import (
     write_episode_gif,
 )
 from torchrl_hmcts.trainers.figures.plots import plot_losses
-from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.figures.report import versions, write_page
 from torchrl_hmcts.trainers.lab.evaluation import (
     make_maze_env,
     make_planner,
@@ -116,11 +114,7 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
         "test": test,
         "wrong_model": robust,
         "config": dataclasses.asdict(config),
-        "versions": {
-            "torchrl_hmcts": __version__,
-            "torch": torch.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
     }
     print("Drawing ...", flush=True)
     draw(config, trained, out, unsolved=test["unsolved"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import platform
 import time
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_hmcts import __version__
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.trainers.a3c import A3CTrainer
@@ -29,7 +27,7 @@ from torchrl_hmcts.trainers.experiments.waterworld_config import (
 )
 from torchrl_hmcts.trainers.figures.goal_figures import plot_goals, plot_tile_search, write_goal_gif
 from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
-from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.figures.report import versions, write_page
 from torchrl_hmcts.trainers.waterworld.agents import make_maze_networks, play_mazes
 from torchrl_hmcts.trainers.waterworld.goal_episodes import run_goal_episodes
 from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
@@ -159,11 +157,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
         for key in ("num_plans", "num_goals_met", "num_divergences"):
             metrics["test"][f"{key}_mean"] = round(float(sampled.last[key].double().mean()), 3)
     metrics["config"] = dataclasses.asdict(config)
-    metrics["versions"] = {
-        "torchrl_hmcts": __version__,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
+    metrics["versions"] = versions()
     (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
     pictures = {"learning.png": "Test mazes solved and base steps of an episode while it learns."}
     plot_learning_curves(

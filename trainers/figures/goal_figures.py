@@ -18,6 +18,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.envs.rendering import PLAYER_COLOR, TARGET_COLOR
 from torchrl_hmcts.planners.drawing import option_color
+from torchrl_hmcts.trainers.figures.plots import legend_below
 from torchrl_hmcts.trainers.waterworld.goal_episodes import GoalTrack
 from torchrl_hmcts.trainers.waterworld.goal_planning import make_tile_planner
 
@@ -166,7 +167,6 @@ def plot_tile_search(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) 
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
     search.tree.plot(0, ax=left, option_names=_ACTIONS)
     legend = left.get_legend()
-    legend.remove()
     _draw_tiles(right, env.mazes[int(state["maze_index"])].cpu().numpy())
     points = np.concatenate(([_center(state["position"])], goals[0].numpy()))
     options = search.tree.options(0, int(search.best_node[0]))
@@ -186,14 +186,7 @@ def plot_tile_search(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) 
     right.plot(*points[0], "o", color=np.array(PLAYER_COLOR) / 255, markersize=13, zorder=3)
     right.plot(*points[-1], "o", color=np.array(TARGET_COLOR) / 255, markersize=13, zorder=1)
     right.set_title(f"the plan: {int(lengths[0])} tiles", fontsize=10, loc="left")
-    figure.legend(
-        legend.legend_handles,
-        [text.get_text() for text in legend.get_texts()],
-        loc="outside lower center",
-        ncols=8,
-        fontsize=9,
-        frameon=False,
-    )
+    legend_below(figure, legend, ncols=8)
     figure.savefig(path, dpi=_DPI)
 
 

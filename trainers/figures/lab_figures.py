@@ -15,14 +15,14 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
+from matplotlib.ticker import StrMethodFormatter
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person
 from torchrl_hmcts.planners import Plan, Search
 from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers.figures.plots import option_rgb
-from torchrl_hmcts.trainers.figures.solving_curves import band
+from torchrl_hmcts.trainers.figures.plots import legend_below, option_rgb
+from torchrl_hmcts.trainers.figures.solving_curves import draw_band, save_curves, show_shares
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 
 _DPI = 110
@@ -178,27 +178,15 @@ def plot_frames_curves(
     figure = Figure(figsize=(10.0, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1.0))
     for axes, name in ((left, "frames"), (right, "solved")):
-        shown = band(curves, name)
-        x = shown["training_steps"]
-        if len(curves) > 1:
-            axes.fill_between(x, shown["least"], shown["largest"], color=_COLOR, alpha=0.15)
-        axes.plot(x, shown["mean"], color=_COLOR, linewidth=2.2, marker="o", markersize=4)
-        axes.grid(alpha=0.25)
-        axes.set_xlim(left=0)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-        axes.spines[["top", "right"]].set_visible(False)
+        draw_band(axes, curves, name, color=_COLOR, marker="o", markersize=4)
     left.axhline(script, color=_SCRIPT_COLOR, linestyle="--", linewidth=1.4, label=_SCRIPT_LABEL)
     left.legend(frameon=False, fontsize=9, loc="upper right")
     left.set_ylim(bottom=0)
     left.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     left.set_title("frames of an episode, mean", fontsize=10, loc="left")
     right.set_title("mazes solved at the first trial", fontsize=10, loc="left")
-    right.set_ylim(0.0, 1.03)
-    right.yaxis.set_major_formatter(PercentFormatter(1.0))
-    figure.supxlabel("frames of training", fontsize=10)
-    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path, dpi=_DPI)
+    show_shares(right)
+    save_curves(figure, path, title=title, x_label="frames of training")
 
 
 def plot_search(search: Search, env: LabMazeEnv, path: str | Path, *, root: int = 0) -> None:
@@ -225,16 +213,7 @@ def plot_search(search: Search, env: LabMazeEnv, path: str | Path, *, root: int 
     )
     left.set_title("where the options led", fontsize=10, loc="left")
     tree.plot(root, ax=right, max_nodes=600, option_names=names)
-    legend = right.get_legend()  # one for both
-    legend.remove()
-    figure.legend(
-        legend.legend_handles,
-        [text.get_text() for text in legend.get_texts()],
-        loc="outside lower center",
-        ncols=6,
-        fontsize=9,
-        frameon=False,
-    )
+    legend_below(figure, right.get_legend(), ncols=6)  # one for both
     figure.savefig(path, dpi=_DPI)
 
 

@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
 
-from torchrl_hmcts.trainers.figures.solving_curves import Curve, band
-
-_COLORS = ("#1d4ed8", "#d97706", "#16a34a", "#7c3aed")
-_DPI = 110
+from torchrl_hmcts.trainers.figures.solving_curves import (
+    CURVE_COLORS,
+    Curve,
+    draw_band,
+    save_curves,
+    show_shares,
+)
 
 
 def plot_learning_curves(
@@ -34,15 +36,11 @@ def plot_learning_curves(
     """
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for color, (name, curves) in zip(_COLORS, runs.items(), strict=False):
+    for color, (name, curves) in zip(CURVE_COLORS, runs.items(), strict=False):
         for axes, entry in ((left, "solved_share"), (right, "episode_steps")):
-            shown = band(curves, entry)
-            x = shown["training_steps"]
-            axes.fill_between(x, shown["least"], shown["largest"], color=color, alpha=0.18, lw=0)
-            axes.plot(x, shown["mean"], color=color, linewidth=2.2, label=name)
+            draw_band(axes, curves, entry, color=color, label=name)
     left.set_title("test mazes solved in time", fontsize=10, loc="left")
-    left.set_ylim(0.0, 1.03)
-    left.yaxis.set_major_formatter(PercentFormatter(1.0))
+    show_shares(left)
     right.set_title("base steps of an episode, mean", fontsize=10, loc="left")
     right.set_ylim(0.0, 1.05 * max_steps)
     right.axhline(max_steps, color="#71717a", linestyle=":", linewidth=1.0)
@@ -57,12 +55,4 @@ def plot_learning_curves(
         color="#71717a",
     )
     right.legend(frameon=False, fontsize=9)
-    for axes in (left, right):
-        axes.grid(alpha=0.25)
-        axes.set_xlim(left=0)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.supxlabel("training base steps", fontsize=10)
-    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path, dpi=_DPI)
+    save_curves(figure, path, title=title)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
@@ -144,6 +145,27 @@ def plot_skill_fan(
     figure.savefig(path, dpi=_DPI)
 
 
+def legend_below(figure: Figure, legend: Legend, *, ncols: int) -> None:
+    """Move a panel's legend below the figure, as the legend of all panels.
+
+    Args:
+        figure: receives it.
+        legend: of one panel; it is removed there.
+        ncols: columns.
+    """
+    handles: Any = legend.legend_handles  # typed as if one could be None
+    names = [text.get_text() for text in legend.get_texts()]
+    legend.remove()
+    figure.legend(
+        handles,
+        names,
+        loc="outside lower center",
+        ncols=ncols,
+        fontsize=9,
+        frameon=False,
+    )
+
+
 def plot_search(search: Search, env: WaterworldMazeEnv, path: Path, *, root: int = 0) -> None:
     """Draw where the options of a search led in the maze, and the tree; the plan stands out.
 
@@ -166,14 +188,5 @@ def plot_search(search: Search, env: WaterworldMazeEnv, path: Path, *, root: int
     left.plot(*tree.states["target"][root, 0].tolist(), "o", color="#16a34a", markersize=11)
     left.set_title("where the options led", fontsize=10, loc="left")
     tree.plot(root, ax=right, max_nodes=_MAX_NODES, option_names=names)
-    legend = right.get_legend()  # one for both
-    legend.remove()
-    figure.legend(
-        legend.legend_handles,
-        [text.get_text() for text in legend.get_texts()],
-        loc="outside lower center",
-        ncols=6,
-        fontsize=9,
-        frameon=False,
-    )
+    legend_below(figure, right.get_legend(), ncols=6)  # one for both
     figure.savefig(path, dpi=_DPI)

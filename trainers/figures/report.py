@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import html
+import platform
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from torchrl_hmcts import __version__
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #d4d4d8; }
@@ -18,6 +22,20 @@ table { border-collapse: collapse; width: 100%; }
 td { border-bottom: 1px solid var(--line); padding: .3rem .5rem; overflow-wrap: anywhere; }
 td:last-child { text-align: right; font-variant-numeric: tabular-nums; }
 """
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a run's figures depend on, by package.
+
+    Example:
+        >>> sorted(versions())
+        ['python', 'torch', 'torchrl_hmcts']
+    """
+    return {
+        "torchrl_hmcts": __version__,
+        "torch": metadata.version("torch"),
+        "python": platform.python_version(),
+    }
 
 
 def write_page(

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
 
-_COLORS = ("#1d4ed8", "#d97706", "#16a34a", "#7c3aed")
+CURVE_COLORS = ("#1d4ed8", "#d97706", "#16a34a", "#7c3aed")
 _DPI = 110
 
 Curve = Mapping[str, Any]
@@ -61,6 +62,51 @@ def band(curves: Sequence[Curve], name: str) -> dict[str, np.ndarray]:
     }
 
 
+def draw_band(axes: Axes, curves: Sequence[Curve], name: str, *, color: str, **line: Any) -> None:
+    """Draw the mean of several seeds' curves, and the band from the least to the largest.
+
+    Args:
+        axes: to draw in.
+        curves: of the seeds, as in :func:`band`.
+        name: entry to draw.
+        color: of line and band.
+        **line: of ``axes.plot``.
+    """
+    shown = band(curves, name)
+    x = shown["training_steps"]
+    if len(curves) > 1:
+        axes.fill_between(x, shown["least"], shown["largest"], color=color, alpha=0.16, lw=0)
+    axes.plot(x, shown["mean"], color=color, linewidth=2.2, **line)
+
+
+def show_shares(axes: Axes) -> None:
+    """Let the y axis go from 0 to 100 %."""
+    axes.set_ylim(0.0, 1.03)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+
+
+def save_curves(
+    figure: Figure, path: str | Path, *, title: str, x_label: str = "training base steps"
+) -> None:
+    """Give all panels of a figure of training curves their common style, and write it.
+
+    Args:
+        figure: whose x axes count steps of training.
+        path: PNG to write.
+        title: heading of the picture.
+        x_label: below all panels.
+    """
+    for axes in figure.axes:
+        axes.grid(alpha=0.25)
+        axes.set_xlim(left=0)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel(x_label, fontsize=10)
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    figure.savefig(path, dpi=_DPI)
+
+
 def plot_solving_curves(
     runs: Mapping[str, Sequence[Curve]], path: str | Path, *, title: str
 ) -> None:
@@ -78,12 +124,9 @@ def plot_solving_curves(
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1.0))
     handles = []
-    for color, (name, curves) in zip(_COLORS, runs.items(), strict=False):
+    for color, (name, curves) in zip(CURVE_COLORS, runs.items(), strict=False):
         for axes, entry in ((left, "base_steps"), (right, "solved")):
-            shown = band(curves, entry)
-            x = shown["training_steps"]
-            axes.fill_between(x, shown["least"], shown["largest"], color=color, alpha=0.15)
-            axes.plot(x, shown["mean"], color=color, linewidth=2.2, marker="o", markersize=4)
+            draw_band(axes, curves, entry, color=color, marker="o", markersize=4)
         executed = band(curves, "executed_steps")
         left.plot(executed["training_steps"], executed["mean"], color=color, linestyle=":")
         handles.append(Line2D([], [], color=color, linewidth=2.2, marker="o", label=name))
@@ -93,14 +136,5 @@ def plot_solving_curves(
     left.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     left.legend(handles=handles, frameon=False, fontsize=9)
     right.set_title("mazes solved", fontsize=10, loc="left")
-    right.set_ylim(0.0, 1.03)
-    right.yaxis.set_major_formatter(PercentFormatter(1.0))
-    for axes in (left, right):
-        axes.grid(alpha=0.25)
-        axes.set_xlim(left=0)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.supxlabel("training base steps", fontsize=10)
-    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path, dpi=_DPI)
+    show_shares(right)
+    save_curves(figure, path, title=title)
