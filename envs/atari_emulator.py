@@ -155,23 +155,34 @@ class AtariEmulator:
                 f"{self.game} has the actions 0 to {self.num_actions - 1}; got {action}."
             )
         ale, code = self.ale, self._actions[action]
-        lives, reward = ale.lives(), 0
+        lives, reward, frames = ale.lives(), 0, 0
         for _ in range(self.frame_skip):
-            reward += self._frame(code)
+            if self.sticky:
+                self._stick(code)
+            reward += ale.act(code)
+            frames += 1
             if ale.game_over():
                 break
-        return reward, max(lives - ale.lives(), 0)
+        self._moved(code, frames)
+        lost = lives - ale.lives()
+        return reward, lost if lost > 0 else 0
 
-    def _frame(self, code: int) -> int:
+    def _frame(self, code: int) -> None:
+        if self.sticky:
+            self._stick(code)
+        self.ale.act(code)
+        self._moved(code, 1)
+
+    def _stick(self, code: int) -> None:
+        """Follow ALE's draws of a frame, one for each player."""
+        if self._twister.random_raw(2)[0] / 2.0**32 >= self._probability:
+            self._held = code
+
+    def _moved(self, code: int, frames: int) -> None:
         self._sent = code
-        if self.sticky:  # one draw for each player
-            if self._twister.random_raw(2)[0] / 2.0**32 >= self._probability:
-                self._held = code
-        self.num_frames += 1
+        self.num_frames += frames
         self._partial = None
         self.screen_is_stale = False
-        reward: int = self.ale.act(code)
-        return reward
 
     # ---------------------------------------------------------------- state
 

@@ -158,12 +158,31 @@ class SharedMLP:
 
     def act(self, ram: np.ndarray, option: int, generator: np.random.Generator) -> int:
         """Return an action drawn from the option's policy, or the most probable one."""
-        _logits(ram, self._array, self._sizes, self._heads[option], self._logits)
-        if not self.deterministic:
-            # Gumbel-max: argmax(logits - log E), E exponential, is a draw from softmax(logits).
-            noise = generator.standard_exponential(self.num_actions, dtype=np.float32)
-            self._logits -= np.log(noise)
-        return int(self._logits.argmax())
+        draw = -1.0 if self.deterministic else generator.random()
+        return int(_choose(ram, self._array, self._sizes, self._heads[option], self._logits, draw))
+
+
+@njit(cache=True)
+def _choose(
+    ram: np.ndarray,
+    weights: np.ndarray,
+    sizes: np.ndarray,
+    head: int,
+    logits: np.ndarray,
+    draw: float,
+) -> int:
+    """The most probable action, or that at which the cumulative probability passes ``draw``."""
+    _logits(ram, weights, sizes, head, logits)
+    best = logits.argmax()
+    if draw < 0.0:
+        return best
+    shares = np.exp(logits - logits[best])
+    left = draw * shares.sum()
+    for action in range(len(shares)):
+        left -= shares[action]
+        if left < 0.0:
+            return action
+    return best  # rounding
 
 
 @njit(cache=True)

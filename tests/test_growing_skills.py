@@ -106,6 +106,12 @@ def test_patience_gives_skills_that_add_nothing_a_second_chance() -> None:
     assert grow.history["gain"][3:] == pytest.approx([-0.05, 0.0])
 
 
+def test_growing_does_not_end_before_one_skill_has_added_something() -> None:
+    grow = make([10.0, 9.0, 9.0, 20.0, 19.0], patience=1)
+    assert run(grow, flat(), 11) == [2, 3, 3, 4, 4, 5, 5, 6, 6, 5, 5]
+    assert grow.history["better"] == [True, False, False, True, False]
+
+
 def test_the_best_skills_get_their_weights_back_and_data_of_other_numbers_are_forgotten() -> None:
     trainer = FakeTrainer()
     grow = make([10.0, 15.0, 20.0, 20.5], patience=1)

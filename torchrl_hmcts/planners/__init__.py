@@ -25,6 +25,7 @@ from torchrl_hmcts.planners.torchrl_scores import TorchRLScore
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import SearchTree, TreeView
 from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, NodeStatistics
+from torchrl_hmcts.planners.tree_rollout import TreeRollout
 
 __all__ = [
     "PUCT",
@@ -58,6 +59,7 @@ __all__ = [
     "TorchRLScore",
     "Transition",
     "Transpositions",
+    "TreeRollout",
     "TreeView",
     "ValueEvaluator",
     "WidthNovelty",

@@ -49,16 +49,27 @@ class MostVisited:
 
 @dataclass(frozen=True)
 class HighestValue:
-    """The option of the root with the highest value (ties: the lower index).
+    """The option of the root with the highest value.
+
+    Args:
+        random_ties: draw among options of equal value, as there are many where rewards are rare,
+            instead of taking the one of lower index. Default ``False``.
 
     Example:
-        >>> HighestValue()
-        HighestValue()
+        >>> HighestValue(random_ties=True)
+        HighestValue(random_ties=True)
     """
+
+    random_ties: bool = False
 
     def choose(self, search: Search) -> np.ndarray:
         """Return an option for each root, int64 ``[B]``."""
-        choice: np.ndarray = _root_options(search)[1].argmax(-1)
+        values = _root_options(search)[1]
+        choice: np.ndarray = values.argmax(-1)
+        if self.random_ties:
+            for b, row in enumerate(values):
+                best = np.flatnonzero(row == row[choice[b]])
+                choice[b] = search.generator(b, "choice").choice(best)
         return choice
 
 

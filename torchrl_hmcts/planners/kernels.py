@@ -415,6 +415,48 @@ def _schedule(wave, i, b, n, a):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def extend(nodes, edges, roots, settings, ended, draws, wave):
+    """Schedule an option of each new node ``ended``, by its prior; return how many there are.
+
+    ``ended`` are records of the last wave, inserted; ``draws`` [len(ended)] in [0, 1).
+    """
+    s = settings[0]
+    count = 0
+    for i in range(ended.shape[0]):
+        b, n = ended[i]["root"], ended[i]["new_node"]
+        root, tree, links = roots[b], nodes[b], edges[b]
+        scheduled = 0
+        for j in range(count):
+            scheduled += wave[j]["root"] == b
+        if tree[n]["flags"] & (TERMINAL | PRUNED | CLOSED):
+            continue
+        if root["simulations"] + scheduled >= root["limit"]:
+            continue
+        total = 0.0
+        for a in range(edges.shape[-1]):
+            if not links[n, a]["closed"] and links[n, a]["child"] < 0:
+                total += links[n, a]["prior"]
+        left, chosen = draws[i] * total, -1
+        for a in range(edges.shape[-1]):
+            if not links[n, a]["closed"] and links[n, a]["child"] < 0:
+                chosen = a
+                left -= links[n, a]["prior"]
+                if left < 0.0:
+                    break
+        if chosen < 0:  # an outcome that was known before, all of whose options have been tried
+            continue
+        if s["mark"]:
+            links[n, chosen]["in_flight"] += 1
+            up = n
+            while tree[up]["parent"] >= 0:
+                links[tree[up]["parent"], tree[up]["option"]]["in_flight"] += 1
+                up = tree[up]["parent"]
+        _schedule(wave, count, b, n, chosen)
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, error_model="numpy")
 def cancel(nodes, edges, settings, wave):
     """Forget a wave that was selected and will never be inserted."""
     s = settings[0]

@@ -37,6 +37,7 @@ from torchrl_hmcts.planners.simulator import Simulator
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import TERMINAL
 from torchrl_hmcts.planners.tree_policies import UCT, Gumbel, TreePolicy
+from torchrl_hmcts.planners.tree_rollout import TreeRollout
 
 Evaluator = Callable[[TensorDictBase], Tensor]
 
@@ -99,6 +100,8 @@ class MCTSPlanner(TensorDictModuleBase):
             :class:`RolloutEvaluator`, :class:`MixedEvaluator` or your own. Default: 0.
         option_prior (callable, optional): ``option_prior(td) -> probabilities [m, A]``:
             :class:`ModulePrior` or your own. Default: uniform.
+        rollout (TreeRollout, optional): from every new leaf go on for some options and keep them in
+            the tree. Needs ``expand="one"``. Default: none.
         root_noise (DirichletNoise, optional): noise in the prior of the roots. Default: none.
         backup: :class:`MeanBackup` (default) or :class:`MaxBackup`.
         final_choice: :class:`BestPlan`, :class:`MostVisited`, :class:`HighestValue` or
@@ -153,6 +156,7 @@ class MCTSPlanner(TensorDictModuleBase):
         chance: ProgressiveWidening | None = None,
         leaf_evaluator: Evaluator | None = None,
         option_prior: Evaluator | None = None,
+        rollout: TreeRollout | None = None,
         root_noise: DirichletNoise | None = None,
         backup: Backup | None = None,
         final_choice: FinalChoice | None = None,
@@ -181,6 +185,12 @@ class MCTSPlanner(TensorDictModuleBase):
             leaves_per_wave=leaves_per_wave,
             exhausted=exhausted,
         )
+        if rollout is not None and (expand != "one" or isinstance(tree_policy, Gumbel)):
+            raise ValueError(
+                f"MCTSPlanner: a TreeRollout goes on from the one option that was simulated; got "
+                f"expand={expand!r} and tree_policy={tree_policy!r}. Pass expand='one' and UCT, "
+                f"PUCT or a policy of your own."
+            )
         if chance is not None and transpositions is not None:
             raise ValueError(
                 "MCTSPlanner: transpositions share what follows a state, which chance redraws; "
@@ -208,6 +218,7 @@ class MCTSPlanner(TensorDictModuleBase):
             bind = getattr(part, "bind", None)
             if bind is not None:
                 bind(self.simulator, gamma)
+        self.rollout = rollout
         self.root_noise = root_noise
         self.backup = MeanBackup() if backup is None else backup
         if final_choice is None:
@@ -456,11 +467,14 @@ class MCTSPlanner(TensorDictModuleBase):
         while len(active):
             wave = search.select(active)
             if len(wave):
-                try:
-                    self._simulate(search, wave)
-                except BaseException:
-                    search.cancel(wave)
-                    raise
+                self._simulate(search, wave)
+            if self.rollout is not None:
+                further = wave
+                for _ in range(self.rollout.max_options):
+                    further = search.extend(further)
+                    if not len(further):
+                        break
+                    self._simulate(search, further)
             seconds = time.perf_counter() - begin
             if self.progress is not None:
                 self.progress(
@@ -508,6 +522,13 @@ class MCTSPlanner(TensorDictModuleBase):
         return np.sort(np.concatenate((kept[:num_kept], np.array(opened, np.int64))))
 
     def _simulate(self, search: Search, wave: Wave) -> None:
+        try:
+            self._insert(search, wave)
+        except BaseException:
+            search.cancel(wave)
+            raise
+
+    def _insert(self, search: Search, wave: Wave) -> None:
         simulator, tree = self.simulator, search.tree
         states = tree.get_states(wave.roots, wave.nodes, simulator.state_keys)
         after = simulator.step(states, wave.options)

@@ -175,7 +175,7 @@ class Search:
             num_roots * leaves_per_wave * (num_options if self.expand_all else 1), WAVE
         )
         self._gumbel = np.zeros((0, 0), np.float32)
-        self.seeds = np.arange(num_roots)
+        self.seed(np.arange(num_roots))
         self._room = 1  # nodes of the largest tree, at most
 
     def __getstate__(self) -> dict[str, Any]:  # a module can be neither copied nor sent
@@ -321,6 +321,23 @@ class Search:
             )
         return Wave(self._wave[:count])
 
+    def extend(self, wave: Wave) -> Wave:
+        """Choose an option, by its prior, of every node that a wave has added and that goes on.
+
+        Only with ``expand="one"``. Each root draws its own random numbers.
+        """
+        draws = np.empty(len(wave))
+        for root in np.unique(wave.roots).tolist():
+            if root not in self._rollouts:
+                self._rollouts[root] = self.generator(root, "rollout")
+            rows = wave.roots == root
+            draws[rows] = self._rollouts[root].random(int(rows.sum()))
+        tree, ended = self.tree, wave.records.copy()
+        count = self._kernels.extend(
+            tree.nodes, tree.edges, tree.roots, self.settings, ended, draws, self._wave
+        )
+        return Wave(self._wave[:count])
+
     def cancel(self, wave: Wave) -> None:
         """Take a wave back that will not be inserted, e.g. after an error in the simulator."""
         self._kernels.cancel(self.tree.nodes, self.tree.edges, self.settings, wave.records)
@@ -367,6 +384,7 @@ class Search:
     def seed(self, seeds: np.ndarray) -> None:
         """Give each root the seed of its random numbers, int64 ``[B]``."""
         self.seeds = seeds
+        self._rollouts: dict[int, np.random.Generator] = {}
 
     def generator(self, root: int, purpose: str) -> np.random.Generator:
         """Return random numbers that depend on the root's seed and on what they are for."""

@@ -74,7 +74,7 @@ def _load_folder(folder: Path) -> TensorDictBase:
             f"There is no dataset in {str(folder)!r}. Write one with replay_buffer.dumps(folder) "
             "or tensordict.memmap(folder)."
         )
-    data = TensorDict.load_memmap(storage)
+    data = TensorDict.load_memmap(storage, allow_pickle=False)
     filled = storage / "storage_metadata.json"
     if filled.is_file():
         data = data[: json.loads(filled.read_text())["len"]]

@@ -112,10 +112,10 @@ class GrowSkills(TrainerHookBase):
     :math:`C_n` is the coverage with n skills, measured once they are learned: as soon as the
     discriminator's accuracy has stopped to rise over a window, but not before ``min_base_steps``
     and not later than ``max_base_steps`` after the last change. When ``patience`` skills in a row
-    have added nothing, they are switched off again, the networks get back the weights with which
-    :math:`n^*` was measured, and the rest of training is spent on these skills. With ``prune``, a
-    skill without which coverage is no smaller (two that do the same) is dropped before, the most
-    useless first.
+    have added nothing, after one that did, they are switched off again, the networks get back the
+    weights with which :math:`n^*` was measured, and the rest of training is spent on these skills.
+    With ``prune``, a skill without which coverage is no smaller (two that do the same) is dropped
+    before, the most useless first.
 
     A skill that is switched on starts from the fresh weights its heads were built with, and the
     replay buffer is emptied: it holds the new skill hardly at all, so that the discriminator
@@ -131,8 +131,9 @@ class GrowSkills(TrainerHookBase):
             :class:`SearchCoverage`, or your own. More is better.
         min_gain (float): :math:`g_{\min}`, the share of coverage that more skills must add. Default
             ``0.05``.
-        patience (int): skills in a row that may add nothing before growing ends. Default ``2``: a
-            third skill on a plane often has to wait for the fourth.
+        patience (int): skills in a row that may add nothing before growing ends, once a skill has
+            added something. Default ``2``: a third skill on a plane often has to wait for the
+            fourth.
         prune (bool): drop useless skills among the :math:`n^*` when growing ends. Default ``True``.
         enough (float, optional): coverage from which on no skill is added. Default ``None``: only
             the gain counts.
@@ -288,8 +289,9 @@ class GrowSkills(TrainerHookBase):
         if better:
             self._best = {"number": number, "coverage": coverage, "weights": _weights(trainer)}
         self._fruitless = 0 if better else self._fruitless + 1
+        helped = any(self.history["better"][1:])
         self.finished = (
-            self._fruitless >= self.patience
+            (helped and self._fruitless >= self.patience)
             or number == self.prior.num_skills
             or (self.until is not None and base_steps >= self.until)
             or (self.enough is not None and coverage >= self.enough)
