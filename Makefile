@@ -1,7 +1,7 @@
 # Needs only make and a Python from 3.10 to 3.13; everything else goes into $(VENV).
 #
 #   make demo ARGS="seed=1 out=runs/one"
-#   make test PYTEST_ARGS="-k packaging"
+#   make test PYTEST_ARGS="-k packaging"        (JOBS=1 for one process instead of two)
 #   make test VENV=/path/to/an/environment      (reuses it, and installs this checkout into it)
 #   make demo PYTHON=/path/to/python3.12
 
@@ -12,6 +12,7 @@ MAKEFLAGS += --no-print-directory
 VENV ?= .venv
 ARGS ?=
 PYTEST_ARGS ?=
+JOBS ?= 2
 
 # A name on the PATH may be a stub that does not run, or lack `venv`: ask each one.
 PYTHON_FITS := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
@@ -21,13 +22,14 @@ PYTHON ?= $(shell for name in python3.13 python3.12 python3.11 python3.10 python
 BIN := $(VENV)/bin
 TRAIN_STAMP := $(VENV)/.torchrl_hmcts-train
 DEV_STAMP := $(VENV)/.torchrl_hmcts-dev
+DOCS_STAMP := $(VENV)/.torchrl_hmcts-docs
 TYPES := build/types
 
 # A stamp holds the checkout it was made from, so an environment shared by two is set up again.
 HERE := $(shell pwd -P)
 stale = $(if $(filter-out $(HERE),$(shell cat $(1) 2>/dev/null)),FORCE)
 
-.PHONY: help demo test lint format types clean FORCE
+.PHONY: help demo test coverage docs lint format types clean FORCE
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' Makefile
@@ -37,10 +39,26 @@ demo: $(TRAIN_STAMP) ## Set up, then learn skills and solve mazes: make demo ARG
 
 test: $(DEV_STAMP) ## Set up, then check the style and run the tests
 	$(BIN)/python -m ruff check .
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
+
+# Warnings are errors. The tutorials are run while the pages are built: a few minutes.
+docs: $(DOCS_STAMP) ## Set up, then build the documentation site in docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "The site: docs/_build/html/index.html"
+
+# Compiled kernels are invisible to coverage: their tests run once more without compiling.
+KERNEL_TESTS := tests/test_planner_golden.py tests/test_array_search.py tests/test_novelty.py \
+	tests/test_transpositions.py tests/test_stochastic_search.py tests/test_lab_maze.py
+
+coverage: ## Run the tests and measure that they reach 92 % of the lines
+	$(MAKE) test PYTEST_ARGS="$(PYTEST_ARGS) --cov --cov-report="
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(KERNEL_TESTS) -q \
+		-k "not speed" --cov --cov-append --cov-report=
+	$(BIN)/python -m coverage report --skip-covered --fail-under=92
 
 lint: $(DEV_STAMP) ## Check the style
 	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
 
 format: $(DEV_STAMP) ## Put imports and layout in order
 	$(BIN)/python -m ruff check --fix .
@@ -62,7 +80,7 @@ types: $(DEV_STAMP) ## Check the types of the built wheel
 
 clean: ## Remove the environment and everything that was built (runs/ stays)
 	rm -rf .venv build dist torchrl_hmcts.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis \
-		.benchmarks htmlcov .coverage
+		.benchmarks htmlcov .coverage docs/_build docs/auto_*
 	find torchrl_hmcts envs trainers tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/pyvenv.cfg:
@@ -83,3 +101,7 @@ $(DEV_STAMP): pyproject.toml $(VENV)/pyvenv.cfg $(call stale,$(DEV_STAMP))
 	$(BIN)/python -m pip install --disable-pip-version-check -e '.[train,dev]'
 	@echo '$(HERE)' > $@
 	@echo '$(HERE)' > $(TRAIN_STAMP)
+
+$(DOCS_STAMP): pyproject.toml $(VENV)/pyvenv.cfg $(call stale,$(DOCS_STAMP))
+	$(BIN)/python -m pip install --disable-pip-version-check -e '.[train,atari,docs]'
+	@echo '$(HERE)' > $@

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from torchrl_hmcts.arguments import name_all_arguments
+from torchrl_hmcts.envs.atari_goals import ByteGoal, FollowGoals, JoinedWorkers
 from torchrl_hmcts.envs.atari_pool import AtariOptionPool
 from torchrl_hmcts.envs.atari_ram import AtariRAMEnv
 from torchrl_hmcts.envs.atari_workers import OptionWorker, RepeatActions, SharedMLP
@@ -30,8 +32,11 @@ from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 __all__ = [
     "AtariOptionPool",
     "AtariRAMEnv",
+    "ByteGoal",
     "DeepMindLabEnv",
+    "FollowGoals",
     "GridworldMazeEnv",
+    "JoinedWorkers",
     "LAB_ACTIONS",
     "LabMazeEnv",
     "OptionWorker",
@@ -55,4 +60,5 @@ __all__ = [
     "wall_centers",
 ]
 
+name_all_arguments(globals(), __all__)
 register_envs()

@@ -55,8 +55,8 @@ class AtariOptionPool(EnvBase):
     the first step.
 
     Writes, besides the entries of :class:`AtariRAMEnv`: ``"duration"`` (int64 ``[*B, 1]``, steps of
-    ``frame_skip`` frames), ``"game_reward"`` (float32 ``[*B, 1]``, the sum without penalty) and
-    ``"life_losses"`` (float32 ``[*B, 1]``, discounted sum of :math:`l`).
+    ``frame_skip`` frames), ``"score"`` (float32 ``[*B, 1]``, :math:`\sum r_{i+1}`, undiscounted and
+    without penalty) and ``"life_losses"`` (float32 ``[*B, 1]``, discounted sum of :math:`l`).
 
     Args:
         game (str): e.g. ``"Breakout"``.
@@ -206,7 +206,7 @@ class AtariOptionPool(EnvBase):
             return Unbounded((*shape, *size), dtype=dtype)
 
         observed["duration"] = numbers(1, dtype=torch.int64)
-        observed["game_reward"] = numbers(1, dtype=torch.float32)
+        observed["score"] = numbers(1, dtype=torch.float32)
         observed["life_losses"] = numbers(1, dtype=torch.float32)
         if self._run.record:
             observed["inner_ram"] = numbers(self.max_steps, 128, dtype=torch.uint8)
@@ -283,7 +283,7 @@ class AtariOptionPool(EnvBase):
         }
         for key in ("lives", "episode_frame", "duration"):
             out[key] = np.zeros((count, 1), np.int64)
-        for key in ("game_reward", "life_losses"):
+        for key in ("score", "life_losses"):
             out[key] = np.zeros((count, 1), np.float32)
         if self._run.record:
             steps = self.max_steps
@@ -318,6 +318,7 @@ class AtariOptionPool(EnvBase):
             seeds = (self._key + self._num_calls + np.arange(count)) & np.iinfo(np.int64).max
             self._num_calls += count
         out = self._begin(count)
+        rewards = np.zeros((count, 1), np.float32)
         flags = {key: np.zeros((count, 1), np.bool_) for key in ("terminated", "truncated")}
         for begin in range(0, count, NUM_SLOTS):
             part = slice(begin, min(begin + NUM_SLOTS, count))
@@ -325,15 +326,15 @@ class AtariOptionPool(EnvBase):
             used["state"], used["option"], used["seed"] = rows[part], options[part], seeds[part]
             self._run_slots(len(used))
             out["emulator_state"][part], out["ram"][part] = used["after"], used["ram"]
-            out["game_reward"][part, 0] = used["reward"]
-            for key in ("life_losses", "duration", "lives", "episode_frame"):
+            rewards[part, 0] = used["reward"]
+            for key in ("score", "life_losses", "duration", "lives", "episode_frame"):
                 out[key][part, 0] = used[key]
             for key, flag in flags.items():
                 flag[part, 0] = used[key]
             if self._run.record:
                 for key in ("inner_ram", "inner_action", "inner_reward"):
                     out[key][part] = used[key]
-        reward = out["game_reward"] - np.float32(self.life_loss_penalty) * out["life_losses"]
+        reward = rewards - np.float32(self.life_loss_penalty) * out["life_losses"]
         result = self._observed(out, shape)
         ends = {**flags, "done": flags["terminated"] | flags["truncated"], "reward": reward}
         for key, value in ends.items():

@@ -61,6 +61,7 @@ def slot_type(width: int, run: OptionRun) -> np.dtype:
         ("after", np.uint8, (width,)),  # out
         ("ram", np.uint8, (128,)),
         ("reward", np.float64),  # discounted sum
+        ("score", np.float64),  # plain sum
         ("life_losses", np.float64),  # discounted sum
         ("duration", np.int64),
         ("lives", np.int64),
@@ -104,7 +105,7 @@ def run_option(
     ram = slots["ram"][index]
     emulator.set_state(slots["state"][index], seed & 0x7FFFFFFF)
     emulator.read_ram(ram)
-    reward = life_losses = 0.0
+    reward = score = life_losses = 0.0
     discount = 1.0
     for step in range(run.max_steps):
         action = worker.act(ram, option, generator)
@@ -116,6 +117,7 @@ def run_option(
             slots["inner_action"][index, step] = action
             slots["inner_reward"][index, step] = gained
         emulator.read_ram(ram)
+        score += gained
         reward += discount * gained
         life_losses += discount * lost
         discount *= run.gamma
@@ -126,7 +128,7 @@ def run_option(
         ):
             break
     slot["duration"] = step + 1
-    slot["reward"], slot["life_losses"] = reward, life_losses
+    slot["reward"], slot["score"], slot["life_losses"] = reward, score, life_losses
     slot["lives"], slot["episode_frame"] = emulator.lives, emulator.episode_frame
     slot["terminated"], slot["truncated"] = emulator.terminated, emulator.truncated
     slots["after"][index] = emulator.state()

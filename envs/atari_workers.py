@@ -173,7 +173,7 @@ def _choose(
 ) -> int:
     """The most probable action, or that at which the cumulative probability passes ``draw``."""
     _logits(ram, weights, sizes, head, logits)
-    best = logits.argmax()
+    best = int(logits.argmax())
     if draw < 0.0:
         return best
     shares = np.exp(logits - logits[best])

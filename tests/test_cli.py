@@ -42,10 +42,18 @@ def test_an_unknown_experiment_is_refused_with_the_nearest(capsys, verb: list[st
     assert "Did you mean: labmaze" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["seed=1"], ["experiment=labmaze", "experiment=labmaze"]])
-def test_train_wants_one_experiment(capsys, words: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["seed=1"], "say which experiment, e.g. experiment=waterworld_goals"),
+        ([], "say which experiment"),
+        (["experiment=labmaze", "experiment=labmaze"], "experiment is given twice"),
+        (["experiment="], "experiment= has no value"),
+    ],
+)
+def test_train_wants_one_experiment(capsys, words: list[str], message: str) -> None:
     assert main(["train", *words]) == 2
-    assert "say once which experiment" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_an_unknown_key_of_an_experiment_is_refused_with_the_nearest(capsys) -> None:

@@ -88,9 +88,11 @@ def imported_names(
 
 
 def layer(name: str) -> str:
-    """Returns ``envs``, ``trainers``, ``components`` or ``outside`` for an import name."""
+    """Returns ``envs``, ``trainers``, ``components``, ``base`` or ``outside`` for an import."""
     if name.split(".")[0] != "torchrl_hmcts":
         return "outside"
+    if name.startswith("torchrl_hmcts.arguments"):  # the standard library only, for all
+        return "base"
     second = [*name.split("."), ""][1]
     return second if second in ("envs", "trainers") else "components"
 
@@ -149,7 +151,9 @@ def test_a_module_imports_only_what_its_layer_may(module: str) -> None:
 @pytest.mark.parametrize("module", modules())
 def test_every_third_party_import_is_declared(module: str) -> None:
     path = modules()[module]
-    extras = {"trainers": ("train", "atari"), "envs": ("atari",)}.get(layer(module), ())
+    extras = {"trainers": ("train", "atari", "scale", "wandb"), "envs": ("atari",)}.get(
+        layer(module), ()
+    )
     if OPTIONAL.get(module) == "matplotlib":
         extras = ("train",)
     allowed = declared_distributions(*extras)

@@ -13,6 +13,26 @@ if TYPE_CHECKING:
         SharedRMSprop,
         share_optimizer,
     )
+    from torchrl_hmcts.trainers.atari.agent import (
+        AtariAgent,
+        AtariProgress,
+        AtariSearch,
+    )
+    from torchrl_hmcts.trainers.atari.goals import (
+        Candidate,
+        GoalFinder,
+        GoalSearch,
+    )
+    from torchrl_hmcts.trainers.atari.sources import (
+        DIAYNSource,
+        DistilledSource,
+        GoalSource,
+        Options,
+        RepeatSource,
+        WorkerSource,
+        load_options,
+    )
+    from torchrl_hmcts.trainers.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.config import DemoConfig
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
     from torchrl_hmcts.trainers.expert_iteration import (
@@ -22,6 +42,10 @@ if TYPE_CHECKING:
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
     from torchrl_hmcts.trainers.resume import GeneratorStates, ResumableTrainer, RunningEpisodes
+    from torchrl_hmcts.trainers.skills.controllability import (
+        Controllability,
+        probe_controllability,
+    )
     from torchrl_hmcts.trainers.skills.coverage import StateCoverage
     from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
     from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
@@ -47,11 +71,22 @@ if TYPE_CHECKING:
 
 __all__ = [
     "A3CTrainer",
+    "AtariAgent",
+    "AtariProgress",
+    "AtariSearch",
+    "Candidate",
+    "Controllability",
+    "DIAYNSource",
     "DIAYNTrainer",
     "DemoConfig",
+    "DistilledSource",
+    "DurableRotation",
     "ExpertIterationTrainer",
     "GeneratorStates",
     "GoalEpisodes",
+    "GoalFinder",
+    "GoalSearch",
+    "GoalSource",
     "GoalTrack",
     "GrowSkills",
     "HMCTSTrainer",
@@ -59,6 +94,8 @@ __all__ = [
     "LearnerError",
     "MazeNetwork",
     "MazeView",
+    "Options",
+    "RepeatSource",
     "ResumableTrainer",
     "RunningEpisodes",
     "ScriptedExpert",
@@ -70,14 +107,18 @@ __all__ = [
     "TerminationConfig",
     "TerminationResult",
     "TilePlanner",
+    "WorkerSource",
     "collect_option_steps",
     "learn_termination",
+    "load_options",
     "make_goal_env",
     "make_guided_planner",
     "make_skill_optimizer",
     "make_terminating_env",
     "make_tile_planner",
     "num_places",
+    "plain_checkpoint",
+    "probe_controllability",
     "run_goal_episodes",
     "share_optimizer",
     "shortest_distances",
@@ -86,11 +127,22 @@ __all__ = [
 # Imported when asked for: the command line answers --help without loading torch.
 _MODULES = {
     "A3CTrainer": "a3c",
+    "AtariAgent": "atari.agent",
+    "AtariProgress": "atari.agent",
+    "AtariSearch": "atari.agent",
+    "Candidate": "atari.goals",
+    "Controllability": "skills.controllability",
+    "DIAYNSource": "atari.sources",
     "DIAYNTrainer": "diayn",
     "DemoConfig": "config",
+    "DistilledSource": "atari.sources",
+    "DurableRotation": "checkpoints",
     "ExpertIterationTrainer": "expert_iteration",
     "GeneratorStates": "resume",
     "GoalEpisodes": "waterworld.goal_episodes",
+    "GoalFinder": "atari.goals",
+    "GoalSearch": "atari.goals",
+    "GoalSource": "atari.sources",
     "GoalTrack": "waterworld.goal_episodes",
     "GrowSkills": "skills.growing",
     "HMCTSTrainer": "hmcts",
@@ -98,6 +150,8 @@ _MODULES = {
     "LearnerError": "asynchronous.learner_processes",
     "MazeNetwork": "waterworld.networks",
     "MazeView": "skills.hindsight",
+    "Options": "atari.sources",
+    "RepeatSource": "atari.sources",
     "ResumableTrainer": "resume",
     "RunningEpisodes": "resume",
     "ScriptedExpert": "waterworld.scripted_expert",
@@ -109,16 +163,20 @@ _MODULES = {
     "TerminationConfig": "skills.termination",
     "TerminationResult": "skills.termination",
     "TilePlanner": "waterworld.goal_planning",
+    "WorkerSource": "atari.sources",
     "collect_option_steps": "skills.termination",
     "learn_termination": "skills.termination",
+    "load_options": "atari.sources",
     "make_goal_env": "waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
     "make_skill_optimizer": "diayn",
     "make_terminating_env": "skills.termination",
     "make_tile_planner": "waterworld.goal_planning",
     "num_places": "skills.growing",
-    "share_optimizer": "asynchronous.shared_optimizers",
+    "plain_checkpoint": "checkpoints",
+    "probe_controllability": "skills.controllability",
     "run_goal_episodes": "waterworld.goal_episodes",
+    "share_optimizer": "asynchronous.shared_optimizers",
     "shortest_distances": "waterworld.networks",
 }
 

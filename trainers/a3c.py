@@ -13,11 +13,11 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.optim import Optimizer
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 
+from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.trainers.asynchronous.actor_learner import (
     ActorLearner,
     LearnerSettings,
@@ -33,6 +33,11 @@ from torchrl_hmcts.trainers.asynchronous.shared_optimizers import (
     SharedRMSprop,
     share_optimizer,
 )
+from torchrl_hmcts.trainers.checkpoints import (
+    DurableRotation,
+    check_settings,
+    plain_checkpoint,
+)
 from torchrl_hmcts.trainers.resume import HistoryState, newest_checkpoint
 
 MakeOptimizer = Callable[[list[nn.Parameter]], Optimizer]
@@ -45,6 +50,7 @@ _OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {"rmsprop": SharedRMSprop, "a
 _POLL_SECONDS = 0.2
 
 
+@name_arguments
 class A3CTrainer:
     r"""Actor-learners in processes of their own, with one set of parameters in shared memory.
 
@@ -249,11 +255,12 @@ class A3CTrainer:
         self.learners = LearnerProcesses(num_learners, start_method)
         self.evaluate, self.stop_when = evaluate, stop_when
         self.log, self.progress = LearnerLog(board, columns, logger), progress
-        self.rotation = (
-            None if save_dir is None else CheckpointRotation(save_dir, keep_last=keep_last)
-        )
+        self.rotation = None if save_dir is None else DurableRotation(save_dir, keep_last=keep_last)
+        self.run_settings = {"trainer": "A3CTrainer", "loss_module": type(loss_module).__name__}
+        if self.rotation is not None:
+            self.rotation.settings = self.run_settings
         self.intervals = {"log": log_interval, "eval": eval_interval, "save": save_interval}
-        self._checkpoint = Checkpoint(
+        self._checkpoint = plain_checkpoint(
             loss_module=loss_module,
             optimizer=_OptimizerState(self.optimizer),
             counters=self.log,
@@ -345,9 +352,12 @@ class A3CTrainer:
 
         Raises:
             FileNotFoundError: if there is no checkpoint.
-            CheckpointError: if the checkpoint does not fit, e.g. other networks or optimiser.
+            CheckpointError: if it is damaged, of a newer version or another loss, or does not fit,
+                e.g. other networks or optimiser.
         """
-        self._checkpoint.load(newest_checkpoint(path))
+        found = newest_checkpoint(path)
+        check_settings(found, self.run_settings)
+        self._checkpoint.load(found)
         return self
 
     # Running learners
@@ -377,7 +387,11 @@ class A3CTrainer:
         """Saves what there is, and says where."""
         if self.rotation is None:
             return
-        self.save()
+        try:
+            self.save()
+        except OSError as failure:  # what ended the run is the error to raise
+            print(f"\n{type(error).__name__}; and {failure}.", file=sys.stderr)
+            return
         again = f"Go on with trainer.load({str(self.rotation.directory)!r}).train()."
         how = "Stopped" if isinstance(error, KeyboardInterrupt) else type(error).__name__
         print(f"\n{how}; saved at {self.frames} frames. {again}", file=sys.stderr)

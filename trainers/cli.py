@@ -3,16 +3,103 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
 
-from torchrl_hmcts.trainers.config import parse_overrides
-from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, Experiment, find_experiment
+from torchrl_hmcts.trainers.command_line.listing import summaries
+from torchrl_hmcts.trainers.command_line.words import LOG_LEVEL_HELP
+from torchrl_hmcts.trainers.experiments.registry import DEMO
 
-_DEMO = Experiment(
-    "demo", "learn four skills and solve random mazes", "..config:DemoConfig", "..demo:run_demo"
-)
+_DEMO = f"""\
+Train skills in the training mazes of Waterworld, then solve test mazes by planning over them.
+
+needs   the extra `train`; about a minute of one CPU core
+writes  metrics.json, pictures, a GIF and index.html to the folder `out`
+
+keys and defaults:
+{{keys}}
+  {LOG_LEVEL_HELP}"""
+
+_TRAIN = f"""\
+Train and test one experiment.
+
+    hmcts train experiment=labmaze seed=1 out=runs/labmaze_1
+    hmcts train resume=runs/labmaze_1                      goes on exactly, with the saved config
+    hmcts train experiment=labmaze out=runs/labmaze_1 resume=true train_frames=80000
+                                                           goes on with other keys
+
+needs   the extra `train` (`atari` for Atari); minutes to hours; Ctrl-C saves and says how to go on
+writes  run.json, metrics.json, curves.csv, log/, pictures, checkpoints/ and index.html to `out`
+
+experiments (their keys: hmcts list NAME):
+{{experiments}}
+
+  {LOG_LEVEL_HELP}"""
+
+_EVALUATE = f"""\
+Test the newest checkpoint of a run again, finished or stopped, with other starts or settings.
+
+    hmcts evaluate run=runs/labmaze_1 seed=7 size=15 mazes=40
+
+needs   the run's folder, with run.json (or metrics.json) and checkpoints/
+writes  evaluation.json into that folder, one entry per choice of keys, and its page anew
+
+Keys are those of the run's experiment (hmcts list NAME); those not given are as in the run.
+  {LOG_LEVEL_HELP}"""
+
+_REPORT = f"""\
+Write a page: of one run, of several runs compared, or a figure of the dissertation.
+
+    hmcts report runs/one                     index.html in runs/one, finished or not
+    hmcts report runs/one out=page.html       the same in one file that can be sent
+    hmcts report runs/a_0 runs/a_1 runs/b_0   runs/report/index.html: groups by config, means over
+                                              seeds with least and largest, bootstrap intervals
+    hmcts report figure=3.6                   figures/figure_3.6.png, from measured results
+    hmcts report figure=4.10 runs/labmaze_*   the same from your own runs
+    hmcts report figure=all                   all whose data are there, and a page of them
+
+needs   folders that `hmcts demo` or `hmcts train` wrote; for figures also docs/results of the
+        repository (results=DIR if it is elsewhere)
+writes  static pages that need no network; out=DIR or out=FILE.html says where
+
+figures: hmcts list figures
+  {LOG_LEVEL_HELP}"""
+
+_SWEEP = f"""\
+Search for good values of an experiment's keys with Optuna.
+
+    hmcts sweep experiment=labmaze num_skills=[3,4,6] option_frames=40..200:20 trials=20
+    hmcts sweep experiment=waterworld_a3c learning_rate=1e-4..1e-2:log trials=10 total_frames=200000
+
+  key=[a,b,c]      one of these            key=low..high       between them, both included
+  key=low..high:N  in steps of N           key=low..high:log   evenly in the logarithm
+  key=value        the same in all trials
+
+  experiment=NAME  which one (hmcts list)          trials=20        how many, finished ones included
+  objective=NAME   figure in metrics.json, e.g. test.solved; -NAME: less is better
+  out=DIR          folder (default runs/sweep_NAME)
+  storage=URL      any storage of Optuna's, e.g. a database that several machines share; then start
+                   the same command on each (default: a journal file in the folder)
+  prune=false      let trials that lag behind run to their end
+  {LOG_LEVEL_HELP}
+
+needs   the extra `scale`; each trial takes what a run takes
+writes  trial_0000/ ... (folders of runs), sweep.json, importances.png and index.html to the
+        folder; the same command again goes on"""
+
+_LIST = "List the experiments; the keys of one with their defaults and meaning; or the figures."
+
+_VERBS = {
+    "demo": ("learn four skills and solve random mazes (about a minute)", _DEMO, "train:demo"),
+    "train": ("run an experiment, or go on with one", _TRAIN, "train:train"),
+    "evaluate": ("test a run again with other settings", _EVALUATE, "evaluate:evaluate"),
+    "report": ("write the page of runs, or draw a figure", _REPORT, "report:report"),
+    "sweep": ("search for good values of an experiment's keys", _SWEEP, "sweep:sweep"),
+    "list": ("list experiments, their keys, or figures", _LIST, "listing:show"),
+}
+_WORDS = {"list": "NAME", "report": "DIR|key=value"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -21,120 +108,45 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: words after the program's name. Default: those of the process.
 
+    Returns:
+        0; 1 if something outside went wrong (a folder, missing data or packages); 2 if the words
+        were wrong; 130 after Ctrl-C; 141 if whoever read the output has stopped.
+
     Example:
         >>> main(["demo", "sede=1"])
         2
     """
     arguments = _parser().parse_args(argv)
-    run: Callable[[argparse.Namespace], int] = arguments.run
-    return run(arguments)
+    module, _, name = _VERBS[arguments.verb][2].partition(":")
+    run: Callable[[Sequence[str]], int] = getattr(
+        importlib.import_module(f"torchrl_hmcts.trainers.command_line.{module}"), name
+    )
+    try:
+        status = run(arguments.words)
+        sys.stdout.flush()
+    except BrokenPipeError:  # e.g. `hmcts list figures | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    return status
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="hmcts", description="Hierarchical Monte Carlo tree search over learned skills."
+        prog="hmcts",
+        description="Hierarchical Monte Carlo tree search over learned skills. Each verb has a "
+        "--help of its own.",
     )
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    raw = argparse.RawDescriptionHelpFormatter
-    demo = verbs.add_parser(
-        "demo",
-        help="learn four skills and solve random mazes with them (about a minute)",
-        description="Train skills in the training mazes, then solve test mazes by planning over "
-        "them. Writes\nmetrics.json, pictures, a GIF and index.html to the folder `out`.",
-        epilog="keys and defaults:\n" + _DEMO.describe(),
-        formatter_class=raw,
-    )
-    demo.add_argument("overrides", nargs="*", metavar="key=value", help="e.g. seed=1 out=runs/one")
-    demo.set_defaults(run=lambda arguments: _run("demo", _DEMO, arguments.overrides))
-    train = verbs.add_parser(
-        "train",
-        help="run an experiment: hmcts train experiment=NAME key=value ...",
-        description="Train and evaluate one experiment. Writes metrics.json, curves.csv, pictures, "
-        "checkpoints\nand index.html to the folder `out`; `resume=true` goes on where a run "
-        "stopped.",
-        epilog="experiments (their keys: hmcts list NAME):\n" + _summaries(),
-        formatter_class=raw,
-    )
-    train.add_argument("words", nargs="+", metavar="key=value", help="experiment=NAME first")
-    train.set_defaults(run=_train)
-    show = verbs.add_parser(
-        "list",
-        help="list the experiments, or the keys of one",
-        description="List the experiments, or the keys of one with their defaults and meaning.",
-    )
-    show.add_argument("experiment", nargs="?", metavar="NAME")
-    show.set_defaults(run=_list)
-    return parser
-
-
-def _train(arguments: argparse.Namespace) -> int:
-    names = [w.partition("=")[2] for w in arguments.words if w.startswith("experiment=")]
-    if len(names) != 1:
-        return _refuse(
-            "train", f"say once which experiment, e.g. experiment={next(iter(EXPERIMENTS))}"
+    for verb, (summary, description, _) in _VERBS.items():
+        filled = description.replace("{keys}", DEMO.describe() if "{keys}" in description else "")
+        made = verbs.add_parser(
+            verb,
+            help=summary,
+            description=filled.replace("{experiments}", summaries()),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-    try:
-        experiment = find_experiment(names[0])
-    except ValueError as error:
-        return _refuse("train", error)
-    overrides = [word for word in arguments.words if not word.startswith("experiment=")]
-    return _run(f"train experiment={experiment.name}", experiment, overrides)
-
-
-def _list(arguments: argparse.Namespace) -> int:
-    if arguments.experiment is None:
-        print(_summaries())
-        return 0
-    try:
-        print(find_experiment(arguments.experiment).describe())
-    except ValueError as error:
-        return _refuse("list", error)
-    return 0
-
-
-def _run(command: str, experiment: Experiment, overrides: Sequence[str]) -> int:
-    """Check the keys, run, and turn what can go wrong for users into one line."""
-    try:
-        config = parse_overrides(experiment.config_class, overrides)
-        _ = experiment.function
-    except ModuleNotFoundError as error:
-        return _missing(error)
-    except ValueError as error:
-        return _refuse(command, error)
-    try:
-        experiment(config)
-    except OSError as error:  # e.g. a folder that cannot be written
-        print(f"hmcts {command}: {error}. Choose another folder with out=DIR.", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print(f"\nhmcts {command}: stopped; {_going_on(command, config)}", file=sys.stderr)
-        return 130
-    return 0
-
-
-def _going_on(command: str, config: Any) -> str:
-    if hasattr(config, "resume"):
-        return f"go on with: hmcts {command} out={config.out} resume=true"
-    return "it starts anew, run it again."
-
-
-def _summaries() -> str:
-    width = max(map(len, EXPERIMENTS))
-    return "\n".join(f"  {name:<{width}}  {e.summary}" for name, e in EXPERIMENTS.items())
-
-
-def _refuse(command: str, message: object) -> int:
-    print(f"hmcts {command}: {message}", file=sys.stderr)
-    return 2
-
-
-def _missing(error: ModuleNotFoundError) -> int:
-    print(
-        f"hmcts needs {error.name}, which is not installed. Install the extra that has it: "
-        "pip install 'torchrl_hmcts[train]'",
-        file=sys.stderr,
-    )
-    return 1
+        made.add_argument("words", nargs="*", metavar=_WORDS.get(verb, "key=value"))
+    return parser
 
 
 if __name__ == "__main__":

@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
+from torchrl_hmcts.arguments import name_arguments
+
 C = TypeVar("C")
 
 NUM_TEST_MAZES = 342
 FRAMES_PER_BATCH = 64
+LOGGERS = ("csv", "tensorboard", "wandb")
 
 
+@name_arguments
 @dataclass
 class DemoConfig:
     """What ``hmcts demo`` does; every value can be given as ``key=value`` on the command line.
@@ -44,6 +48,8 @@ class DemoConfig:
     """Nodes that a search may expand before it gives up."""
     gamma: float = 0.99
     """Discount per base step."""
+    logger: str = "csv"
+    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
     toy: bool = False
     """1,920 base steps of training and 3 mazes, to see in seconds that everything works."""
 
@@ -68,16 +74,41 @@ class DemoConfig:
                 f"train_base_steps={self.train_base_steps} is no whole number of batches of "
                 f"{FRAMES_PER_BATCH} base steps; use a multiple of {FRAMES_PER_BATCH}."
             )
+        check_logger(self.logger)
         if self.mazes > NUM_TEST_MAZES:
             raise ValueError(f"mazes={self.mazes}, but the test split has {NUM_TEST_MAZES} mazes.")
 
 
-def parse_overrides(config_class: type[C], overrides: Sequence[str]) -> C:
+def check_logger(name: str) -> None:
+    """Check the name of a logger.
+
+    Args:
+        name: one of ``LOGGERS``.
+
+    Raises:
+        ValueError: if it is none of them.
+
+    Example:
+        >>> check_logger("csv")
+    """
+    if name not in LOGGERS:
+        raise ValueError(f"logger is one of {', '.join(LOGGERS)}; got {name!r}.")
+
+
+def parse_overrides(
+    config_class: type[C],
+    overrides: Sequence[str],
+    *,
+    base: C | None = None,
+    others: Sequence[str] = (),
+) -> C:
     """Build a configuration from ``key=value`` words, types checked.
 
     Args:
         config_class: a dataclass whose fields all have defaults.
         overrides: words of the command line.
+        base: configuration whose values hold where no word says otherwise. Default: the defaults.
+        others: keys of the same command that belong to no configuration, to be suggested as well.
 
     Returns:
         The configuration.
@@ -92,6 +123,7 @@ def parse_overrides(config_class: type[C], overrides: Sequence[str]) -> C:
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError  # values are read as YAML
 
     names = [field.name for field in fields(config_class)]  # type: ignore[arg-type]
     for word in overrides:
@@ -99,12 +131,33 @@ def parse_overrides(config_class: type[C], overrides: Sequence[str]) -> C:
         if not separator:
             raise ValueError(f"{word!r} is no key=value, e.g. {names[0]}=1.")
         if key not in names:
-            near = difflib.get_close_matches(key, names, n=3, cutoff=0.4) or names
-            raise ValueError(f"Unknown key {key!r}. Did you mean: {', '.join(near)}?")
+            raise ValueError(unknown_key(key, [*names, *others]))
     try:
         merged = OmegaConf.merge(
-            OmegaConf.structured(config_class), OmegaConf.from_dotlist(list(overrides))
+            OmegaConf.structured(config_class if base is None else base),
+            OmegaConf.from_dotlist(list(overrides)),
         )
         return config_class(**{name: getattr(merged, name) for name in names})
+    except YAMLError as error:
+        raise ValueError(
+            f"A value of {list(overrides)} cannot be read: {str(error).splitlines()[0]}. Close "
+            "its quotes and brackets."
+        ) from None
     except OmegaConfBaseException as error:
-        raise ValueError(str(error).splitlines()[0]) from None
+        key = f"{error.full_key}: " if getattr(error, "full_key", None) else ""
+        raise ValueError(key + str(error).splitlines()[0]) from None
+
+
+def unknown_key(key: str, known: Sequence[str]) -> str:
+    """Return the sentence that refuses a key and names the nearest ones.
+
+    Args:
+        key: what was typed.
+        known: all keys.
+
+    Example:
+        >>> unknown_key("sede", ["seed", "out"])
+        "Unknown key 'sede'. Did you mean: seed?"
+    """
+    near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or list(known)
+    return f"Unknown key {key!r}. Did you mean: {', '.join(near)}?"

@@ -12,13 +12,16 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
+from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudget
+from torchrl_hmcts.trainers.checkpoints import write_text
 from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.figures.animation import write_episode_gif
 from torchrl_hmcts.trainers.figures.plots import plot_losses, plot_search, plot_skill_fan
 from torchrl_hmcts.trainers.figures.report import versions, write_page
@@ -46,7 +49,9 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     begin = time.perf_counter()
 
     print(f"Learning {config.num_skills} skills in {config.train_base_steps:,} base steps ...")
-    trainer, loss = train_worker(config)
+    logger = make_logger(config)
+    trainer, loss = train_worker(config, save_dir=out / "checkpoints", logger=logger)
+    logger.close()
     train_seconds = time.perf_counter() - begin
     policy = SkillPolicy(loss.actor_network, deterministic=True)
 
@@ -95,7 +100,7 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     plot_search(planner.last_search, real.base_env, out / "search.png")
     write_episode_gif(real.base_env, starts[shown], episodes[shown], out / "episode.gif")
     metrics["seconds"] = round(time.perf_counter() - begin, 2)
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     write_page(
         out / "index.html",
         title="Solving random mazes by planning over learned skills",
@@ -144,11 +149,15 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
     return env.make_state(torch.arange(num_mazes), centers[:, 0], centers[:, 1])
 
 
-def train_worker(config: DemoConfig) -> tuple[DIAYNTrainer, Any]:
+def train_worker(
+    config: DemoConfig, *, save_dir: Path | None = None, logger: Logger | None = None
+) -> tuple[DIAYNTrainer, Any]:
     """Train the demo's worker; return the trainer with its history, and the loss with its networks.
 
     Args:
         config: see :class:`~torchrl_hmcts.trainers.config.DemoConfig`.
+        save_dir: folder of the checkpoint that is written at the end. Default: none.
+        logger: of TorchRL; gets the training's values. Default: none.
     """
     env = make_training_env(num_skills=config.num_skills, skill_steps=config.skill_steps)
     loss = DIAYNTrainer.make_loss(env, config.num_skills, seed=config.seed)
@@ -159,6 +168,8 @@ def train_worker(config: DemoConfig) -> tuple[DIAYNTrainer, Any]:
         frames_per_batch=FRAMES_PER_BATCH,
         seed=config.seed,
         progress=lambda total: tqdm(total=total, desc="train", unit="step", disable=None),
+        save_dir=save_dir,
+        logger=logger,
     )
     trainer.train()
     return trainer, loss

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule, SoftUpdate
@@ -17,8 +17,10 @@ from torchrl.trainers import (
     ReplayBufferTrainer,
     TargetNetUpdaterHook,
     Trainer,
+    UpdateWeights,
 )
 
+from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, DiscreteSkillSACLoss, SkillObjective
 from torchrl_hmcts.trainers.resume import ResumableTrainer
@@ -35,6 +37,7 @@ class Progress(Protocol):
     def close(self) -> object: ...
 
 
+@name_arguments
 class DIAYNTrainer(ResumableTrainer):
     """Trains skills off-policy with any skill loss, on TorchRL's Trainer and Collector.
 
@@ -46,13 +49,13 @@ class DIAYNTrainer(ResumableTrainer):
     What is logged, per batch the mean over its updates, in :attr:`history` and to the ``logger``
     with base steps as x. Figures are the dissertation's.
 
-    ============================  ======================================  =======
-    name                          entry of the loss's output              figure
-    ============================  ======================================  =======
-    ``actor_loss``                ``loss_actor``                          4.6
-    ``critic_1_loss``             ``qvalue_loss_0``                       4.7
-    ``critic_2_loss``             ``qvalue_loss_1``                       4.8
-    ``discriminator_loss``        ``loss_discriminator``                  4.9
+    ============================  ==========================================  =======
+    name                          entry of the loss's output                  figure
+    ============================  ==========================================  =======
+    ``actor_loss``                ``loss_actor``                              4.6
+    ``critic_1_loss``             ``qvalue_loss_0``                           4.7
+    ``critic_2_loss``             ``qvalue_loss_1``                           4.8
+    ``discriminator_loss``        ``loss_discriminator``                      4.9
     ``discriminator_accuracy``    the same; share of skills guessed
     ``entropy``                   the same, of the policy, in nats
     ``critic_loss``               ``loss_qvalue``, both critics
@@ -61,7 +64,7 @@ class DIAYNTrainer(ResumableTrainer):
     ``optim_steps``               updates so far
     ``state_coverage``            cells visited, see :class:`StateCoverage`
     ``state_coverage_total``      the same since the start
-    ============================  ======================================  =======
+    ============================  ==========================================  =======
 
     Any other entry ``loss_x`` is logged as ``x_loss``; all others keep their names. In ``history``
     the entries can also be read by the loss's own names.
@@ -97,6 +100,9 @@ class DIAYNTrainer(ResumableTrainer):
             on as if it had never stopped, see :class:`ResumableTrainer`.
         log_interval (int): base steps between two values that reach the ``logger``. Default ``0``:
             every batch.
+        make_collector (callable): called as ``torchrl.collectors.Collector`` (default) is, with
+            env, policy and keywords; e.g. one that collects in other processes, after each batch of
+            which the weights are sent there. Such a run does not go on exactly.
         **trainer_kwargs: passed to :class:`ResumableTrainer` and ``torchrl.trainers.Trainer``
             (``logger``, ``keep_last``, ``save_trainer_interval``, ...).
 
@@ -145,6 +151,7 @@ class DIAYNTrainer(ResumableTrainer):
         seed: int | None = None,
         save_dir: str | Path | None = None,
         log_interval: int = 0,
+        make_collector: Callable[..., BaseCollector] = Collector,
         **trainer_kwargs: Any,
     ) -> None:
         copies = env.batch_size.numel()
@@ -167,7 +174,7 @@ class DIAYNTrainer(ResumableTrainer):
         def stored(batch: TensorDictBase) -> TensorDictBase:
             return batch.select(*keys, strict=False).reshape(-1)
 
-        collector = Collector(
+        collector = make_collector(
             env,
             SkillPolicy(loss_module.actor_network),
             frames_per_batch=frames_per_batch,
@@ -203,11 +210,21 @@ class DIAYNTrainer(ResumableTrainer):
             **trainer_kwargs,
         )
         self.seed = seed
+        self.run_settings.update(
+            frames_per_batch=frames_per_batch,
+            updates_per_batch=updates_per_batch,
+            batch_size=batch_size,
+            buffer_size=buffer_size,
+            target_tau=target_tau,
+            clip_norm=clip_norm,
+        )
         replay = ReplayBufferTrainer(buffer, batch_size=batch_size)
         self.register_op("batch_process", replay.extend)
         self.register_op("process_optim_batch", replay.sample)
         self.register_op("post_optim", TargetNetUpdaterHook(updater))
         self.register_op("post_optim_complete_log", log_curves)
+        if not isinstance(collector, Collector):  # it has weights of its own
+            self.register_op("post_steps", UpdateWeights(collector, 1))
         coverage.register(self)
         if progress is not None:
             _ProgressHook(self, progress).register(self)

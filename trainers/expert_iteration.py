@@ -14,6 +14,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.trainers import LRSchedulerHook, ReplayBufferTrainer
 
+from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import (
     PUCT,
@@ -85,6 +86,7 @@ def make_guided_planner(
     )
 
 
+@name_arguments
 class SearchCollector:
     """Yields one batch of examples per iteration, from searches at fresh starts of an env.
 
@@ -191,6 +193,7 @@ class SearchCollector:
             setattr(self, name, list(values))
 
 
+@name_arguments
 class ExpertIterationTrainer(ResumableTrainer):
     """Trains the network that guides a planner, on what the planner finds with its help.
 
@@ -312,6 +315,13 @@ class ExpertIterationTrainer(ResumableTrainer):
         )
         self.network = network
         self.planner = planner
+        self.run_settings.update(
+            searches_per_iteration=searches_per_iteration,
+            updates_per_iteration=updates_per_iteration,
+            batch_size=batch_size,
+            buffer_size=buffer_size,
+            clip_norm=clip_norm,
+        )
         replay = ReplayBufferTrainer(buffer, batch_size=batch_size)
         self.register_op("batch_process", replay.extend)
         self.register_op("process_optim_batch", replay.sample)

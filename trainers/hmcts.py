@@ -16,6 +16,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.objectives import LossModule, SoftUpdate
 from torchrl.trainers import TargetNetUpdaterHook
 
+from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MCTSPlanner, SearchBudget
 from torchrl_hmcts.trainers.diayn import Progress, make_skill_optimizer
@@ -26,6 +27,7 @@ from torchrl_hmcts.trainers.skills.rounds import PlanningRounds, RoundRecords, s
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
 
 
+@name_arguments
 class HMCTSTrainer(ResumableTrainer):
     r"""Learns skills and plans over them in turn: the source's Algorithm 3.
 
@@ -241,6 +243,16 @@ class HMCTSTrainer(ResumableTrainer):
             **{"log_interval": -1, **trainer_kwargs},
         )
         self.seed = seed
+        self.run_settings.update(
+            option_steps=option_steps,
+            c_p=c_p,
+            updates_per_step=updates_per_step,
+            batch_size=batch_size,
+            buffer_size=buffer_size,
+            dataset_fraction=dataset_fraction,
+            target_tau=target_tau,
+            clip_norm=clip_norm,
+        )
         self.rounds, self.num_init_samples = rounds, num_init_samples
         self.retrain_interval, self.test_interval = retrain_interval, test_interval
         self.updates_per_step, self.pretrain_updates = updates_per_step, pretrain_updates

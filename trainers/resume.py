@@ -10,6 +10,7 @@ and policies own (:class:`GeneratorStates`) and the curves so far (:class:`Histo
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,18 +20,23 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
-from torchrl.checkpoint import (
-    Checkpoint,
-    CheckpointRotation,
-    GlobalRNGState,
-    StateDictCheckpointAdapter,
-)
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
+
+from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.trainers.checkpoints import (
+    DurableRotation,
+    PlainStateAdapter,
+    check_settings,
+    find_damage,
+    plain_checkpoint,
+)
 
 Generator = torch.Generator | np.random.Generator | random.Random
 
 
+@name_arguments
 class RunningEpisodes:
     """State of the episodes that a collector is in the middle of.
 
@@ -186,11 +192,12 @@ class HistoryState:
 
 
 class ResumableTrainer(Trainer):
-    """A TorchRL ``Trainer`` that resumes exactly.
+    """A TorchRL ``Trainer`` that resumes exactly, and stops before it learns from NaN.
 
     Training to 2 n base steps and training to n, loading in a new process and training to 2 n give
     the same weights, optimiser state, replay buffer, random numbers, counters and curves, bit for
-    bit, if the env's whole state is in its tensordict. Checkpoints are read without pickle.
+    bit, if the env's whole state is in its tensordict. Checkpoints are written so that a crash
+    cannot damage one (:class:`DurableRotation`) and are read without pickle.
 
     Args:
         save_dir (path, optional): folder of the checkpoints; one is written whenever
@@ -199,14 +206,23 @@ class ResumableTrainer(Trainer):
         keep_last (int): checkpoints kept. Default ``2``.
         **trainer_kwargs: passed to ``torchrl.trainers.Trainer``.
 
+    Attributes:
+        run_settings (dict): values that a run must keep when it goes on, by name (JSON). They are
+            written into its checkpoints; :meth:`load` refuses others.
+
     Raises:
         ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
             ``save_trainer_file``.
+        OSError: if ``save_dir`` cannot be written to.
     """
 
     def __init__(
         self, *, save_dir: str | Path | None = None, keep_last: int = 2, **trainer_kwargs: Any
     ) -> None:
+        self.run_settings: dict[str, Any] = {"trainer": type(self).__name__}
+        for part in ("loss_module", "optimizer"):
+            if trainer_kwargs.get(part) is not None:
+                self.run_settings[part] = type(trainer_kwargs[part]).__name__
         if save_dir is not None:
             for other in ("checkpoint_rotation", "save_trainer_file"):
                 if trainer_kwargs.get(other) is not None:
@@ -214,16 +230,16 @@ class ResumableTrainer(Trainer):
                         f"save_dir={str(save_dir)!r} and {other} both say where checkpoints go. "
                         "Pass one of them."
                     )
-            trainer_kwargs["checkpoint_rotation"] = CheckpointRotation(
-                save_dir, keep_last=keep_last
-            )
+            rotation = DurableRotation(save_dir, keep_last=keep_last)
+            rotation.settings = self.run_settings
+            trainer_kwargs["checkpoint_rotation"] = rotation
         if trainer_kwargs.get("checkpoint") is None and not trainer_kwargs.get("save_trainer_file"):
-            trainer_kwargs["checkpoint"] = Checkpoint()
+            trainer_kwargs["checkpoint"] = plain_checkpoint()
         trainer_kwargs.setdefault("optimization_stepper", DetachedStepper())
         checkpoint, buffer = (trainer_kwargs.get(k) for k in ("checkpoint", "replay_buffer"))
         if checkpoint is not None and buffer is not None and "replay_buffer" not in checkpoint:
             # A buffer's own dump() writes a pickle beside the tensors; its state dict needs none.
-            checkpoint.register("replay_buffer", buffer, adapter=StateDictCheckpointAdapter())
+            checkpoint.register("replay_buffer", buffer, adapter=PlainStateAdapter())
         super().__init__(**trainer_kwargs)
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
         self._last_log: dict[str, Any] = {}
@@ -247,44 +263,101 @@ class ResumableTrainer(Trainer):
 
         Args:
             path (path): a checkpoint, or a folder of checkpoints (``save_dir``), of which the
-                newest is taken.
+                newest whole one is taken.
 
         Returns:
             ResumableTrainer: itself.
 
         Raises:
             FileNotFoundError: if there is no checkpoint.
-            CheckpointError: if the checkpoint does not fit, e.g. another number of copies.
+            CheckpointError: if the checkpoint is damaged, of a newer version or of other settings,
+                or does not fit, e.g. another number of copies.
         """
-        self.load_from_file(newest_checkpoint(path))
+        found = newest_checkpoint(path)
+        check_settings(found, self.run_settings)
+        self.load_from_file(found)
         return self
+
+    def compute_loss(self, sub_batch: TensorDictBase) -> TensorDictBase:
+        """Returns the losses of a batch.
+
+        Raises:
+            FloatingPointError: if one is not finite; nothing has been changed by it.
+        """
+        losses = super().compute_loss(sub_batch)
+        for name in losses.keys():
+            if name.startswith("loss") and not math.isfinite(losses.get(name).detach().sum()):
+                raise self.not_finite(name, losses.get(name).detach().sum())
+        return losses
+
+    def not_finite(self, name: str, value: Any) -> FloatingPointError:
+        """Returns the error of a figure that is not finite, which names the last checkpoint."""
+        rotation = self.checkpoint_rotation
+        saved = None if rotation is None else rotation.latest()
+        if saved is None:
+            again = "There is no checkpoint: pass save_dir to have some."
+        else:
+            again = f"The last good checkpoint is {str(saved)!r}: trainer.load() goes on from it."
+        return FloatingPointError(
+            f"{name} is {float(value)} in update {self._optim_count}, after "
+            f"{self.collected_frames} base steps. The update was not applied. {again} Look for "
+            "rewards or observations that are not finite, or lower the learning rate."
+        )
 
 
 def newest_checkpoint(path: str | Path) -> Path:
     """Returns the checkpoint that a path names.
 
     Args:
-        path (path): a checkpoint, or a folder of checkpoints, of which the newest is taken.
+        path (path): a checkpoint, or a folder of checkpoints, of which the newest whole one is
+            taken; a line on stderr names damaged ones.
 
     Raises:
         FileNotFoundError: if there is none.
+        CheckpointError: if none is whole, or a newer version wrote it.
     """
-    if Checkpoint.is_checkpoint(path):
-        return Path(path)
-    found = CheckpointRotation(path, keep_last=1).latest()
+    path = Path(path)
+    if path.is_file() or Checkpoint.is_checkpoint(path):
+        damage = find_damage(path)
+        if damage is not None:
+            raise CheckpointError(
+                f"The checkpoint {str(path)!r} is damaged ({damage}). Pass its folder to go on "
+                "from the newest one that is whole."
+            )
+        return path
+    found = _Reader(path).latest() if path.is_dir() else None
     if found is None:
         raise FileNotFoundError(
             f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to go on "
-            "with, or one of the checkpoint folders in it."
+            "with, or one of the checkpoints in it."
         )
-    return Path(found)
+    return found
+
+
+class _Reader(DurableRotation):
+    """A folder of checkpoints that may be read-only."""
+
+    def __init__(self, directory: Path) -> None:
+        CheckpointRotation.__init__(self, directory, keep_last=1)
 
 
 class DetachedStepper(DefaultOptimizationStepper):
-    """TorchRL's default step; what it logs is kept for the history and must not hold a graph."""
+    """TorchRL's default step, which refuses a gradient that is not finite.
+
+    What it logs is kept for the history and must not hold a graph.
+    """
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         return super().step(trainer, sub_batch).detach()
+
+    def _compute_and_clip_grad_norm(self, optimizer: Any, *clipping: Any) -> float:  # type: ignore[override]
+        norm = super()._compute_and_clip_grad_norm(optimizer, *clipping)
+        if not math.isfinite(norm):
+            optimizer.zero_grad()
+            if isinstance(self._trainer, ResumableTrainer):
+                raise self._trainer.not_finite("The gradient's norm", norm)
+            raise FloatingPointError(f"The gradient's norm is {norm}; it was not applied.")
+        return norm
 
 
 def _find(

@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import AtariOptionPool, RepeatActions, SharedMLP
+from torchrl_hmcts.envs.atari_emulator import AtariEmulator
 from torchrl_hmcts.modules import SkillMLP
-from torchrl_hmcts.planners import PUCT, MaxBackup, MCTSPlanner, SearchBudget
+from torchrl_hmcts.planners.tree import SearchTree
+from torchrl_hmcts.trainers import AtariAgent, AtariSearch
 
 
 def cpu_seconds(pids: list[int]) -> float:
@@ -95,8 +96,6 @@ class Agent:
     """Decision after decision: search, take the chosen option, go on from there."""
 
     def __init__(self, args: argparse.Namespace) -> None:
-        from torchrl_hmcts.envs.atari_emulator import AtariEmulator
-
         num_actions = AtariEmulator(args.game).num_actions
         worker = SharedMLP(args.options, num_actions)
         network = SkillMLP(128, num_actions, args.options, hidden=(128, 128, 128))
@@ -104,25 +103,18 @@ class Agent:
         self.pool = AtariOptionPool(
             args.game, worker, max_steps=args.steps, num_processes=args.processes, seed=0
         )
-        self.planner = MCTSPlanner(
-            self.pool,
-            tree_policy=PUCT(c=2.0, normalize="tree"),
-            backup=MaxBackup(),
-            expand="one",
-            leaves_per_wave=args.leaves,
-            budget=SearchBudget(base_steps=args.frames // 16, until_plan=False),
-            seed=0,
-        )
-        self.td: TensorDictBase = self.pool.reset()
-        self.run(1)
+        search = AtariSearch(ratio=args.ratio, leaves_per_wave=args.leaves)
+        self.agent = AtariAgent(self.pool, search, seed=0)
+        self.frames = args.frames
+        self.run()
 
-    def run(self, decisions: int = 4) -> dict[str, float]:
+    def run(self) -> dict[str, float]:
         pool = self.pool
         began, worked, before = time.perf_counter(), cpu_seconds(pool.pids), pool.num_frames
-        for _ in range(decisions):
-            self.td = pool.step(self.planner(self.td))["next"]
-            if self.td["done"].item():
-                self.td = pool.reset()
+        while pool.num_frames - before < self.frames:
+            if self.agent.progress.done:
+                self.agent.begin()
+            self.agent.play(1)
         seconds, cpu = time.perf_counter() - began, cpu_seconds(pool.pids) - worked
         return rates(pool.num_frames - before, seconds, cpu)
 
@@ -131,8 +123,6 @@ def memory(game: str, nodes: int) -> dict[str, float]:
     """Megabytes of a tree, growing as it must, and of the whole process at most."""
     worker = RepeatActions(18)
     pool = AtariOptionPool(game, worker, max_steps=1, num_processes=0, full_action_space=True)
-    from torchrl_hmcts.planners.tree import SearchTree
-
     row = pool.reset().select("emulator_state").unsqueeze(0)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     tree = SearchTree(1, pool.num_options)
@@ -157,7 +147,8 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--options", type=int, default=3)
     parser.add_argument("--steps", type=int, default=10, help="steps of an option")
-    parser.add_argument("--leaves", type=int, default=16, help="leaves per wave")
+    parser.add_argument("--leaves", type=int, default=4, help="leaves per wave")
+    parser.add_argument("--ratio", type=float, default=25.0, help="simulated steps per real one")
     parser.add_argument("--frames", type=int, default=12_000, help="of one side of a round")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--nodes", type=int, default=0, help="of the tree whose memory is measured")

@@ -70,7 +70,7 @@ class Workers:
             from torchrl_hmcts.trainers.waterworld.worker import make_training_env
 
             loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=seed)
-            loss.load_state_dict(torch.load(str(weights).format(seed=seed)))
+            loss.load_state_dict(torch.load(str(weights).format(seed=seed), weights_only=True))
         self.worker = SkillPolicy(loss.actor_network, deterministic=True)
         self._options = termination
         self._learned: dict[float, TerminationNetwork] = {}

@@ -1,5 +1,6 @@
 """Networks of the worker: actors and critics conditioned on skills, and what tells skills apart."""
 
+from torchrl_hmcts.arguments import name_all_arguments
 from torchrl_hmcts.modules.gaussian_skill_actor import GaussianSkillActor
 from torchrl_hmcts.modules.option_memory import OptionMemory
 from torchrl_hmcts.modules.option_model import OptionModel
@@ -48,3 +49,5 @@ __all__ = [
     "StallTermination",
     "TerminationNetwork",
 ]
+
+name_all_arguments(globals(), __all__)

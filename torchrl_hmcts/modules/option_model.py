@@ -99,6 +99,8 @@ class OptionModel(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         check_positive("OptionModel", max_duration=max_duration, num_models=num_models)
+        if num_models > 1_000:
+            raise ValueError(f"OptionModel needs num_models <= 1,000; got {num_models}.")
         if not delta_keys:
             raise ValueError(
                 "OptionModel needs the state entries that an option changes; delta_keys is empty. "

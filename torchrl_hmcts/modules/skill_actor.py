@@ -9,7 +9,15 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.data import Categorical, Composite, OneHot, TensorSpec
+from torchrl.data import (
+    Binary,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+)
 from torchrl.modules import OneHotCategorical, ProbabilisticActor
 
 from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
@@ -167,11 +175,12 @@ class SkillPolicy(TensorDictModuleBase):
 
 def _leaf_spec(action_spec: TensorSpec, action_key: NestedKey) -> tuple[TensorSpec, bool]:
     """Returns the unbatched leaf spec and whether it is one-hot."""
-    if isinstance(action_spec, Composite):
+    if isinstance(action_spec, Composite) and action_key in action_spec.keys(True, True):
         action_spec = action_spec[action_key]
-    if isinstance(action_spec, OneHot):
+    several = isinstance(action_spec, (Binary, MultiCategorical, MultiOneHot))
+    if isinstance(action_spec, OneHot) and not several:
         return OneHot(int(action_spec.space.n), dtype=action_spec.dtype), True
-    if isinstance(action_spec, Categorical):
+    if isinstance(action_spec, Categorical) and not several:
         return Categorical(int(action_spec.space.n)), False
     raise ValueError(
         "SkillActor chooses among a fixed number of actions, so it needs a Categorical or OneHot "

@@ -274,7 +274,8 @@ def own_weights(hidden: nn.Sequential, last: nn.Linear) -> list[Tensor]:
 def can_stack(layers: Iterable[nn.Module]) -> bool:
     """Returns whether stacked parameters can be run: none but linear layers may have any."""
     others = [layer for layer in layers if type(layer) is not nn.Linear]
-    return not any(True for layer in others for _ in layer.state_dict())
+    # Not by their state dicts, which torch.compile cannot trace.
+    return not any(True for layer in others for _ in (*layer.parameters(), *layer.buffers()))
 
 
 def _linear(weight: Tensor, bias: Tensor, x: Tensor) -> Tensor:

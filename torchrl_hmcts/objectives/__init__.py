@@ -1,5 +1,6 @@
 """Losses of the worker: actor and critics beside interchangeable skill objectives."""
 
+from torchrl_hmcts.arguments import name_all_arguments
 from torchrl_hmcts.objectives.a3c import A3CLoss, NStepReturn, n_step_returns
 from torchrl_hmcts.objectives.dads import SkillDynamicsLoss
 from torchrl_hmcts.objectives.diayn import ContinuousDIAYNLoss, DIAYNLoss
@@ -33,3 +34,5 @@ __all__ = [
     "SkillSACLoss",
     "n_step_returns",
 ]
+
+name_all_arguments(globals(), __all__)

@@ -138,14 +138,17 @@ class NStepReturn(TD1Estimator):
         # One value per step, whatever further dimensions a reward has.
         used = (ends & ~terminated).reshape(*tensordict.shape, -1).any(-1)
         value = self._values(tensordict, params)
-        next_value = torch.zeros_like(value)
-        if used.any():
-            rows = after.select(*network.in_keys, strict=False)[used]
-            missing = [key for key in network.in_keys if rows.get(key, None) is None]
-            rows.update(tensordict.select(*missing)[used])
-            next_value[used] = self._values(
-                rows, params if target_params is None else target_params
-            )
+        following = after.select(*network.in_keys, strict=False)
+        missing = [key for key in network.in_keys if following.get(key, None) is None]
+        following.update(tensordict.select(*missing))
+        if target_params is None:
+            target_params = params
+        if torch.compiler.is_compiling():  # shapes must not depend on the data
+            next_value = self._values(following, target_params)
+        else:
+            next_value = torch.zeros_like(value)
+            if used.any():
+                next_value[used] = self._values(following[used], target_params)
         discount = torch.as_tensor(self.gamma, device=reward.device).expand_as(reward)
         duration = tensordict.get(keys.steps_to_next_obs, None)
         if duration is not None:
@@ -190,7 +193,8 @@ class A3CLoss(A2CLoss):
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
-        critic_network (TensorDictModule): writes ``state_value`` ``[*B, T, 1]``.
+        critic_network (TensorDictModule): writes ``state_value`` ``[*B, T, 1]``, or the value as
+            its first entry of another name.
         gamma (float): discount per base step, in ``(0, 1]``. Default 0.99.
         entropy_coeff (float): :math:`c_H \ge 0`, nats to return. Default 0.01, the paper's.
         critic_coeff (float): :math:`c_v > 0`. Default 0.5: half the squared error.
@@ -273,8 +277,11 @@ class A3CLoss(A2CLoss):
             loss_critic_type=loss_critic_type,
             **kwargs,
         )
+        self._discount = gamma
+        if self.tensor_keys.value not in map(unravel_key, critic_network.out_keys):
+            self.tensor_keys.value = unravel_key(critic_network.out_keys[0])
         # Built at once: built lazily it would add entries to the state dict of a run under way.
-        self.make_value_estimator(gamma=gamma)
+        self.make_value_estimator()
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -282,13 +289,13 @@ class A3CLoss(A2CLoss):
         actions = keys.action if isinstance(keys.action, list) else [keys.action]
         read = [*self.actor_network.in_keys, *self.critic_network.in_keys]
         after = [keys.reward, keys.done, keys.terminated, *self.critic_network.in_keys]
-        return list(
-            dict.fromkeys([*actions, *read, *(unravel_key(("next", key)) for key in after)])
-        )
+        after = [unravel_key(("next", key)) for key in after]
+        return list(dict.fromkeys([*actions, *read, *after, unravel_key(keys.duration)]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
-        """Builds a value estimator; by default :class:`NStepReturn`, which takes a ``gamma``."""
+        """Builds a value estimator, by default :class:`NStepReturn`, with the loss's own gamma."""
         value_type = self.default_value_estimator if value_type is None else value_type
+        hyperparams.setdefault("gamma", self._discount)
         if isinstance(value_type, type) and not isinstance(value_type, ValueEstimators):
             hyperparams.setdefault("value_network", self.critic_network)
         out = super().make_value_estimator(value_type, **hyperparams)

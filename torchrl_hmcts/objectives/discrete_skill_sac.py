@@ -106,6 +106,8 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    # The parent has a list, with which select_out_keys fails in every class derived from it.
+    out_keys = TensorDictModuleBase.out_keys
 
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams

@@ -15,12 +15,13 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_hmcts.objectives.priority import PriorityWeights
 from torchrl_hmcts.objectives.skill_objective import check_reduction
 
 OptionPolicy = Callable[[TensorDictBase], Tensor]
 
 
-class OptionTerminationLoss(LossModule):
+class OptionTerminationLoss(PriorityWeights, LossModule):
     r"""The termination gradient: end an option where another one promises more.
 
     .. math::
@@ -196,7 +197,7 @@ class OptionTerminationLoss(LossModule):
         return out
 
 
-class IntraOptionQLoss(LossModule):
+class IntraOptionQLoss(PriorityWeights, LossModule):
     r"""Values of options that end with a learned probability, from parts of their way.
 
     .. math::

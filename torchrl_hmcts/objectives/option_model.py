@@ -17,10 +17,11 @@ from torch.nn import functional as F
 from torchrl.objectives import LossModule, distance_loss
 
 from torchrl_hmcts.modules.option_model import OptionModel
+from torchrl_hmcts.objectives.priority import PriorityWeights
 from torchrl_hmcts.objectives.skill_objective import check_reduction
 
 
-class OptionModelLoss(LossModule):
+class OptionModelLoss(PriorityWeights, LossModule):
     r"""Regression of an option's outcome on recorded macro transitions, for every member.
 
     With normalised targets :math:`y` (see :meth:`OptionModel.targets`), predictions

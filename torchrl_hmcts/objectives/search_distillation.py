@@ -14,12 +14,13 @@ from torch import Tensor
 from torch.nn import functional as F
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.objectives.priority import PriorityWeights
 from torchrl_hmcts.objectives.skill_objective import check_reduction
 
 _SMALLEST = 1e-30  # whose logarithm is still a number in float32
 
 
-class ExpertIterationLoss(LossModule):
+class ExpertIterationLoss(PriorityWeights, LossModule):
     r"""Cross-entropy to the options a search preferred, and the error of the values it found.
 
     .. math::

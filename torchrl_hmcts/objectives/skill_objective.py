@@ -15,9 +15,10 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
+from torchrl_hmcts.objectives.priority import PriorityWeights
 
 
-class SkillObjective(LossModule):
+class SkillObjective(PriorityWeights, LossModule):
     r"""Base class of skill objectives: the loss of a representation and the reward it gives.
 
     .. math:: L(\phi; s, z, s'), \qquad r_\phi(s, z, s')

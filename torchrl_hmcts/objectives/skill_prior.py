@@ -153,11 +153,12 @@ class SkillPriorLoss(LossModule):
         skill = tensordict.get(self.tensor_keys.skill).flatten()
         reward = tensordict.get(("next", self.tensor_keys.reward)).flatten()
         on = self.prior.active()[skill]  # a skill that is switched off has log p(z) = -inf
-        skill, reward = skill[on], reward[on].to(self.mean_reward)
+        reward = reward.to(self.mean_reward)
         if self.prior_in_reward:
             reward = reward + self.prior.log_probs().to(reward)[skill]
-        count = torch.zeros_like(self.mean_reward).index_add_(0, skill, torch.ones_like(reward))
-        total = torch.zeros_like(self.mean_reward).index_add_(0, skill, reward)
+        # Masked, not selected: torch.compile wants shapes that do not depend on the data.
+        count = torch.zeros_like(self.mean_reward).index_add_(0, skill, on.to(reward))
+        total = torch.zeros_like(count).index_add_(0, skill, reward.masked_fill(~on, 0.0))
         batch_mean = total / count.clamp_min(1.0)
         moved = self.mean_reward.lerp(batch_mean, 1.0 - self.decay)
         moved = torch.where(self.seen, moved, batch_mean)
@@ -167,8 +168,8 @@ class SkillPriorLoss(LossModule):
 
     def skill_rewards(self) -> Tensor:
         """Returns the running mean reward of each skill, ``[Z]``; unseen ones count as average."""
-        known = self.mean_reward[self.seen]
-        average = known.mean() if known.numel() else self.mean_reward.new_zeros(())
+        known = self.mean_reward.masked_fill(~self.seen, 0.0)
+        average = known.sum() / self.seen.sum().clamp_min(1)
         return torch.where(self.seen, self.mean_reward, average)
 
     @dispatch

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,12 +12,11 @@ from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
 from torchrl_hmcts.objectives.functional import run_network, takes_weights
+from torchrl_hmcts.objectives.priority import PriorityWeights
 from torchrl_hmcts.objectives.skill_objective import SkillObjective, check_reduction
 
-_Base: Any = torch.nn.Module if TYPE_CHECKING else object
 
-
-class TrainsObjective(_Base):
+class TrainsObjective(PriorityWeights):
     """What the discrete and the continuous loss share: they train a SkillObjective as well."""
 
     objective: SkillObjective

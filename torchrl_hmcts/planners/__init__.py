@@ -1,5 +1,6 @@
 """The manager: Monte Carlo tree search over the options of a macro environment."""
 
+from torchrl_hmcts.arguments import name_all_arguments
 from torchrl_hmcts.planners.array_search import Root, Transition, tree_search
 from torchrl_hmcts.planners.backups import MaxBackup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
@@ -68,3 +69,5 @@ __all__ = [
     "search_examples",
     "tree_search",
 ]
+
+name_all_arguments(globals(), __all__)

@@ -1,5 +1,6 @@
 """Transforms: skills, their displacement and reward, options, and subgoals."""
 
+from torchrl_hmcts.arguments import name_all_arguments
 from torchrl_hmcts.transforms.displacement import DisplacementTransform
 from torchrl_hmcts.transforms.goal_plans import PlansGoals
 from torchrl_hmcts.transforms.intrinsic_reward import DIAYNReward, SkillReward
@@ -22,3 +23,5 @@ __all__ = [
     "StallTransform",
     "SubgoalTransform",
 ]
+
+name_all_arguments(globals(), __all__)

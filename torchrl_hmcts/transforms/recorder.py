@@ -103,8 +103,14 @@ class OptionRecorder(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         block = next_tensordict.pop(OptionTrajectory.KEY)  # [*B, T]
-        # Its own copy: a planner may use the memory of its options again.
-        skill = tensordict.get(self.skill_key).clone()
+        skill = tensordict.get(self.skill_key, None)
+        if skill is None:
+            raise KeyError(
+                f"OptionRecorder found no skill under {self.skill_key!r}, where the "
+                "OptionTransform before it tells the worker its option. Give both the same "
+                "skill_key, and put both on the same side of a SerialEnv or ParallelEnv."
+            )
+        skill = skill.clone()  # its own: a planner may use the memory of its options again
         self._blocks.append((block.reshape(-1, block.shape[-1]), skill.reshape(-1)))
         self.num_base_steps += int(block.get(OptionTrajectory.MASK_KEY).sum())
         if self.replay_buffer is not None:

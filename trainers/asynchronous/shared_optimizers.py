@@ -10,6 +10,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 # Those whose state after a step with zero gradients is the state they start from.
+from torchrl_hmcts.arguments import name_arguments
+
 _SHAREABLE = (
     torch.optim.Adagrad,
     torch.optim.Adam,
@@ -89,6 +91,7 @@ def _build_state(optimizer: Optimizer, parameters: list[Tensor]) -> None:
         group["weight_decay"] = value
 
 
+@name_arguments
 class SharedRMSprop(Optimizer):
     r"""RMSprop with one shared mean of squared gradients, as in A3C.
 
@@ -174,6 +177,7 @@ class SharedRMSprop(Optimizer):
         return loss
 
 
+@name_arguments
 class SharedAdam(torch.optim.Adam):
     """torch's Adam with its moments and step count in shared memory.
 

@@ -18,7 +18,9 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import draw_first_person
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
+from torchrl_hmcts.trainers.checkpoints import write_text
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.figures.lab_figures import (
     frames_curve,
     plot_frames_curves,
@@ -40,7 +42,7 @@ from torchrl_hmcts.trainers.lab.script import ShortestPathScript
 from torchrl_hmcts.trainers.lab.training import TrainedWorker, curve_script_frames, train_worker
 from torchrl_hmcts.trainers.lab.worker import held_out_seeds, make_starts
 
-_TOY: dict[str, Any] = {
+TOY: dict[str, Any] = {
     "mazes": 4,
     "train_frames": 4_096,
     "init_options": 8,
@@ -81,17 +83,20 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
         Dissertation, chapter 4.
     """
     if config.toy:
-        config = dataclasses.replace(config, **_TOY)
+        config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
     print(f"Learning {config.num_skills} skills in {config.train_frames:,} frames ...", flush=True)
+    logger = make_logger(config)
     trained = train_worker(
         config,
         save_dir=out / "checkpoints",
+        logger=logger,
         progress=lambda total: tqdm(total=total if total < 2**31 - 1000 else None, disable=None),
     )
+    logger.close()
     curve = frames_curve(trained.tests, config.frames_per_step, config.max_frames)
     _write_curves(trained, curve, config, out / "curves.csv")
     worker = trained.policy
@@ -119,7 +124,7 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     print("Drawing ...", flush=True)
     draw(config, trained, out, unsolved=test["unsolved"])
     metrics["seconds"] = round(time.perf_counter() - begin, 1)
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     title = "DeepMind Lab's random maze, by planning over learned skills"
     write_page(out / "index.html", title=title, metrics=metrics, pictures=_PICTURES)
     print(

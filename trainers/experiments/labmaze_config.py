@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.trainers.config import check_logger
+
 _ALGORITHMS = ("diayn", "hmcts")
+_COLLECTORS = ("local", "ray")
 BATCH_STEPS = 64  # base steps of a batch of DIAYN's training
 
 
+@name_arguments
 @dataclass
 class LabMazeConfig:
     """What ``hmcts train experiment=labmaze`` does.
@@ -72,6 +77,11 @@ class LabMazeConfig:
     """Test mazes to solve where clock and friction differ from the model's, for each sign."""
     robust_error: float = 0.05
     """Share by which they differ."""
+    logger: str = "csv"
+    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
+    collector: str = "local"
+    """Where the worker acts for its training: "local" in this process, or "ray" in a process of a
+    Ray cluster (with algorithm=diayn; a run then does not go on exactly)."""
     resume: bool = False
     """Go on from the newest checkpoint in `out`, if there is one."""
     toy: bool = False
@@ -99,6 +109,14 @@ class LabMazeConfig:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
         if self.algorithm not in _ALGORITHMS:
             raise ValueError(f"algorithm is one of {_ALGORITHMS}; got {self.algorithm!r}.")
+        check_logger(self.logger)
+        if self.collector not in _COLLECTORS:
+            raise ValueError(f"collector is one of {_COLLECTORS}; got {self.collector!r}.")
+        if self.collector == "ray" and self.algorithm != "diayn":
+            raise ValueError(
+                f"collector='ray' goes with algorithm='diayn'; got {self.algorithm!r}, whose "
+                "searches need the env in this process."
+            )
         if self.size < 5 or self.size % 2 == 0:
             raise ValueError(f"size must be odd and at least 5 cells; got {self.size}.")
         for name in ("option_frames", "skill_frames"):

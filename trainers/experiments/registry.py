@@ -12,6 +12,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 
+class ExperimentError(ValueError):
+    """What an experiment was asked for does not fit what is there; the message says it all."""
+
+
 @dataclass(frozen=True)
 class Experiment:
     """One experiment: what it shows, how it is set up, and what runs it.
@@ -21,6 +25,11 @@ class Experiment:
         summary: one line for the list.
         config: dataclass of its keys, as ``".module:Class"``, relative to this package.
         run: function of that configuration which returns the figures, as ``".module:function"``.
+        evaluate: function of a configuration, whose ``out`` is the folder of a run, that tests the
+            newest checkpoint there and returns the figures; for ``hmcts evaluate``. Default: none.
+        objective: figure that a sweep improves, e.g. ``"test.solved"``, larger is better; with a
+            minus before it, smaller is better. Default: none, the user has to name one.
+        progress: logged value by which a sweep gives up trials early. Default: none.
 
     Example:
         >>> find_experiment("waterworld_goals").config_class(seed=3).seed
@@ -31,6 +40,9 @@ class Experiment:
     summary: str
     config: str
     run: str
+    evaluate: str = ""
+    objective: str = ""
+    progress: str = ""
 
     @property
     def config_class(self) -> Any:
@@ -42,6 +54,22 @@ class Experiment:
         """What runs it; loads torch and all that the experiment needs."""
         run: Callable[[Any], dict[str, Any]] = _load(self.run)
         return run
+
+    @property
+    def evaluation(self) -> Callable[[Any], dict[str, Any]]:
+        """What evaluates a run again.
+
+        Raises:
+            ValueError: if the experiment has nothing of the kind.
+        """
+        if not self.evaluate:
+            raise ValueError(
+                f"Runs of {self.name} cannot be evaluated again. Experiments whose runs can: "
+                + ", ".join(e.name for e in ALL_EXPERIMENTS.values() if e.evaluate)
+                + "."
+            )
+        evaluate: Callable[[Any], dict[str, Any]] = _load(self.evaluate)
+        return evaluate
 
     def __call__(self, config: Any) -> dict[str, Any]:
         """Run the experiment; return its figures."""
@@ -67,21 +95,47 @@ EXPERIMENTS = {
             "chapter 3's goal-based agent: tree search over tiles sets goals, A3C reaches them",
             ".waterworld_config:WaterworldGoalsConfig",
             ".waterworld:run_waterworld",
+            ".evaluations:evaluate_waterworld",
+            objective="test.solved_share",
+            progress="eval_solved_share",
         ),
         Experiment(
             "waterworld_a3c",
             "chapter 3's comparison: A3C alone on the same mazes, network and budget",
             ".waterworld_config:WaterworldA3CConfig",
             ".waterworld:run_waterworld",
+            ".evaluations:evaluate_waterworld",
+            objective="test.solved_share",
+            progress="eval_solved_share",
         ),
         Experiment(
             "labmaze",
             "chapter 4: tree search over skills learned by DIAYN in DeepMind Lab's random maze",
             ".labmaze_config:LabMazeConfig",
             ".labmaze:run_labmaze",
+            ".evaluations:evaluate_labmaze",
+            objective="test.solved",
+            progress="test_solved",
+        ),
+        Experiment(
+            "atari",
+            "chapter 5: tree search over options on the RAM of an Atari game",
+            ".atari_config:AtariConfig",
+            ".atari:run_atari",
+            objective="score_max",
         ),
     )
 }
+
+DEMO = Experiment(
+    "demo",
+    "learn four skills and solve random mazes",
+    "..config:DemoConfig",
+    "..demo:run_demo",
+    ".evaluations:evaluate_demo",
+)
+ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS}
+"""The experiments of ``hmcts train``, and the demo: whatever leaves a folder of a run."""
 
 
 def find_experiment(name: str) -> Experiment:

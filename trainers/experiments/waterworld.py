@@ -20,7 +20,9 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.trainers.a3c import A3CTrainer
+from torchrl_hmcts.trainers.checkpoints import write_text
 from torchrl_hmcts.trainers.demo import make_starts
+from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.experiments.waterworld_config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
@@ -40,7 +42,7 @@ _GOAL_KEYS = (
     "r_goal_met",
     "r_goal_divergence",
 )
-_TOY: dict[str, Any] = {
+TOY: dict[str, Any] = {
     "total_frames": 4_000,
     "num_learners": 0,
     "test_mazes": 3,
@@ -103,7 +105,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
         Dissertation, chapter 3.
     """
     if config.toy:
-        config = dataclasses.replace(config, **_TOY)
+        config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -119,6 +121,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
             "episode_steps": float(test.base_steps.double().mean()),
         }
 
+    logger = make_logger(config)
     trainer = A3CTrainer(
         partial(make_agent_env, config, None, (config.envs_per_learner,)),
         loss,
@@ -129,10 +132,13 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
         clip_norm=config.clip_norm,
         evaluate=evaluate,
         eval_interval=config.eval_interval,
+        logger=logger,
         save_dir=out / "checkpoints",
         progress=lambda total: tqdm(total=total, desc="train", unit="step", disable=None),
         seed=config.seed,
     )
+    kept = ("seed", "gamma", "entropy_coeff", "critic_coeff", "hidden", "max_episode_steps")
+    trainer.run_settings.update({name: getattr(config, name) for name in kept})
     if config.resume:
         trainer.load(out / "checkpoints")
     name = "the worker of the goal-based agent" if with_goals else "A3C without goals"
@@ -140,6 +146,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
     begin = time.perf_counter()
     history = trainer.train()
     train_seconds = time.perf_counter() - begin
+    logger.close()
     write_curves(history, out / "curves.csv")
 
     print(f"Testing in {config.test_mazes} mazes it has never seen ...", flush=True)
@@ -158,7 +165,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
             metrics["test"][f"{key}_mean"] = round(float(sampled.last[key].double().mean()), 3)
     metrics["config"] = dataclasses.asdict(config)
     metrics["versions"] = versions()
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     pictures = {"learning.png": "Test mazes solved and base steps of an episode while it learns."}
     plot_learning_curves(
         {name: [learning_curve(history)]},

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_hmcts.trainers.config import NUM_TEST_MAZES
+from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.trainers.config import NUM_TEST_MAZES, check_logger
 
 
+@name_arguments
 @dataclass
 class WaterworldA3CConfig:
     """What ``hmcts train experiment=waterworld_a3c`` does; each field is a key.
@@ -50,6 +52,8 @@ class WaterworldA3CConfig:
     """Base steps of training between two points of the test curve."""
     eval_mazes: int = 64
     """Test mazes of a point of the curve."""
+    logger: str = "csv"
+    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
     toy: bool = False
     """Seconds instead of minutes: 4,000 base steps and 3 mazes, to see that everything works."""
 
@@ -77,6 +81,7 @@ class WaterworldA3CConfig:
                 raise ValueError(f"{name} must not be negative; got {getattr(self, name)}.")
         if not 0.0 < self.gamma <= 1.0:
             raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")
+        check_logger(self.logger)
         for name in ("test_mazes", "eval_mazes"):
             if getattr(self, name) > NUM_TEST_MAZES:
                 raise ValueError(
@@ -84,6 +89,7 @@ class WaterworldA3CConfig:
                 )
 
 
+@name_arguments
 @dataclass
 class WaterworldGoalsConfig(WaterworldA3CConfig):
     """What ``hmcts train experiment=waterworld_goals`` does; each field is a key.

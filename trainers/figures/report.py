@@ -1,8 +1,9 @@
-"""The page of a run: its figures and pictures in one HTML file."""
+"""The page of a run: its figures, pictures, curves and config in one HTML file."""
 
 from __future__ import annotations
 
-import html
+import json
+import os
 import platform
 from collections.abc import Mapping
 from importlib import metadata
@@ -10,18 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts import __version__
+from torchrl_hmcts.trainers.checkpoints import write_text
+from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
 
-_STYLE = """
-:root { color-scheme: light dark; --line: #d4d4d8; }
-body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 68rem; padding: 1rem; }
-h1 { font-size: 1.5rem; line-height: 1.25; }
-figure { margin: 1.5rem 0; }
-img { max-width: 100%; height: auto; border: 1px solid var(--line); background: #fff; }
-figcaption { color: #71717a; font-size: .95rem; }
-table { border-collapse: collapse; width: 100%; }
-td { border-bottom: 1px solid var(--line); padding: .3rem .5rem; overflow-wrap: anywhere; }
-td:last-child { text-align: right; font-variant-numeric: tabular-nums; }
-"""
+_PACKAGES = ("torch", "torchrl", "tensordict", "numpy")
 
 
 def versions() -> dict[str, str]:
@@ -29,61 +22,75 @@ def versions() -> dict[str, str]:
 
     Example:
         >>> sorted(versions())
-        ['python', 'torch', 'torchrl_hmcts']
+        ['numpy', 'python', 'tensordict', 'torch', 'torchrl', 'torchrl_hmcts']
     """
     return {
         "torchrl_hmcts": __version__,
-        "torch": metadata.version("torch"),
+        **{name: metadata.version(name) for name in _PACKAGES},
         "python": platform.python_version(),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """Return what a run's times depend on; nothing that names the machine or its folders.
+
+    Example:
+        >>> sorted(machine())
+        ['cpus', 'platform']
+    """
+    return {
+        "cpus": os.cpu_count(),
+        "platform": f"{platform.system()} {platform.machine()}".strip(),
     }
 
 
 def write_page(
     path: Path, *, title: str, metrics: Mapping[str, Any], pictures: Mapping[str, str]
 ) -> None:
-    """Write a page that shows figures and pictures; whatever it shows is escaped.
+    """Write a run's page, and beside it what it takes to write it anew; everything is escaped.
 
     Args:
-        path: file to write; pictures lie beside it.
+        path: file to write; pictures, curves and ``run.json`` lie beside it.
         title: heading of the page.
-        metrics: figures by name; nested mappings become groups of rows.
+        metrics: figures by name; nested mappings become tables of their own. The entries
+            ``"config"`` and ``"versions"`` are shown where there is no ``run.json``.
         pictures: caption of each picture file.
     """
-    escape = html.escape
-    figures = "\n".join(
-        f'<figure><img src="{escape(name)}" alt="{escape(caption)}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-        for name, caption in pictures.items()
-    )
-    rows = "\n".join(
-        f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>"
-        for name, value in _flatten(metrics)
-    )
-    path.write_text(
-        f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{_STYLE}</style>
-</head>
-<body>
-<h1>{escape(title)}</h1>
-{figures}
-<h2>Figures</h2>
-<table>{rows}</table>
-</body>
-</html>
-"""
-    )
+    content = {"title": title, "pictures": dict(pictures)}
+    write_text(path.parent / "page.json", json.dumps(content, indent=1) + "\n")
+    run = RunFolder(path.parent)
+    if any((path.parent / name).is_file() for name in ("run.json", "metrics.json")):
+        run = read_run(path.parent)
+    for name in ("config", "versions"):
+        run.record.setdefault(name, metrics.get(name, {}))
+    run.metrics = {k: v for k, v in metrics.items() if k not in ("config", "versions")}
+    run.title, run.pictures = title, dict(pictures)
+    write_text(path, render_run(run))
 
 
-def _flatten(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    rows: list[tuple[str, str]] = []
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            rows += _flatten(value, f"{prefix}{name}.")
-        else:
-            rows.append((prefix + name, f"{value:,}" if isinstance(value, int) else str(value)))
-    return rows
+def write_run_page(path: str | Path, out: str | Path | None = None) -> Path:
+    """Write the page of a run from what is in its folder, finished or not.
+
+    Args:
+        path: the folder.
+        out: file to write; pictures are embedded then. Default: ``index.html`` in the folder,
+            beside its pictures.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: if it is no folder of a run.
+    """
+    run = read_run(path)
+    file = run.path / "index.html" if out is None else Path(out)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_text(file, render_run(run, embed=out is not None))
+    return file
+
+
+def render_run(run: RunFolder, *, embed: bool = False) -> str:
+    """Return the page of a run; see :func:`~torchrl_hmcts.trainers.figures.run_page.run_page`."""
+    from torchrl_hmcts.trainers.figures.run_page import run_page  # draws: loads matplotlib
+
+    return run_page(run, embed=embed)

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.record.loggers import Logger
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.objectives import DiscreteSkillSACLoss
@@ -21,6 +23,7 @@ from torchrl_hmcts.trainers.experiments.labmaze_config import (
     BATCH_STEPS,
     LabMazeConfig,
 )
+from torchrl_hmcts.trainers.experiments.ray_collector import make_ray_collector
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.trainers.lab.evaluation import make_maze_env, make_planner
 from torchrl_hmcts.trainers.lab.script import ShortestPathScript
@@ -38,6 +41,20 @@ from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform
 
 _CURVE_EXPANSIONS = 300  # of a search while the worker learns
+_KEPT = (  # by a run that goes on
+    "seed",
+    "algorithm",
+    "num_skills",
+    "option_frames",
+    "frames_per_step",
+    "updates_per_step",
+    "skill_frames",
+    "init_options",
+    "retrain_interval",
+    "round_expansions",
+    "novelty_radius",
+    "gamma",
+)
 
 
 @dataclass
@@ -67,6 +84,7 @@ def train_worker(
     *,
     save_dir: str | Path | None = None,
     progress: Callable[..., Progress] | None = None,
+    logger: Logger | None = None,
 ) -> TrainedWorker:
     """Train a worker as the configuration says.
 
@@ -74,6 +92,8 @@ def train_worker(
         config: of the experiment; with ``resume`` it goes on from the newest checkpoint.
         save_dir: folder of the checkpoints. Default: none are written.
         progress: makes a progress bar, e.g. ``tqdm.tqdm``.
+        logger: of TorchRL; gets the training's values and, as ``test_solved`` and ``test_frames``,
+            those of the tests on the way. Default: none.
 
     Reference:
         Dissertation, algorithm 3 and figures 4.6 to 4.10.
@@ -81,7 +101,8 @@ def train_worker(
     begin = time.process_time()
     loss = make_worker_loss(config.num_skills, seed=config.seed)
     make = _make_hmcts if config.algorithm == "hmcts" else _make_diayn
-    trainer, tests = make(config, loss, save_dir, progress)
+    trainer, tests = make(config, loss, save_dir, progress, logger)
+    trainer.run_settings.update({name: getattr(config, name) for name in _KEPT})
     if config.resume and save_dir is not None and any(Path(save_dir).glob("*")):
         trainer.load(save_dir)
     trainer.train()
@@ -108,6 +129,7 @@ def _make_hmcts(
     loss: DiscreteSkillSACLoss,
     save_dir: str | Path | None,
     progress: Callable[..., Progress] | None,
+    logger: Logger | None,
 ) -> tuple[ResumableTrainer, RoundRecords]:
     make_env = partial(make_lab_env, num_steps=config.frames_per_step, max_frames=config.max_frames)
     options = config.num_skills * config.option_steps
@@ -140,6 +162,7 @@ def _make_hmcts(
         total_frames=config.train_steps,
         save_dir=save_dir,
         progress=progress,
+        logger=logger,
         seed=config.seed,
     )
     return trainer, trainer.test_records
@@ -150,6 +173,7 @@ def _make_diayn(
     loss: DiscreteSkillSACLoss,
     save_dir: str | Path | None,
     progress: Callable[..., Progress] | None,
+    logger: Logger | None,
 ) -> tuple[ResumableTrainer, RoundRecords]:
     env = make_training_env(
         num_skills=config.num_skills,
@@ -166,6 +190,8 @@ def _make_diayn(
         save_dir=save_dir,
         save_trainer_interval=interval,
         progress=progress,
+        logger=logger,
+        make_collector=make_ray_collector if config.collector == "ray" else Collector,
         seed=config.seed,
     )
     tests = CurveTests(trainer, config, interval)
@@ -215,6 +241,15 @@ class CurveTests:
             )
             results = plan_and_carry_out(planner, self.real, self.starts)
         self.records.add(results, np.arange(len(results.solved)), steps)
+        logger = self.trainer.logger
+        if logger is not None:
+            frames = np.where(
+                results.solved,
+                results.episode_steps * self.config.frames_per_step,
+                self.config.max_frames,
+            )
+            logger.log_scalar("test_solved", float(results.solved.mean()), step=steps)
+            logger.log_scalar("test_frames", float(frames.mean()), step=steps)
 
     def state_dict(self) -> dict[str, Any]:
         return {"at": self._at, "records": self.records.state_dict()}

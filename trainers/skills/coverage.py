@@ -15,7 +15,10 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.trainers import Trainer, TrainerHookBase
 
+from torchrl_hmcts.arguments import name_arguments
 
+
+@name_arguments
 class StateCoverage(TrainerHookBase):
     r"""Counts the distinct cells of an entry that were visited: lately, and since the start.
 

@@ -13,11 +13,13 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.trainers import Trainer, TrainerHookBase
 
+from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import GrowingSkillPrior, SkillPrior
 from torchrl_hmcts.planners import MCTSPlanner, Search
 from torchrl_hmcts.planners.tree import PRUNED
 
 
+@name_arguments
 class SearchCoverage:
     r"""Counts the places that searches of a fixed budget reach with the skills that are on.
 
@@ -104,6 +106,7 @@ def num_places(search: Search) -> np.ndarray:
     return (accepted & used).sum(-1)
 
 
+@name_arguments
 class GrowSkills(TrainerHookBase):
     r"""Switches on one skill after the other while they add coverage, then goes back to the best.
 

@@ -11,7 +11,10 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_hmcts.arguments import name_arguments
 
+
+@name_arguments
 class MazeView(TensorDictModuleBase):
     r"""Writes what lies around the disc: where it is in its tile, how it moves, and the walls.
 
@@ -60,6 +63,7 @@ class MazeView(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], view)
 
 
+@name_arguments
 class HindsightTransitions:
     """Pieces of options from stored base steps, with targets that may have been reached.
 

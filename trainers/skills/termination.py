@@ -17,6 +17,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import MLP
 from torchrl.objectives import SoftUpdate
 
+from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import (
     AnyTermination,
@@ -32,6 +33,7 @@ _STALL_TOLERANCE = 0.005  # tiles per base step, a twentieth of the top speed
 _EPISODE_STEPS = 200  # base steps in a maze before the next one
 
 
+@name_arguments
 @dataclass
 class TerminationConfig:
     """How a termination is learned.

@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv
 from torchrl_hmcts.planners import (
     UCT,
@@ -76,6 +77,7 @@ def make_tile_planner(env: WaterworldMazeEnv, **planner_kwargs: Any) -> GoalPlan
     return GoalPlanner(MCTSPlanner(macro_env, **settings), to_macro, in_keys=_IN_KEYS)
 
 
+@name_arguments
 class TilePlanner:
     r"""The manager of :func:`make_tile_planner` without tensordicts: a tenth of the time per plan.
 

@@ -12,7 +12,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 
+from torchrl_hmcts.arguments import name_arguments
 
+
+@name_arguments
 class ScriptedExpert(TensorDictModuleBase):
     r"""Thrusts along the axis on which the velocity is furthest from what the goals ask for.
 

@@ -1,0 +1,115 @@
+"""Lets a docstring name anything public by its short name, and shows how classes are made.
+
+Public names are exported once in the whole project, so a short name is never ambiguous. Classes of
+TorchRL and tensordict have metaclasses that take any arguments; what counts is ``__init__``. Those
+of a TensorClass lose their docstrings, which are read from the source.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+import textwrap
+from typing import Any
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.util.inspect import stringify_signature
+
+PACKAGES = (
+    "torchrl_hmcts.planners",
+    "torchrl_hmcts.objectives",
+    "torchrl_hmcts.modules",
+    "torchrl_hmcts.transforms",
+    "torchrl_hmcts.envs",
+    "torchrl_hmcts.trainers",
+    "torchrl_hmcts.testing",
+)
+
+
+def public_names() -> dict[str, str]:
+    """Map each public name to the path under which it is documented."""
+    return {
+        name: f"{package}.{name}"
+        for package in PACKAGES
+        for name in importlib.import_module(package).__all__
+    }
+
+
+def resolve(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, text: nodes.TextElement
+) -> nodes.reference | None:
+    """Find what a reference in a docstring means by its first public name."""
+    if node.get("refdomain") != "py":
+        return None
+    parts = node["reftarget"].split(".")
+    for i, part in enumerate(parts):
+        path = env.public_names.get(part)
+        if path is not None:
+            target = ".".join([path, *parts[i + 1 :]])
+            found: Any = env.domains.python_domain.resolve_xref(
+                env, node["refdoc"], app.builder, "obj", target, node, text
+            )
+            return found
+    return None
+
+
+def signature(
+    app: Sphinx,
+    what: str,
+    name: str,
+    obj: Any,
+    options: Any,
+    text: str | None,
+    returned: str | None,
+) -> tuple[str, str | None] | None:
+    """Return the signature of a class's own ``__init__`` where a metaclass hides it."""
+    if what == "class" and type(obj).__name__ == "_TensorClassMeta":
+        return "", None  # its fields are listed
+    if what != "class" or text is None or not text.startswith("(*args"):
+        return None
+    shown = inspect.signature(obj.__init__)
+    parameters = list(shown.parameters.values())[1:]
+    shown = shown.replace(parameters=parameters, return_annotation=inspect.Signature.empty)
+    return stringify_signature(shown, unqualified_typehints=True), returned
+
+
+def tensorclass_docstring(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]
+) -> None:
+    """Put back the docstring that tensordict's TensorClass replaces, and the fields' comments."""
+    if what != "class" or type(obj).__name__ != "_TensorClassMeta":
+        return
+    source = textwrap.dedent(inspect.getsource(obj))
+    text = ast.get_docstring(ast.parse(source).body[0]) or ""  # type: ignore[arg-type]
+    fields = re.findall(r"^    (\w+): ([\w.\[\], |]+?)(?:  # (.*))?$", source, re.MULTILINE)
+    lines[:] = [*text.splitlines(), ""]
+    for field, kind, comment in fields:
+        meaning = re.sub(r"(\[[^\]]+\])", r"``\1``", comment)
+        lines.append(f"* **{field}** ({kind}){': ' if meaning else ''}{meaning}")
+    lines.append("")
+
+
+def skip_foreign(
+    app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any
+) -> bool | None:
+    """Leave out what a decorator of tensordict put into a class of ours."""
+    function = getattr(obj, "fget", None) or getattr(obj, "__func__", obj)
+    module = getattr(function, "__module__", None) or ""
+    return True if module.startswith(("tensordict", "torch.", "torchrl.")) else None
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    def remember(app: Sphinx) -> None:
+        app.env.public_names = public_names()
+
+    app.connect("builder-inited", remember)
+    app.connect("missing-reference", resolve)
+    app.connect("autodoc-process-signature", signature)
+    app.connect("autodoc-skip-member", skip_foreign)
+    app.connect("autodoc-process-docstring", tensorclass_docstring, priority=400)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

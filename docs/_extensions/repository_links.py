@@ -1,0 +1,45 @@
+"""Makes links that are right in the repository right on the site as well.
+
+Pages link to folders and files of the repository, which are shown there by GitHub and the like. On
+the site a folder of results means the page of results, and a file at the top the page made of it.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from typing import Any
+
+from sphinx.application import Sphinx
+
+_LINK = re.compile(r"(?<!!)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)]*)?\)")
+_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+
+
+def site_target(page: str, target: str) -> str:
+    """Return what a link of a page (``"algorithms/a3c"``) should lead to on the site.
+
+    Example:
+        >>> site_target("planning", "results/planner")
+        '/auto_results/index.md'
+        >>> site_target("algorithms/a3c", "goal_based_agent.md")
+        'goal_based_agent.md'
+    """
+    path = posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
+    if path.startswith("../"):  # at the top of the repository
+        return "/" + _PAGES.get(path[3:], "index.md")
+    if path.startswith("results") and not posixpath.splitext(path)[1]:
+        return "/auto_results/index.md"
+    return target
+
+
+def _rewrite(app: Sphinx, docname: str, source: list[str]) -> None:
+    if app.env.doc2path(docname).suffix == ".md":
+        source[0] = _LINK.sub(
+            lambda match: f"]({site_target(docname, match[1])}{match[2] or ''})", source[0]
+        )
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    app.connect("source-read", _rewrite)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

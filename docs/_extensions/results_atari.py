@@ -1,0 +1,60 @@
+"""Chapter 5's tables, from the runs in ``docs/results/atari``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from results_tables import ATARI, table
+
+_HEAD = [
+    "game",
+    "table 5.1",
+    "best of table A.1",
+    "best episode",
+    "last",
+    "episodes",
+    "emulated frames, all kinds",
+    "options from",
+    "options x base steps",
+    "seed",
+]
+
+
+def atari(runs: Sequence[dict[str, Any]]) -> str:
+    """Return a table for each protocol."""
+    text = (
+        "The source reports the highest score within 10 million time steps (40 million frames). "
+        "Here all emulated frames count: real, simulated, and those spent on finding options.\n"
+    )
+    for protocol in ("deterministic", "sticky"):
+        rows = [
+            [
+                game,
+                score,
+                baseline,
+                run["score_max"],
+                run["score_final"],
+                len(run["episodes"]),
+                f"{run['frames'] / 1e6:.2f} million",
+                run["source"],
+                f"{len(run['options'])} x {run['option_steps']}",
+                run["seed"],
+            ]
+            for game, score, _, _, baseline in ATARI
+            for run in runs
+            if run["game"] == game and run["protocol"] == protocol
+        ]
+        if rows:
+            text += f"\nProtocol: {protocol}\n\n" + table(_HEAD, rows)
+    return text
+
+
+def best(runs: Sequence[dict[str, Any]], game: str) -> str:
+    """Return the best deterministic score in a game, or that there is none."""
+    scores = [
+        run["score_max"]
+        for run in runs
+        if run["game"] == game and run["protocol"] == "deterministic"
+    ]
+    return f"{max(scores):,.0f}" if scores else "not measured yet"

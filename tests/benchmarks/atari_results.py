@@ -1,0 +1,146 @@
+"""Results of Atari runs: Table 5.1 with ours beside it, and scores normalised by humans'.
+
+    python tests/benchmarks/atari_results.py runs/* --out docs/results/atari
+
+Reads the folders that ``hmcts train experiment=atari`` has written, finished ones; runs nothing.
+Protocols and sources of options are never mixed: a row is a game, a protocol and a source. The
+interquartile mean over games and seeds is given with a stratified bootstrap interval of 95 %
+(Agarwal et al. 2021).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_hmcts.trainers.experiments.run_folder import read_curves
+from torchrl_hmcts.trainers.figures.atari_results import TABLE_5_1, best_baseline
+from torchrl_hmcts.trainers.figures.intervals import interquartile_mean
+
+# Human and random scores as in dqn_zoo's atari_data.py.
+HUMAN = {
+    "BeamRider": (16926.5, 363.9),
+    "Breakout": (30.5, 1.7),
+    "Enduro": (860.5, 0.0),
+    "SpaceInvaders": (1668.7, 148.0),
+    "Qbert": (13455.0, 163.9),
+    "Seaquest": (42054.7, 68.4),
+    "Pong": (14.6, -20.7),
+}
+UCT_SOURCE = "primitive actions, UCT"
+KEPT = (
+    "game", "protocol", "source", "seed", "score_max", "score_final", "score_mean", "episodes",
+    "frames", "base_steps", "options", "option_steps", "c", "frames_finding_options",
+    "frames_tuning", "seconds", "finding", "tuning",
+)  # fmt: skip
+SETTINGS = (
+    "ratio", "tree_policy", "rollout_options", "gamma", "width_novelty", "leaves_per_wave",
+    "max_episode_frames", "option_steps",
+)  # fmt: skip
+
+
+def read(folder: Path) -> dict[str, Any] | None:
+    """What is kept of a run; None if it is not finished."""
+    path = folder / "metrics.json"
+    if not path.is_file():
+        return None
+    metrics = json.loads(path.read_text())
+    row = {key: metrics[key] for key in KEPT}
+    config = metrics["config"]
+    row["settings"] = {key: config[key] for key in SETTINGS if key in config}
+    words = [f"{k}={v}" for k, v in sorted(config.items()) if k not in ("out", "resume")]
+    row["command"] = "hmcts train experiment=atari " + " ".join(w for w in words if w[-1] != "=")
+    row["versions"] = metrics["versions"]
+    if row["settings"].get("tree_policy", "puct") == "uct":
+        row["source"] = UCT_SOURCE
+    curves = read_curves(folder)
+    row["curves"] = {
+        name: {"step": curves[name].steps, "value": curves[name].values}
+        for name in ("score", "score_max")
+        if name in curves
+    }
+    return row
+
+
+def bootstrap(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
+    """Interquartile mean and its 95 % interval, resampling the seeds within each game."""
+    generator = np.random.default_rng(0)
+    drawn = [generator.choice(np.array(g), size=(draws, len(g))) for g in scores]
+    means = interquartile_mean(np.concatenate(drawn, -1))
+    middle = float(interquartile_mean(np.concatenate([np.array(g) for g in scores])))
+    low, high = np.percentile(means, [2.5, 97.5])
+    return middle, float(low), float(high)
+
+
+def normalised(row: Mapping[str, Any], key: str) -> float:
+    human, random = HUMAN[row["game"]]
+    return (row[key] - random) / (human - random)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--out", type=Path, help="folder")
+    args = parser.parse_args()
+    rows = [row for row in map(read, args.runs) if row is not None]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        groups[row["protocol"], row["source"]].append(row)
+    summary = []
+    print(
+        "| protocol | options | game | seeds | best episode | last episode | frames, all kinds | "
+        "Table 5.1 | best of Table A.1 |\n|---|---|---|---|---|---|---|---|---|"
+    )
+    for (protocol, source), members in sorted(groups.items()):
+        for game in TABLE_5_1:
+            runs = [row for row in members if row["game"] == game]
+            if not runs:
+                continue
+            best = "/".join(f"{r['score_max']:g}" for r in runs)
+            last = "/".join(f"{r['score_final']:g}" for r in runs)
+            frames = "/".join(f"{r['frames'] / 1e6:.2f}M" for r in runs)
+            print(
+                f"| {protocol} | {source} | {game} | {len(runs)} | {best} | {last} | {frames} | "
+                f"{TABLE_5_1[game].score} | {best_baseline(game)[1]:g} |"
+            )
+        for key in ("score_max", "score_final"):
+            games = sorted({row["game"] for row in members})
+            scores = [[normalised(r, key) for r in members if r["game"] == g] for g in games]
+            middle, low, high = bootstrap(scores)
+            summary.append(
+                {
+                    "protocol": protocol,
+                    "source": source,
+                    "of": key,
+                    "games": games,
+                    "interquartile_mean_human_normalised": round(middle, 3),
+                    # One run of a game says nothing about others of it.
+                    "interval_95": [round(low, 3), round(high, 3)]
+                    if min(map(len, scores)) > 1
+                    else None,
+                }
+            )
+    for line in summary:
+        print(json.dumps(line))
+    if args.out is not None:
+        # What is compared with has a folder of its own: figures 5.1 to 5.7 show ours.
+        ours = [row for row in rows if row["source"] != UCT_SOURCE]
+        others = [row for row in rows if row["source"] == UCT_SOURCE]
+        command = "python tests/benchmarks/atari_results.py runs/* --out docs/results/atari"
+        for path, content in (
+            (args.out / "runs.json", ours),
+            (args.out / "compared" / "uct.json", others),
+            (args.out / "summary.json", {"command": command, "summary": summary}),
+        ):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

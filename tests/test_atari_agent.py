@@ -1,0 +1,310 @@
+"""The hierarchical agent on Atari: options, how they are found, playing, stopping and going on."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+pytest.importorskip("ale_py")
+
+from torchrl_hmcts.envs import (  # noqa: E402
+    AtariOptionPool,
+    ByteGoal,
+    FollowGoals,
+    JoinedWorkers,
+    RepeatActions,
+    SharedMLP,
+)
+from torchrl_hmcts.trainers import (  # noqa: E402
+    AtariAgent,
+    AtariSearch,
+    DIAYNSource,
+    DistilledSource,
+    GoalFinder,
+    GoalSearch,
+    Options,
+    RepeatSource,
+    load_options,
+)
+from torchrl_hmcts.trainers.experiments.atari import AtariRun, run_atari  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig  # noqa: E402
+
+TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)], fire=1)
+
+TRACKERS_WITHOUT_FIRE = FollowGoals(TRACKERS.goals)
+
+
+def make_pool(worker, max_steps, **kwargs) -> AtariOptionPool:
+    kwargs = {"num_processes": 0, "seed": 0, **kwargs}
+    return AtariOptionPool("Breakout", worker, max_steps=max_steps, **kwargs)
+
+
+# ------------------------------------------------------------------------------------ goals
+
+
+@pytest.mark.parametrize(
+    ("controlled", "action"), [(100, 2), (104, 2), (105, 0), (111, 0), (112, 3), (200, 3)]
+)
+def test_a_goal_brings_its_byte_to_the_target_plus_the_offset(controlled, action) -> None:
+    ram = np.zeros(128, np.uint8)
+    ram[72], ram[99] = controlled, 120
+    assert ByteGoal(72, 99, -12, raising=2, lowering=3, dead_zone=3).action(ram) == action
+
+
+def test_fire_is_taken_now_and_then_whatever_the_goal() -> None:
+    ram, generator = np.zeros(128, np.uint8), np.random.default_rng(0)
+    worker = FollowGoals([ByteGoal(72, 99, 0, 2, 3)], fire=1, fire_probability=0.25)
+    taken = [worker.act(ram, 0, generator) for _ in range(4000)]
+    assert set(taken) == {0, 1}
+    assert np.mean(taken) == pytest.approx(0.25, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([],), "a goal for each option; got none"),
+        (([ByteGoal(128, 0, 0, 1, 2)],), "bytes 0 to 127; got .*controlled=128"),
+        (([ByteGoal(0, 1, 0, 1, 2)], 1, 1.5), "from 0 to 1; got 1.5"),
+    ],
+)
+def test_goals_that_are_none_are_refused(arguments, message) -> None:
+    goals, *rest = arguments
+    with pytest.raises(ValueError, match=message):
+        FollowGoals(goals, **dict(zip(("fire", "fire_probability"), rest, strict=False)))
+
+
+def test_joined_workers_number_their_options_one_after_the_other() -> None:
+    class Ends(RepeatActions):
+        def ends(self, ram, option, steps):
+            return steps >= 2
+
+    joined = JoinedWorkers([RepeatActions([4, 5]), Ends([6])])
+    assert [joined.act(None, z, None) for z in range(3)] == [4, 5, 6]
+    assert [joined.ends(None, z, 2) for z in range(3)] == [False, False, True]
+    with pytest.raises(ValueError, match="at least one worker; got none"):
+        JoinedWorkers([])
+
+
+@pytest.mark.parametrize("kind", ["repeat", "goals", "network", "joined"])
+def test_options_are_built_again_from_what_was_saved(kind) -> None:
+    from torchrl_hmcts.trainers.atari.sources import _plain
+
+    network = SharedMLP(2, 4, hidden=(8,), deterministic=True)
+    network.weights.normal_(generator=torch.Generator().manual_seed(0))
+    workers = {"repeat": [RepeatActions([3, 1])], "goals": [TRACKERS], "network": [network]}
+    workers["joined"] = [w for part in list(workers.values()) for w in part]
+    saved = {"parts": [_plain(w) for w in workers[kind]]}
+    worker = load_options(saved)
+    before = workers[kind][0] if len(workers[kind]) == 1 else JoinedWorkers(workers[kind])
+    assert worker.num_options == before.num_options
+    ram = np.arange(128, dtype=np.uint8)[::-1].copy()
+    for option in range(worker.num_options):
+        drawn = [w.act(ram, option, np.random.default_rng(1)) for w in (worker, before)]
+        if kind in ("repeat", "goals"):
+            assert drawn[0] == drawn[1]
+    with pytest.raises(ValueError, match="kind 'magic' are not known"):
+        load_options({"parts": [{"kind": "magic"}]})
+
+
+def test_the_goals_of_breakout_are_found_without_being_told() -> None:
+    settings = GoalSearch(probe_states=150, screen_steps=300)
+    finder = GoalFinder(make_pool, settings, seed=0)
+    candidates, states = finder._probe()
+    assert finder.report["controllable"] == [72]  # the paddle
+    assert 99 in finder.report["moving"]  # the ball
+    ranked = finder._screen(candidates, states[:1])
+    best = ranked[0].worker.goals[0]
+    assert (best.controlled, best.target) == (72, 99)
+    # An action alone scores nothing in these steps, and is still a candidate.
+    assert finder.report["screened"][ranked[0].name] > 0.0
+    assert {"NOOP", "FIRE", "RIGHT", "LEFT"} <= set(finder.report["screened"])
+    assert finder.num_frames > 150 * 4 * 3 * 4
+
+
+# ------------------------------------------------------------------------------------ playing
+
+
+def agent(**kwargs) -> AtariAgent:
+    pool = make_pool(TRACKERS, 5)
+    return AtariAgent(pool, AtariSearch(ratio=4.0), seed=1, **kwargs)
+
+
+def test_what_was_planned_happens_and_the_subtree_is_kept() -> None:
+    player = agent()
+    kept = []
+    advance = player.planner.advance
+    player.planner.advance = lambda *a, **k: kept.append(bool(advance(*a, **k).all()))
+    player.begin()
+    assert player.play(12).decisions == 12
+    assert kept == [True] * 12
+
+
+def test_play_goes_on_bit_for_bit_from_where_the_tree_is_planted_anew() -> None:
+    whole = agent(replant_every=4)
+    whole.begin()
+    whole.play(10)
+    first = agent(replant_every=4)
+    first.begin()
+    first.play(8)
+    second = agent(replant_every=4)
+    second.load_state_dict(first.state_dict())
+    second.play(2)
+    assert second.progress == whole.progress
+    torch.testing.assert_close(
+        second.state["emulator_state"], whole.state["emulator_state"], rtol=0, atol=0
+    )
+
+
+def test_a_lost_life_costs_planning_but_not_the_score() -> None:
+    player = agent()
+    player.greatest_reward = 4.0
+    player.begin()
+    player.play(1)
+    assert player.pool.life_loss_penalty == 4.0
+    assert player.progress.score >= 0.0
+
+
+def test_with_sticky_actions_the_planner_sees_no_random_generator() -> None:
+    plan = make_pool(TRACKERS, 5)
+    real = make_pool(TRACKERS, 5, repeat_action_probability=0.25, seed=9)
+    player = AtariAgent(plan, AtariSearch(ratio=2.0), play_in=real)
+    player.begin()
+    player.play(3)
+    width = plan.reset()["emulator_state"].shape[-1]
+    assert player.state["emulator_state"].shape == (1, width)
+    assert player.num_frames == plan.num_frames + real.num_frames
+
+
+def test_pools_of_different_options_are_refused() -> None:
+    with pytest.raises(ValueError, match="plans over 3 options and plays with 4"):
+        AtariAgent(make_pool(TRACKERS, 5), play_in=make_pool(RepeatActions(4), 5))
+
+
+def test_trackers_under_a_small_search_keep_the_ball_in_play() -> None:
+    pool = make_pool(TRACKERS, 20)
+    player = AtariAgent(pool, AtariSearch(ratio=4.0, rollout_options=3), seed=0)
+    progress = player.play(max_steps=300)
+    assert progress.score >= 8.0  # a random player has 1 or 2
+    assert player.state["lives"].item() == 5 if "lives" in player.state.keys() else True
+
+
+# ------------------------------------------------------------------------------------ sources
+
+
+def test_repeated_actions_are_an_option_each() -> None:
+    options = RepeatSource().find("Breakout", make_pool, seed=0, log=print)
+    assert options.names == ["NOOP", "FIRE", "RIGHT", "LEFT"]
+    assert options.worker.num_options == 4
+
+
+@pytest.mark.parametrize("discriminator", ["state", "displacement"])
+def test_skills_learned_on_the_ram_become_options(discriminator) -> None:
+    source = DIAYNSource(
+        2, 128, skill_steps=8, num_envs=2, hidden=(16,), discriminator=discriminator
+    )
+    options = source.find("Breakout", make_pool, seed=0, log=lambda text: None)
+    assert options.worker.num_options == 2
+    assert options.num_frames == 4 * 128
+    again = load_options(options.saved)
+    assert again.weights.equal(options.worker.weights)
+    assert options.worker.weights.abs().sum() > 0
+    td = make_pool(options.worker, 3).reset().set("option", torch.tensor(1))
+    assert make_pool(options.worker, 3).step(td)["next", "duration"].item() == 3
+
+
+def test_an_unknown_discriminator_is_refused() -> None:
+    with pytest.raises(ValueError, match="'state', 'displacement' or 'controllable'; got 'ram'"):
+        DIAYNSource(discriminator="ram")
+
+
+# ------------------------------------------------------------------------------------ experiment
+
+
+def test_a_short_run_of_two_processes_leaves_its_figures(tmp_path) -> None:
+    metrics = run_atari(AtariConfig(toy=True, out=str(tmp_path), num_processes=2))
+    assert metrics["frames"] >= 20_000
+    assert metrics["score_max"] == max(row["score"] for row in metrics["episodes"])
+    assert json.loads((tmp_path / "metrics.json").read_text())["frames"] == metrics["frames"]
+    with (tmp_path / "curves.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {"score", "score_max"} <= {row["name"] for row in rows}
+    assert int(rows[0]["step"]) * 4 == pytest.approx(metrics["episodes"][0]["frames"], abs=4)
+    for name in ("index.html", "scores.png", "episode.gif", "checkpoints/run.pt"):
+        assert (tmp_path / name).stat().st_size > 100
+
+
+def test_a_run_in_pieces_is_the_run_in_one(tmp_path) -> None:
+    config = AtariConfig(
+        frames=9_000, max_episode_frames=1_200, source="repeat", option_steps=10, ratio=3.0,
+        num_processes=0, replant_every=5, seed=4, out=str(tmp_path),
+    )  # fmt: skip
+
+    def nothing() -> None:
+        return None
+
+    whole = AtariRun(config)
+    whole.play(nothing, nothing)
+    saved: list[dict] = []
+    first = AtariRun(config)
+
+    def save() -> None:
+        saved.append(first.state_dict())
+        if len(saved) == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first.play(save, nothing)
+    path = tmp_path / "run.pt"
+    torch.save(saved[-1], path)
+    second = AtariRun(config)
+    second.load_state_dict(torch.load(path, weights_only=True))
+    second.play(nothing, nothing)
+    assert second.scores == whole.scores
+    assert second.points == whole.points
+    other = AtariRun(AtariConfig(**{**config.__dict__, "ratio": 4.0}))
+    with pytest.raises(ValueError, match="other settings: ratio=4.0 instead of 3.0"):
+        other.load_state_dict(saved[-1])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"protocol": "random"}, "deterministic, sticky; got 'random'"),
+        ({"source": "luck"}, "one of goals, .*repeat.*got 'luck'"),
+        ({"ratio": 0.0}, "ratio must be above 0; got 0.0"),
+        ({"gamma": 1.5}, r"gamma must be in \(0, 1\]; got 1.5"),
+        ({"frames": 0}, "frames must be at least 1; got 0"),
+        ({"num_processes": -2}, "num_processes must be at least -1; got -2"),
+    ],
+)
+def test_a_config_that_cannot_be_is_refused(wrong, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        AtariConfig(**wrong)
+
+
+def test_an_agent_starts_by_itself() -> None:
+    assert agent().play(1).decisions == 1
+    assert isinstance(agent().pool.reset(TensorDict(batch_size=[1])), TensorDict)
+
+
+def test_a_network_learns_the_goals_that_rules_carry_out() -> None:
+    class Given:
+        def find(self, game, make_pool, *, seed, log):
+            saved = {"parts": []}
+            return Options(TRACKERS_WITHOUT_FIRE, ["left", "below", "right"], 7, {}, saved)
+
+    source = DistilledSource(Given(), samples=900, epochs=30, hidden=(32,), batch_size=32, lr=3e-3)
+    options = source.find("Breakout", make_pool, seed=0, log=lambda text: None)
+    assert options.names == ["left", "below", "right"]
+    assert options.num_frames > 7
+    assert options.report["distilled_agreement"] > 0.8  # of 4 actions
+    again = load_options(options.saved)
+    again.deterministic = options.worker.deterministic = True
+    ram = np.zeros(128, np.uint8)
+    ram[72], ram[99] = 60, 180
+    assert again.act(ram, 1, None) == options.worker.act(ram, 1, None)

@@ -1,0 +1,178 @@
+"""Runs from the command line at toy size: what they leave, going on with them, testing again."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.experiments.run_folder import read_run
+
+TRAIN = ["train", "experiment=waterworld_a3c", "toy=true", "seed=3"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "one"
+    assert main([*TRAIN, f"out={out}"]) == 0
+    return out
+
+
+def test_a_run_records_experiment_config_command_versions_and_machine(run: Path) -> None:
+    record = json.loads((run / "run.json").read_text())
+    assert record["experiment"] == "waterworld_a3c"
+    assert record["config"]["seed"] == 3
+    assert record["commands"] == ["hmcts " + " ".join([*TRAIN, "out=one"])]
+    assert record["status"] == "finished"
+    assert set(record["machine"]) == {"cpus", "platform"}
+    assert "torchrl" in record["versions"]
+    assert str(run.parent) not in (run / "run.json").read_text()
+
+
+def test_a_demo_is_tested_again_in_other_mazes(tmp_path) -> None:
+    out = tmp_path / "demo"
+    assert main(["demo", "toy=true", f"out={out}", "log_level=warning"]) == 0
+    solved = json.loads((out / "metrics.json").read_text())["solved"]
+    assert main(["evaluate", f"run={out}"]) == 0
+    assert main(["evaluate", f"run={out}", "expansions=1", "seed=1"]) == 0
+    same, fewer = json.loads((out / "evaluation.json").read_text())["evaluations"]
+    assert same["results"]["test"]["solved"] == solved
+    assert fewer["results"]["test"]["expansions"]["mean"] <= 4.0  # leaves of one wave
+
+
+def test_values_are_logged_as_csv_while_it_trains(run: Path) -> None:
+    with (run / "log" / "scalars" / "eval_solved_share.csv").open() as file:
+        logged = [(int(step), float(value)) for step, value in csv.reader(file)]
+    curve = read_run(run).curves["eval_solved_share"]
+    assert [step for step, _ in logged] == curve.steps
+    np.testing.assert_allclose([value for _, value in logged], curve.values)
+
+
+def test_a_run_is_tested_again_with_other_starts(run: Path, capsys) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert main(["evaluate", f"run={run}"]) == 0
+    assert main(["evaluate", f"run={run}", "seed=4"]) == 0
+    assert main(["evaluate", f"run={run}", "seed=4"]) == 0  # the same once more: in its place
+    assert "evaluation.json" in capsys.readouterr().out
+    same, other = json.loads((run / "evaluation.json").read_text())["evaluations"]
+    assert same["changes"] == {}
+    assert same["results"]["test"].items() <= metrics["test"].items()  # the very same episodes
+    assert same["results"]["test_greedy"] == metrics["test_greedy"]
+    assert other["changes"] == {"seed": 4}
+    assert other["results"]["checkpoint"] == same["results"]["checkpoint"]
+    page = (run / "index.html").read_text()
+    assert "Evaluated again" in page
+    assert "<h3>seed=4</h3>" in page
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "say which run"),
+        (["run={run}", "sed=1"], "Did you mean: seed"),
+        (["run={run}", "out=elsewhere"], "no out="),
+        (["run={run}/checkpoints"], "no folder of a run"),
+        (["run={run}", "hidden=7"], "not those of this configuration"),
+    ],
+)
+def test_what_evaluate_cannot_do_is_said(run: Path, capsys, words, message) -> None:
+    assert main(["evaluate", *(word.format(run=run) for word in words)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_resume_goes_on_with_the_saved_config(tmp_path, monkeypatch) -> None:
+    seen = []
+
+    def remembered(config) -> dict:
+        seen.append(config)
+        return {}
+
+    path = "torchrl_hmcts.trainers.experiments.labmaze.run_labmaze"
+    monkeypatch.setattr(path, remembered)
+    out = tmp_path / "run"
+    assert main(["train", "experiment=labmaze", "seed=7", "train_frames=8000", f"out={out}"]) == 0
+    assert main(["train", f"resume={out}"]) == 0
+    assert main(["train", "experiment=labmaze", "seed=7", f"out={out}", "resume=true"]) == 0
+    first, second, third = seen
+    assert (first.resume, second.resume, third.resume) == (False, True, True)
+    assert (second.seed, second.train_frames, second.out) == (7, 8_000, str(out))
+    assert third.train_frames == 40_000
+    record = json.loads((out / "run.json").read_text())
+    assert len(record["commands"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["resume={run}", "seed=1"], "'seed=1' would change it"),
+        (["resume={run}", "experiment=labmaze"], "leave experiment=labmaze out"),
+        (["resume={run}/nowhere"], "no folder of a run"),
+    ],
+)
+def test_what_cannot_be_gone_on_with_is_said(run: Path, capsys, words, message) -> None:
+    assert main(["train", *(word.format(run=run) for word in words)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_going_on_without_a_checkpoint_says_so(tmp_path, capsys) -> None:
+    assert main([*TRAIN, f"out={tmp_path}", "resume=true"]) == 1
+    assert "There is no checkpoint in" in capsys.readouterr().err
+
+
+def test_a_run_that_is_stopped_is_recorded_so(tmp_path, monkeypatch, capsys) -> None:
+    def interrupted(config) -> dict:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.labmaze.run_labmaze", interrupted)
+    assert main(["train", "experiment=labmaze", f"out={tmp_path}"]) == 130
+    assert json.loads((tmp_path / "run.json").read_text())["status"] == "stopped"
+
+
+def test_log_level_warning_is_silent_on_standard_output(tmp_path, monkeypatch, capsys) -> None:
+    def talks(config) -> dict:
+        print("talking")
+        return {}
+
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.labmaze.run_labmaze", talks)
+    words = ["train", "experiment=labmaze", f"out={tmp_path}"]
+    assert main(words) == 0
+    assert "talking" in capsys.readouterr().out
+    assert main([*words, "log_level=warning"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main([*words, "log_level=loud"]) == 2
+    assert "log_level is one of debug, info, warning, error; got 'loud'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["demo", "train", "evaluate", "report", "sweep"])
+def test_help_says_what_a_verb_needs_and_where_results_go(capsys, verb) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([verb, "--help"])
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    for word in ("\nneeds ", "\nwrites ", "log_level="):
+        assert word in printed
+
+
+@pytest.mark.parametrize("logger", ["tensorboard", "wandb"])
+def test_values_go_to_other_loggers_as_well(tmp_path, logger) -> None:
+    pytest.importorskip(logger)
+    from torchrl_hmcts.trainers.config import DemoConfig
+    from torchrl_hmcts.trainers.experiments.loggers import make_logger
+
+    made = make_logger(DemoConfig(out=str(tmp_path), logger=logger))
+    made.log_scalar("entropy", 1.25, step=64)
+    made.log_scalar("entropy", float("nan"), step=128)
+    made.close()
+    assert (tmp_path / "log" / "scalars" / "entropy.csv").read_text() == "64,1.25\n"
+    files = [p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file()]
+    written = [p for p in files if p.parts[0] == logger]
+    assert any(p.name.startswith("events.out") or p.suffix == ".wandb" for p in written)
+
+
+def test_an_unknown_logger_is_refused(capsys) -> None:
+    assert main(["demo", "logger=paper"]) == 2
+    assert "logger is one of csv, tensorboard, wandb; got 'paper'" in capsys.readouterr().err

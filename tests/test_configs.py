@@ -1,0 +1,281 @@
+"""Configs in Hydra's store: they are what their classes are, and compose with TorchRL's."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import MISSING, DictConfig, OmegaConf
+from torchrl.envs import EnvBase
+
+import torchrl_hmcts.envs
+import torchrl_hmcts.objectives
+import torchrl_hmcts.planners
+import torchrl_hmcts.transforms
+from torchrl_hmcts.planners import PUCT, UCT, Gumbel, MaxBackup, RadiusNovelty
+from torchrl_hmcts.testing import ChainEnv
+from torchrl_hmcts.trainers.configs import GROUPS, to_yaml
+from torchrl_hmcts.trainers.configs.base import named
+from torchrl_hmcts.trainers.experiments import EXPERIMENTS
+from torchrl_hmcts.trainers.experiments.registry import field_docs
+
+CONFIGS = [(f"{g}={n}", config) for g, names in GROUPS.items() for n, config in names.items()]
+INTERNAL = {"_target_", "_component_", "_partial_"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def hydra() -> Iterator[None]:
+    GlobalHydra.instance().clear()
+    with initialize(version_base=None):
+        yield
+    GlobalHydra.instance().clear()
+
+
+def keywords(component: type) -> dict[str, inspect.Parameter]:
+    parameters = inspect.signature(component.__init__).parameters
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return {n: p for n, p in parameters.items() if n != "self" and p.kind not in variable}
+
+
+def default_of(field: dataclasses.Field) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
+
+
+def component_of(config: type) -> type:
+    return named({f.name: f for f in dataclasses.fields(config)}["_component_"].default)
+
+
+def as_written(value: Any) -> Any:
+    """A class's default as a config can hold it."""
+    if isinstance(value, tuple | list | range):
+        return [as_written(item) for item in value]
+    if isinstance(value, dict):
+        return {key: as_written(item) for key, item in value.items()}
+    return value
+
+
+@pytest.mark.parametrize(("name", "config"), CONFIGS, ids=[name for name, _ in CONFIGS])
+def test_a_config_has_the_keywords_and_defaults_of_its_class(name: str, config: type) -> None:
+    parameters = keywords(component_of(config))
+    own = {f.name: f for f in dataclasses.fields(config) if f.name not in INTERNAL}
+    assert sorted(own) == sorted(parameters)
+    for key, parameter in parameters.items():
+        default = default_of(own[key])
+        if parameter.default is inspect.Parameter.empty:
+            assert default == MISSING, key
+        elif callable(parameter.default):
+            assert named(default) is parameter.default, key
+        else:
+            assert default == as_written(parameter.default), key
+
+
+@pytest.mark.parametrize(("name", "config"), CONFIGS, ids=[name for name, _ in CONFIGS])
+def test_every_key_has_a_sentence_and_the_yaml_shows_it(name: str, config: type) -> None:
+    meanings = field_docs(config)
+    written = to_yaml(config)
+    for field in dataclasses.fields(config):
+        if field.name not in INTERNAL:
+            assert meanings[field.name].endswith("."), field.name
+            assert len(meanings[field.name]) > 8, field.name
+            assert f"\n{field.name}:" in f"\n{written}"
+    assert set(OmegaConf.create(written)) == {f.name for f in dataclasses.fields(config)}
+
+
+# Built by others, or no part that one would choose in a config.
+NOT_CONFIGURED = {
+    "torchrl_hmcts.planners": {
+        "NodeStatistics", "NoveltyTest", "Plan", "Root", "Search", "SearchProgress", "SearchTree",
+        "Transition", "TreeView",
+    },
+    "torchrl_hmcts.objectives": {"NStepReturn", "SkillObjective"},
+    "torchrl_hmcts.transforms": {"PlansGoals"},
+    # Own processes and workers; another program.
+    "torchrl_hmcts.envs": {"AtariOptionPool", "DeepMindLabEnv"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("package", NOT_CONFIGURED)
+def test_every_class_that_can_be_swapped_has_a_config(package: str) -> None:
+    module = getattr(torchrl_hmcts, package.rpartition(".")[2])
+    public = {n for n in module.__all__ if inspect.isclass(getattr(module, n))}
+    if package.endswith(".envs"):
+        public = {n for n in public if issubclass(getattr(module, n), EnvBase)}
+    configured = {component_of(config).__name__ for _, config in CONFIGS}
+    missing = public - configured - NOT_CONFIGURED[package]
+    assert not missing, f"without a config in trainers/configs: {sorted(missing)}"
+
+
+@pytest.mark.parametrize(
+    ("name", "policy", "more"),
+    [
+        ("uct", UCT(), []),
+        ("puct", PUCT(), []),
+        (
+            "gumbel",
+            Gumbel(),
+            [
+                "planner.expand=one",
+                "+budget=search",
+                "planner.budget.simulations=8",
+                "planner.budget.until_plan=false",
+            ],
+        ),
+    ],
+    ids=["uct", "puct", "gumbel"],
+)
+def test_a_tree_policy_goes_into_the_planner(name: str, policy: object, more: list[str]) -> None:
+    config = compose(overrides=["+planner=mcts", f"+tree_policy={name}", *more])
+    planner = instantiate(config.planner, _partial_=True)(env=ChainEnv(length=5))
+    assert planner.tree_policy == policy
+
+
+def test_a_planner_is_composed_of_parts_with_other_values() -> None:
+    config = compose(
+        overrides=[
+            "+planner=mcts",
+            "+tree_policy=puct",
+            "+novelty=radius",
+            "+backup=max",
+            "+budget=search",
+            "planner.tree_policy.c=2.5",
+            "planner.novelty.key=state",
+            "planner.novelty.radius=0.5",
+            "planner.budget.simulations=7",
+            "planner.gamma=0.9",
+        ]
+    )
+    planner = instantiate(config.planner, _partial_=True)(env=ChainEnv(length=5))
+    assert planner.tree_policy == PUCT(c=2.5)
+    assert isinstance(planner.novelty, RadiusNovelty)
+    assert planner.backup == MaxBackup()
+    assert planner.budget.simulations == 7
+    assert planner.gamma == 0.9
+
+
+def test_a_part_of_an_unknown_name_is_refused_by_hydra() -> None:
+    with pytest.raises(Exception, match="tree_policy/uctt"):
+        compose(overrides=["+planner=mcts", "+tree_policy=uctt"])
+
+
+def test_a_nested_key_is_given_as_a_list() -> None:
+    config = compose(
+        overrides=["+transform@skill=skill", "skill.num_skills=3", "skill.skill_key=[agent,skill]"]
+    )
+    assert instantiate(config.skill).skill_key == ("agent", "skill")
+
+
+def test_a_class_is_given_by_its_name() -> None:
+    config = compose(
+        overrides=[
+            "+model@net=skill_critic",
+            "net.in_features=2",
+            "net.num_actions=4",
+            "net.num_skills=3",
+            "net.in_keys=[velocity]",
+            "net.activation=torch.nn.Tanh",
+        ]
+    )
+    assert any(isinstance(module, torch.nn.Tanh) for module in instantiate(config.net).modules())
+
+
+def waterworld_with_skills() -> list[str]:
+    """Overrides for the env of DIAYN's training: Waterworld under two transforms."""
+    return [
+        "+env@base=waterworld",
+        "base.batch_size=[8]",
+        "base.observation=false",
+        "+transform@skill=skill",
+        "skill.num_skills=3",
+        "skill.max_skill_steps=10",
+        "+transform@displacement=displacement",
+        "+transform@transforms=compose",
+        "transforms.transforms=[${skill},${displacement}]",
+        "+env=transformed_env",
+        "env.base_env=${base}",
+        "env.transform=${transforms}",
+    ]
+
+
+def test_diayn_composes_with_torchrls_env_collector_and_optimizer() -> None:
+    overrides = [
+        *waterworld_with_skills(),
+        "+collector=sync",
+        "collector.create_env_fn=${env}",
+        "collector.frames_per_batch=32",
+        "collector.total_frames=32",
+        "collector.auto_register_policy_transforms=false",
+        "+model@actor=skill_actor",
+        "+model@critic=skill_critic",
+        "+model@discriminator=skill_discriminator",
+        *(f"{n}.num_skills=3" for n in ("actor", "critic", "discriminator")),
+        *(f"{n}.in_features=2" for n in ("actor", "critic", "discriminator")),
+        *(f"{n}.in_keys=[velocity]" for n in ("actor", "critic")),
+        "critic.num_actions=4",
+        "+loss=diayn",
+        "loss.action_space=categorical",
+        "+target_net_updater=soft",
+        "target_net_updater.tau=0.5",
+        "+optimizer=adam",
+        "optimizer.lr=0.01",
+    ]
+    config = compose(overrides=overrides)
+    env = instantiate(config.env)
+    actor = instantiate(config.actor, _partial_=True)(action_spec=env.action_spec_unbatched)
+    loss = instantiate(config.loss, _partial_=True)(
+        actor_network=actor,
+        qvalue_network=instantiate(config.critic),
+        discriminator=instantiate(config.discriminator),
+    )
+    updater = instantiate(config.target_net_updater, _partial_=True)(loss)
+    optimizer = instantiate(config.optimizer, _partial_=True)(params=loss.parameters())
+    collector = instantiate(config.collector, _partial_=True)(
+        create_env_fn=lambda: env, policy=actor
+    )
+    (batch,) = list(collector)
+    before = [p.clone() for p in loss.parameters()]
+    batch.set(("next", "reward"), torch.zeros(*batch.shape, 1))
+    values = loss(batch.reshape(-1))
+    sum(values[key] for key in values.keys() if key.startswith("loss")).backward()
+    optimizer.step()
+    updater.step()
+    assert values["loss_discriminator"].isfinite()
+    assert any((a != b).any() for a, b in zip(before, loss.parameters(), strict=True))
+    collector.shutdown()
+
+
+def test_an_objective_goes_into_the_skill_loss() -> None:
+    config = compose(overrides=["+loss=discrete_skill_sac", "+objective=metra"])
+    assert config.loss.objective._component_.endswith("METRAEncoderLoss")
+    assert config.loss.objective.slack == 1e-3
+
+
+def test_what_is_missing_is_named() -> None:
+    config = compose(overrides=["+transform@skill=skill"])
+    with pytest.raises((InstantiationException, Exception), match="num_skills"):
+        instantiate(config.skill)
+
+
+def test_torchrls_own_groups_are_still_there() -> None:
+    store = ConfigStore.instance()
+    assert {"sac.yaml", "diayn.yaml", "a3c.yaml"} <= set(store.list("loss"))
+    assert {"step_counter.yaml", "option.yaml"} <= set(store.list("transform"))
+    assert {"sync.yaml"} <= set(store.list("collector"))
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_experiments_compose_too(name: str) -> None:
+    config = compose(overrides=[f"+experiment={name}", "experiment.seed=5"])
+    assert isinstance(config, DictConfig)
+    assert instantiate(config.experiment).seed == 5
+    assert config.experiment.out == f"runs/{name}"

@@ -1,0 +1,509 @@
+"""Every loss keeps TorchRL's contract: keys, reductions, gradients, targets, dispatch, compile."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded, Categorical, OneHot
+from torchrl.modules import ProbabilisticActor, ValueOperator
+from torchrl.objectives import DiscreteSACLoss, LossModule, SACLoss
+from torchrl.objectives.utils import ValueEstimators
+
+import torchrl_hmcts.objectives
+from torchrl_hmcts.modules import (
+    FixedSkillPrior,
+    GaussianSkillActor,
+    GrowingSkillPrior,
+    LearnedSkillPrior,
+    OptionModel,
+    SkillActionCritic,
+    SkillActor,
+    SkillCritic,
+    SkillDiscriminator,
+    SkillDynamics,
+    SkillEncoder,
+    SkillMLP,
+    SpectralLinear,
+    TerminationNetwork,
+)
+from torchrl_hmcts.objectives import (
+    A3CLoss,
+    ContinuousDIAYNLoss,
+    DIAYNLoss,
+    DiscreteSkillSACLoss,
+    ExpertIterationLoss,
+    IntraOptionQLoss,
+    LSDEncoderLoss,
+    METRAEncoderLoss,
+    NStepReturn,
+    OptionModelLoss,
+    OptionTerminationLoss,
+    SkillDiscriminatorLoss,
+    SkillDynamicsLoss,
+    SkillObjective,
+    SkillPriorLoss,
+    SkillSACLoss,
+)
+from torchrl_hmcts.testing import (
+    LOSS_CHECKS,
+    check_loss,
+    check_skill_objective,
+    check_skill_prior,
+)
+
+Z, A = 3, 4  # skills, actions
+N = 6  # transitions
+SPEC = Bounded(-1.0, 1.0, shape=(2,))
+SIZES: dict[str, Any] = {"hidden": (8,), "activation": nn.Tanh}
+SAC_ESTIMATORS = (ValueEstimators.TD0, ValueEstimators.TD1, ValueEstimators.TDLambda)
+
+
+@pytest.fixture(autouse=True)
+def _no_target_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchrl.objectives.common.rl_warnings", lambda: False)
+
+
+# ------------------------------------------------------------------------------------ the data
+
+
+def transitions(action: Tensor) -> TensorDict:
+    """Transitions ``[N]`` with everything any of the losses reads."""
+    g = torch.Generator().manual_seed(0)
+    skill = torch.randint(Z, (N,), generator=g)
+    terminated = torch.arange(N)[:, None] == 0
+
+    def state() -> dict[str, Tensor]:
+        names = ("velocity", "position")
+        return {**{k: torch.randn(N, 2, generator=g) for k in names}, "skill": skill}
+
+    root, after = state(), state()
+    after.update(
+        reward=torch.randn(N, 1, generator=g),
+        duration=torch.randint(1, 9, (N, 1), generator=g),
+        terminated=terminated,
+        done=terminated.clone(),
+    )
+    return TensorDict(
+        {**root, "action": action, "next": TensorDict(after, batch_size=[N])}, batch_size=[N]
+    )
+
+
+def discrete() -> TensorDict:
+    return transitions(torch.arange(N) % A)
+
+
+def one_hot() -> TensorDict:
+    return transitions(nn.functional.one_hot(torch.arange(N) % A, A))
+
+
+def continuous() -> TensorDict:
+    return transitions(torch.linspace(-0.8, 0.8, 2 * N).reshape(N, 2))
+
+
+def segments() -> TensorDict:
+    """Segments ``[2, 3]`` in which episodes end: one terminated, one truncated."""
+    td = discrete()
+    td["next", "done"] = (torch.arange(N)[:, None] % 4) == 0
+    return td.reshape(2, 3)
+
+
+def examples() -> TensorDict:
+    g = torch.Generator().manual_seed(1)
+    return TensorDict(
+        velocity=torch.randn(N, 2, generator=g),
+        policy_target=torch.rand(N, A, generator=g).softmax(-1),
+        value_target=torch.rand(N, 1, generator=g),
+        batch_size=[N],
+    )
+
+
+# ---------------------------------------------------------------------------------- the losses
+
+
+def discriminator(name: Callable, **kwargs: Any) -> SkillDiscriminatorLoss:
+    network = SkillDiscriminator(
+        2, Z, in_keys=[name("position")], skill_logits_key=name("skill_logits"), **SIZES
+    )
+    return SkillDiscriminatorLoss(network, **kwargs)
+
+
+def metra(name: Callable, **kwargs: Any) -> METRAEncoderLoss:
+    keys = {"in_keys": [name("position")], "representation_key": name("representation")}
+    return METRAEncoderLoss(SkillEncoder(2, Z, **keys, **SIZES), dual_init=2.0, **kwargs)
+
+
+def lsd(name: Callable, **kwargs: Any) -> LSDEncoderLoss:
+    keys = {"in_keys": [name("position")], "representation_key": name("representation")}
+    encoder = SkillEncoder(2, Z, linear=SpectralLinear, **keys, **SIZES)
+    return LSDEncoderLoss(encoder, **kwargs)
+
+
+def dads(name: Callable, **kwargs: Any) -> SkillDynamicsLoss:
+    keys: dict[str, Any] = {
+        "in_keys": [name("position")],
+        "target_key": name("position"),
+        "loc_key": name("skill_loc"),
+        "scale_key": name("skill_scale"),
+    }
+    return SkillDynamicsLoss(SkillDynamics(2, 2, Z, **keys, **SIZES), **kwargs)
+
+
+def renamed_metra(name: Callable, reduction: str) -> METRAEncoderLoss:
+    objective = metra(name, reduction=reduction)
+    objective.set_keys(representation=name("representation"))
+    return objective
+
+
+def actor_and_critic(
+    name: Callable, *, spec: Any = None, encoded: bool = False
+) -> tuple[nn.Module, nn.Module]:
+    keys: dict[str, Any] = {"in_keys": [name("velocity")], "skill_key": name("skill")}
+    spec = Categorical(A) if spec is None else spec
+    if spec is SPEC:
+        actor: nn.Module = GaussianSkillActor(
+            2, spec, Z, action_key=name("action"), **keys, **SIZES
+        )
+        critic: nn.Module = SkillActionCritic(
+            2,
+            2,
+            Z,
+            action_key=name("action"),
+            state_action_value_key=name("state_action_value"),
+            **keys,
+            **SIZES,
+        )
+    else:
+        actor = SkillActor(2, spec, Z, action_key=name("action"), **keys, **SIZES)
+        critic = SkillCritic(2, A, Z, action_value_key=name("action_value"), **keys, **SIZES)
+    return actor, critic
+
+
+def diayn(name: Callable, *, spec: Any = None, **kwargs: Any) -> DIAYNLoss:
+    spec = Categorical(A) if spec is None else spec
+    network = SkillDiscriminator(
+        2, Z, in_keys=[name("position")], skill_logits_key=name("skill_logits"), **SIZES
+    )
+    return DIAYNLoss(
+        *actor_and_critic(name, spec=spec), network, action_space=spec, fixed_alpha=False, **kwargs
+    )
+
+
+def continuous_diayn(name: Callable, **kwargs: Any) -> ContinuousDIAYNLoss:
+    network = SkillDiscriminator(
+        2, Z, in_keys=[name("position")], skill_logits_key=name("skill_logits"), **SIZES
+    )
+    return ContinuousDIAYNLoss(
+        *actor_and_critic(name, spec=SPEC), network, fixed_alpha=False, **kwargs
+    )
+
+
+def discrete_sac(name: Callable, *, reduction: str = "mean", **kwargs: Any) -> DiscreteSkillSACLoss:
+    objective = renamed_metra(name, reduction)
+    networks = actor_and_critic(name)
+    return DiscreteSkillSACLoss(
+        *networks, objective, action_space=Categorical(A), fixed_alpha=False, **kwargs
+    )
+
+
+def continuous_sac(name: Callable, *, reduction: str = "mean", **kwargs: Any) -> SkillSACLoss:
+    objective = renamed_metra(name, reduction)
+    networks = actor_and_critic(name, spec=SPEC)
+    return SkillSACLoss(*networks, objective, fixed_alpha=False, **kwargs)
+
+
+def a3c(name: Callable, **kwargs: Any) -> A3CLoss:
+    logits = TensorDictModule(nn.Linear(2, A), [name("velocity")], ["logits"])
+    actor = ProbabilisticActor(
+        logits,
+        in_keys=["logits"],
+        out_keys=[name("action")],
+        distribution_class=torch.distributions.Categorical,
+    )
+    critic = ValueOperator(
+        nn.Linear(2, 1), in_keys=[name("velocity")], out_keys=[name("state_value")]
+    )
+    return A3CLoss(actor, critic, **kwargs)
+
+
+def option_values(name: Callable) -> TensorDictModule:
+    return TensorDictModule(nn.Linear(2, Z), [name("velocity")], [name("action_value")])
+
+
+def termination_network(name: Callable) -> TerminationNetwork:
+    return TerminationNetwork(
+        2,
+        Z,
+        in_keys=[name("velocity")],
+        skill_key=name("skill"),
+        termination_logits_key=name("termination_logits"),
+        **SIZES,
+    )
+
+
+def always_the_same(make: Callable, name: Callable) -> nn.Module:
+    """A network that a loss reads and does not hold: it is not in the loss's state dict."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(7)
+        return make(name)
+
+
+def termination(name: Callable, **kwargs: Any) -> OptionTerminationLoss:
+    values = always_the_same(option_values, name)
+    return OptionTerminationLoss(termination_network(name), values, **kwargs)
+
+
+def intra_option(name: Callable, **kwargs: Any) -> IntraOptionQLoss:
+    ends = always_the_same(termination_network, name)
+    return IntraOptionQLoss(option_values(name), ends, **kwargs)
+
+
+def option_model(name: Callable, **kwargs: Any) -> OptionModelLoss:
+    model = OptionModel(
+        lambda n: SkillMLP(2, n, num_skills=Z, **SIZES),
+        [name("position"), name("skill")],
+        {name("position"): 2},
+        max_duration=9,
+        num_models=2,
+    )
+    return OptionModelLoss(model, **kwargs)
+
+
+class TwoHeads(nn.Linear):
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        out = super().forward(x)
+        return out[..., :A], out[..., A:]
+
+
+def expert_iteration(name: Callable, **kwargs: Any) -> ExpertIterationLoss:
+    out_keys = [name("logits"), name("state_value")]
+    network = TensorDictModule(TwoHeads(2, A + 1), [name("velocity")], out_keys)
+    return ExpertIterationLoss(network, **kwargs)
+
+
+def skill_prior(name: Callable, **kwargs: Any) -> SkillPriorLoss:
+    return SkillPriorLoss(LearnedSkillPrior(Z, [0.3, -0.2, 0.0]), **kwargs)
+
+
+@dataclass
+class Case:
+    """A loss, data for it, and what is expected of it."""
+
+    make: Callable[..., LossModule]
+    data: Callable[[], TensorDict]
+    gradients: dict[str, list[str]]
+    targets: Sequence[str] = ()
+    value_estimators: Sequence[Any] = ()
+    covers: Sequence[type] = field(default=())
+
+
+SAC_GRADIENTS = {
+    "loss_actor": ["actor_network_params"],
+    "loss_qvalue": ["qvalue_network_params"],
+    "loss_alpha": ["log_alpha"],
+}
+DIAYN_GRADIENTS = {**SAC_GRADIENTS, "loss_discriminator": ["objective.discriminator_params"]}
+METRA_GRADIENTS = {
+    **SAC_GRADIENTS,
+    "loss_encoder": ["objective.encoder_params"],
+    "loss_dual": ["objective.log_dual"],
+}
+SAC: dict[str, Any] = {"targets": ["qvalue_network"], "value_estimators": SAC_ESTIMATORS}
+
+CASES = {
+    "a3c": Case(
+        a3c,
+        segments,
+        {
+            "loss_objective": ["actor_network_params"],
+            "loss_entropy": ["actor_network_params"],
+            "loss_critic": ["critic_network_params"],
+        },
+        value_estimators=(
+            NStepReturn,
+            ValueEstimators.TD0,
+            ValueEstimators.TD1,
+            ValueEstimators.TDLambda,
+            ValueEstimators.GAE,
+        ),
+        covers=[A3CLoss],
+    ),
+    "diayn": Case(diayn, discrete, DIAYN_GRADIENTS, **SAC, covers=[DIAYNLoss]),
+    "diayn_one_hot": Case(
+        functools.partial(diayn, spec=OneHot(A)), one_hot, DIAYN_GRADIENTS, **SAC
+    ),
+    "continuous_diayn": Case(
+        continuous_diayn, continuous, DIAYN_GRADIENTS, **SAC, covers=[ContinuousDIAYNLoss]
+    ),
+    "discrete_sac": Case(
+        discrete_sac, discrete, METRA_GRADIENTS, **SAC, covers=[DiscreteSkillSACLoss]
+    ),
+    "continuous_sac": Case(
+        continuous_sac, continuous, METRA_GRADIENTS, **SAC, covers=[SkillSACLoss]
+    ),
+    "discriminator": Case(
+        discriminator,
+        discrete,
+        {"loss_discriminator": ["discriminator_params"]},
+        covers=[SkillDiscriminatorLoss],
+    ),
+    "metra": Case(
+        metra,
+        discrete,
+        {"loss_encoder": ["encoder_params"], "loss_dual": ["log_dual"]},
+        covers=[METRAEncoderLoss],
+    ),
+    "lsd": Case(lsd, discrete, {"loss_encoder": ["encoder_params"]}, covers=[LSDEncoderLoss]),
+    "dads": Case(
+        dads, discrete, {"loss_dynamics": ["dynamics_params"]}, covers=[SkillDynamicsLoss]
+    ),
+    "termination": Case(
+        termination,
+        discrete,
+        {"loss_termination": ["termination_network_params"]},
+        covers=[OptionTerminationLoss],
+    ),
+    "intra_option": Case(
+        intra_option,
+        discrete,
+        {"loss_qvalue": ["qvalue_network_params"]},
+        targets=["qvalue_network"],
+        covers=[IntraOptionQLoss],
+    ),
+    "option_model": Case(
+        option_model,
+        discrete,
+        {f"loss_{part}": ["model."] for part in ("delta", "reward", "duration", "terminated")},
+        covers=[OptionModelLoss],
+    ),
+    "expert_iteration": Case(
+        expert_iteration,
+        examples,
+        {"loss_policy": ["network_params"], "loss_value": ["network_params"]},
+        covers=[ExpertIterationLoss],
+    ),
+    "skill_prior": Case(
+        skill_prior, discrete, {"loss_skill_prior": ["prior."]}, covers=[SkillPriorLoss]
+    ),
+}
+OBJECTIVES = ["discriminator", "metra", "lsd", "dads"]
+# One of each kind: seconds each, and up to 15 for the others.
+QUICK_TO_COMPILE = {
+    "diayn",
+    "discriminator",
+    "dads",
+    "termination",
+    "expert_iteration",
+    "skill_prior",
+}
+CHEAP_CHECKS = [check for check in LOSS_CHECKS if check != "compile"]
+
+
+def run(name: str, check: str) -> None:
+    case = CASES[name]
+    check_loss(
+        case.make,
+        case.data(),
+        gradients=case.gradients,
+        targets=case.targets,
+        value_estimators=case.value_estimators,
+        checks=[check],
+    )
+
+
+@pytest.mark.parametrize("check", CHEAP_CHECKS)
+@pytest.mark.parametrize("name", CASES)
+def test_a_loss_keeps_the_contract(name: str, check: str) -> None:
+    run(name, check)
+
+
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt:FutureWarning")
+@pytest.mark.parametrize(
+    "name",
+    [n if n in QUICK_TO_COMPILE else pytest.param(n, marks=pytest.mark.slow) for n in CASES],
+)
+def test_a_loss_compiles_into_one_graph(name: str) -> None:
+    run(name, "compile")
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_the_reward_of_an_objective_keeps_the_contract(name: str) -> None:
+    case = CASES[name]
+    check_skill_objective(case.make, case.data(), checks=["out_keys"])
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [FixedSkillPrior(3, [2.0, 1.0, 0.0]), GrowingSkillPrior(4), LearnedSkillPrior(2, [0.5, 0.0])],
+    ids=lambda prior: type(prior).__name__,
+)
+def test_every_prior_is_a_distribution(prior: Any) -> None:
+    check_skill_prior(prior)
+
+
+def test_no_loss_that_is_exported_is_left_out() -> None:
+    covered = {cls for case in CASES.values() for cls in case.covers}
+    exported = {getattr(torchrl_hmcts.objectives, n) for n in torchrl_hmcts.objectives.__all__}
+    losses = {c for c in exported if isinstance(c, type) and issubclass(c, LossModule)}
+    assert losses - {SkillObjective} == covered
+
+
+@pytest.mark.parametrize("name", ["diayn", "discrete_sac", "continuous_diayn", "continuous_sac"])
+def test_with_and_without_vmap_the_losses_are_the_same(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = CASES[name]
+
+    def losses(deactivate_vmap: bool) -> TensorDict:
+        torch.manual_seed(0)
+        loss = case.make(lambda key: key, deactivate_vmap=deactivate_vmap)
+        plain = DiscreteSACLoss if isinstance(loss, DiscreteSACLoss) else SACLoss
+        plain._make_vmap(loss)  # without the stacked critics, which need neither
+        torch.manual_seed(1)
+        return loss(case.data())
+
+    # The reparametrised actions are drawn alike: the critics alone are vmapped.
+    with_vmap, without = losses(False), losses(True)
+    for key in with_vmap.keys():
+        torch.testing.assert_close(with_vmap[key], without[key])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_priority_weight_may_be_nested_and_weighs_each_transition(name: str) -> None:
+    case = CASES[name]
+    torch.manual_seed(0)
+    loss = case.make(lambda key: key, reduction="sum")
+    if not hasattr(loss.tensor_keys, "priority_weight"):
+        pytest.skip("has no priority weights")
+    td = case.data()
+    torch.manual_seed(1)
+    plain = loss(td.clone())
+    loss.set_keys(priority_weight=("buffer", "weight"))
+    td["buffer", "weight"] = torch.full(td.batch_size, 2.0)
+    torch.manual_seed(1)
+    weighted = loss(td)
+    for key in plain.keys():
+        if key.startswith("loss"):
+            torch.testing.assert_close(weighted[key], 2.0 * plain[key])
+
+
+@pytest.fixture(autouse=True)
+def _compiled_code_is_dropped() -> Iterator[None]:
+    yield
+    torch._dynamo.reset()
+
+
+@pytest.mark.parametrize("kind", [NStepReturn, ValueEstimators.TD0, ValueEstimators.GAE])
+def test_another_value_estimator_keeps_the_discount_of_the_loss(kind: Any) -> None:
+    loss = a3c(lambda key: key, gamma=0.5)
+    loss.make_value_estimator(kind)
+    assert float(loss.value_estimator.gamma) == 0.5
+    loss.make_value_estimator(kind, gamma=0.25)
+    assert float(loss.value_estimator.gamma) == 0.25

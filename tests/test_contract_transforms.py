@@ -1,0 +1,528 @@
+"""Every transform keeps the contract of TorchRL's eleven transform tests, and of four more.
+
+``check_transform`` holds what is common; what a transform must write, and the places where it must
+refuse to be, are one row of a table.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.data import Categorical, Composite, OneHot, Unbounded
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    SerialEnv,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
+
+import torchrl_hmcts.transforms
+from torchrl_hmcts.modules import (
+    FixedSkillPrior,
+    GrowingSkillPrior,
+    SkillActor,
+    SkillDiscriminator,
+    SkillEncoder,
+    SkillPolicy,
+)
+from torchrl_hmcts.objectives import METRAEncoderLoss, SkillDiscriminatorLoss
+from torchrl_hmcts.testing import (
+    TRANSFORM_CHECKS,
+    ChainEnv,
+    ContractError,
+    PointMassEnv,
+    check_macro_env,
+    check_transform,
+)
+from torchrl_hmcts.transforms import (
+    DIAYNReward,
+    DisplacementTransform,
+    OptionRecorder,
+    OptionTransform,
+    SkillMaskTransform,
+    SkillReward,
+    SkillTransform,
+    StallTransform,
+    SubgoalTransform,
+)
+
+PARALLEL = ("parallel", "trans_parallel")
+# Processes take seconds to start; the others with the marker `slow`.
+STARTED = {("option", "parallel"), ("stall", "trans_parallel")}
+N = 5
+
+
+# ------------------------------------------------------------------------------------ envs
+
+
+class OneHotChain(ChainEnv):
+    """A chain whose action is one-hot."""
+
+    def __init__(self, length: int = 5) -> None:
+        super().__init__(length=length)
+        self.action_spec = OneHot(2)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        index = tensordict.get("action").long().argmax(-1)
+        return super()._step(tensordict.copy().set("action", index))
+
+
+class NestedPoint(EnvBase):
+    """A point mass whose entries and action are nested."""
+
+    batch_locked = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = PointMassEnv()
+        spec = self.inner.observation_spec
+        agent = Composite(x=spec["position"].clone(), v=spec["velocity"].clone())
+        self.observation_spec = Composite(agent=agent)
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Composite(agent=Composite(push=Categorical(4)))
+        self.reward_spec = Unbounded((1,))
+
+    def _nest(self, flat: TensorDictBase) -> TensorDictBase:
+        agent = {"x": flat.pop("position"), "v": flat.pop("velocity")}
+        return flat.set("agent", TensorDict(agent, batch_size=flat.batch_size))
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        return self._nest(self.inner._reset(tensordict))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        agent = tensordict.get("agent")
+        flat = {"position": agent["x"], "velocity": agent["v"], "action": agent["push"]}
+        return self._nest(self.inner._step(TensorDict(flat, batch_size=agent.batch_size)))
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.inner._set_seed(seed)
+
+
+def chain_with_options(*, one_hot: bool = False, trajectory_keys: Any = None) -> EnvBase:
+    options = OptionTransform(one_of_two(), 2, 3, one_hot=one_hot, trajectory_keys=trajectory_keys)
+    return TransformedEnv(ChainEnv(length=9), options)
+
+
+def skilled_points() -> EnvBase:
+    return TransformedEnv(PointMassEnv(), SkillTransform(3, 4))
+
+
+def skilled_for_good() -> EnvBase:
+    return TransformedEnv(PointMassEnv(), SkillTransform(3))
+
+
+def counted_points() -> EnvBase:
+    return TransformedEnv(PointMassEnv(), StepCounter(step_count_key="skill_step"))
+
+
+# ------------------------------------------------------------------------------ transforms
+
+
+def same(skill: Tensor) -> Tensor:
+    return skill
+
+
+def as_one_hot(skill: Tensor) -> Tensor:
+    return torch.nn.functional.one_hot(skill, 2).bool()
+
+
+def one_of_two() -> TensorDictModule:
+    """To the left or to the right, as the option says."""
+    return TensorDictModule(same, ["skill"], ["action"])
+
+
+def learned_worker(key: Any = "velocity") -> SkillPolicy:
+    torch.manual_seed(0)
+    return SkillPolicy(SkillActor(2, Categorical(4), 3, in_keys=[key]), deterministic=True)
+
+
+def one_and_two_to_the_right(td: TensorDictBase) -> tuple[Tensor, Tensor]:
+    position = td.get("position")
+    away = torch.tensor([[1.0, 0.0], [2.0, 0.0]], device=position.device)
+    return position.unsqueeze(1) + away, torch.full((len(td),), 2)
+
+
+def discriminator_objective(key: Any = "position") -> SkillDiscriminatorLoss:
+    torch.manual_seed(0)
+    return SkillDiscriminatorLoss(SkillDiscriminator(2, 3, in_keys=[key]))
+
+
+def metra_objective() -> METRAEncoderLoss:
+    torch.manual_seed(0)
+    return METRAEncoderLoss(SkillEncoder(2, 3))
+
+
+def diayn_reward(**kwargs: Any) -> DIAYNReward:
+    torch.manual_seed(0)
+    return DIAYNReward(SkillDiscriminator(2, 3, in_keys=["position"]), 3, **kwargs)
+
+
+def transitions() -> TensorDict:
+    g = torch.Generator().manual_seed(0)
+    after = TensorDict(
+        position=torch.randn(N, 2, generator=g), reward=torch.zeros(N, 1), batch_size=[N]
+    )
+    return TensorDict(
+        position=torch.randn(N, 2, generator=g),
+        skill=torch.arange(N) % 3,
+        next=after,
+        batch_size=[N],
+    )
+
+
+def recorder() -> OptionRecorder:
+    return OptionRecorder(["state", "skill", ("next", "state")])
+
+
+def options_and_recorder() -> Transform:
+    listener = recorder()
+    options = OptionTransform(one_of_two(), 2, 3, trajectory_keys=listener.trajectory_keys)
+    return Compose(options, listener)
+
+
+SUBGOAL_KEYS = ["goals", "plan", "plan_length", "goal_index", "num_plans", "num_goals_met"]
+
+
+@dataclass
+class Case:
+    """How to make a transform, on which env, and what is expected of it (see check_transform)."""
+
+    covers: type | None
+    make: Callable[[], Transform]
+    env: Callable[[], EnvBase]
+    expected: dict[str, Any] = field(default_factory=dict)
+    skip: Sequence[str] = ()
+    #: whether processes are started for it: one of each transform is enough
+    parallel: bool = False
+
+
+REWARD_DATA: dict[str, Any] = {
+    "data": transitions(),
+    "data_writes": [("next", "reward")],
+    "changes": ["reward"],
+}
+OPTION: dict[str, Any] = {
+    "writes": ["duration"],
+    "changes": ["reward"],
+    "inverse_writes": ["action", "skill"],
+}
+CASES = {
+    "skill": Case(
+        SkillTransform,
+        functools.partial(SkillTransform, 3),
+        PointMassEnv,
+        {"writes": ["skill", "skill_step"]},
+        parallel=True,
+    ),
+    "skill_every_2_steps": Case(
+        None,
+        functools.partial(SkillTransform, 3, 2, prior=[0.5, 0.3, 0.2]),
+        PointMassEnv,
+        {
+            "writes": ["skill", "skill_step"],
+            "redrawn_keys": ["skill", "skill_step"],
+            "inside_workers": False,
+        },
+    ),
+    "skill_with_a_generator": Case(
+        None,
+        functools.partial(SkillTransform, 3, 2, seed=0),
+        PointMassEnv,
+        # A reset of the env's seed does not reach its generator.
+        skip=[check for check in TRANSFORM_CHECKS if check not in ("state_dict", "copy")],
+    ),
+    "skill_on_one_hot_actions": Case(
+        None,
+        functools.partial(SkillTransform, 3),
+        OneHotChain,
+        {"writes": ["skill", "skill_step"]},
+    ),
+    "skill_nested": Case(
+        None,
+        functools.partial(
+            SkillTransform, 3, 2, skill_key=("agent", "z"), skill_step_key=("agent", "k")
+        ),
+        NestedPoint,
+        {
+            "writes": [("agent", "z"), ("agent", "k")],
+            "redrawn_keys": [("agent", "z"), ("agent", "k")],
+            "inside_workers": False,
+        },
+    ),
+    "displacement": Case(
+        DisplacementTransform,
+        functools.partial(DisplacementTransform, skill_step_key=None),
+        PointMassEnv,
+        {"writes": ["displacement", "origin"]},
+        parallel=True,
+    ),
+    "displacement_since_the_skill_began": Case(
+        None,
+        DisplacementTransform,
+        skilled_points,
+        {
+            "writes": ["displacement", "origin"],
+            "redrawn_keys": ["skill", "skill_step", "displacement", "origin"],
+            "inside_workers": False,
+        },
+        # The env has a SkillTransform of its own, which may not be inside workers either.
+        skip=["serial", "trans_serial"],
+    ),
+    "displacement_inside_workers": Case(
+        None,
+        DisplacementTransform,
+        counted_points,
+        {"inside_workers": False},
+        skip=[check for check in TRANSFORM_CHECKS if check != "serial"],
+    ),
+    "displacement_nested": Case(
+        None,
+        functools.partial(
+            DisplacementTransform,
+            ("agent", "x"),
+            ("agent", "d"),
+            origin_key=("agent", "o"),
+            skill_step_key=None,
+        ),
+        NestedPoint,
+        {"writes": [("agent", "d"), ("agent", "o")]},
+    ),
+    "skill_reward": Case(
+        SkillReward,
+        lambda: SkillReward(discriminator_objective()),
+        skilled_for_good,
+        {**REWARD_DATA},
+        parallel=False,
+    ),
+    "skill_reward_of_metra": Case(
+        None,
+        lambda: SkillReward(metra_objective(), intrinsic_coeff=0.5, extrinsic_coeff=0.1),
+        skilled_for_good,
+        {**REWARD_DATA},
+    ),
+    "diayn_reward": Case(
+        DIAYNReward,
+        diayn_reward,
+        skilled_for_good,
+        {**REWARD_DATA},
+    ),
+    "option": Case(
+        OptionTransform,
+        lambda: OptionTransform(one_of_two(), 2, 3),
+        functools.partial(ChainEnv, 9),
+        OPTION,
+        parallel=True,
+    ),
+    "option_one_hot": Case(
+        None,
+        lambda: OptionTransform(one_of_two(), 2, 3, one_hot=True),
+        functools.partial(ChainEnv, 9),
+        OPTION,
+    ),
+    "option_on_one_hot_actions": Case(
+        None,
+        lambda: OptionTransform(TensorDictModule(as_one_hot, ["skill"], ["action"]), 2, 3),
+        OneHotChain,
+        OPTION,
+    ),
+    "option_nested": Case(
+        None,
+        lambda: OptionTransform(
+            TensorDictModule(same, [("agent", "z")], [("agent", "push")]),
+            4,
+            3,
+            option_key=("agent", "option"),
+            skill_key=("agent", "z"),
+            duration_key=("agent", "k"),
+        ),
+        NestedPoint,
+        {
+            "writes": [("agent", "k")],
+            "changes": ["reward"],
+            "inverse_writes": [("agent", "push"), ("agent", "z")],
+        },
+    ),
+    "option_with_a_network_and_trajectories": Case(
+        None,
+        lambda: OptionTransform(
+            learned_worker(), 3, 4, trajectory_keys=["position", ("next", "reward")]
+        ),
+        PointMassEnv,
+        {**OPTION, "writes": ["duration", ("trajectory", "position"), ("trajectory", "mask")]},
+    ),
+    "recorder": Case(
+        OptionRecorder,
+        recorder,
+        functools.partial(
+            chain_with_options, trajectory_keys=recorder().trajectory_keys
+        ),
+        {
+            "changes": [
+                ("trajectory", "state"),
+                ("trajectory", "next", "state"),
+                ("trajectory", "mask"),
+            ],
+            "inside_workers": False,
+        },
+        # It takes entries away: see the tests below. Around workers it needs the options there.
+        skip=["env", "trans_serial"],
+    ),
+    "options_and_recorder": Case(
+        None,
+        options_and_recorder,
+        functools.partial(ChainEnv, 9),
+        {"inside_workers": False},
+        skip=["no_env", "compose", "model", "replay_buffer", "env", "inverse", "serial"],
+    ),
+    "skill_mask": Case(
+        SkillMaskTransform,
+        lambda: SkillMaskTransform(FixedSkillPrior(2, [1.0, 0.0])),
+        chain_with_options,
+        {"writes": ["action_mask"], "inside_workers": False},
+    ),
+    "skill_mask_one_hot_nested": Case(
+        None,
+        lambda: SkillMaskTransform(GrowingSkillPrior(2), mask_key=("agent", "mask")),
+        functools.partial(chain_with_options, one_hot=True),
+        {"writes": [("agent", "mask")], "inside_workers": False},
+    ),
+    "stall": Case(
+        StallTransform,
+        functools.partial(StallTransform, "state", 0.5),
+        ChainEnv,
+        {"writes": ["stalled_steps"]},
+        parallel=True,
+    ),
+    "stall_nested": Case(
+        None,
+        functools.partial(StallTransform, ("agent", "x"), 0.1, ("agent", "stalled")),
+        NestedPoint,
+        {"writes": [("agent", "stalled")]},
+    ),
+    "subgoal": Case(
+        SubgoalTransform,
+        lambda: SubgoalTransform(one_and_two_to_the_right, max_goals=4),
+        PointMassEnv,
+        {
+            "writes": [*SUBGOAL_KEYS, "num_divergences"],
+            "writes_next": ["task_reward"],
+            "changes": ["reward"],
+        },
+        parallel=True,
+    ),
+    "subgoal_nested": Case(
+        None,
+        lambda: SubgoalTransform(
+            one_and_two_to_the_right,
+            max_goals=4,
+            goals_key=("agent", "goals"),
+            plan_key=("agent", "plan"),
+            task_reward_key=("agent", "task_reward"),
+            relative=False,
+        ),
+        PointMassEnv,
+        {
+            "writes": [("agent", "goals"), ("agent", "plan"), "plan_length", "goal_index",
+                       "num_plans", "num_goals_met", "num_divergences"],
+            "writes_next": [("agent", "task_reward")],
+            "changes": ["reward"],
+        },
+    ),
+}  # fmt: skip
+
+
+def on_env(case: Case) -> TransformedEnv:
+    return TransformedEnv(case.env(), case.make(), auto_unwrap=True)
+
+
+def rows() -> list[Any]:
+    found = []
+    for name, case in CASES.items():
+        for check in TRANSFORM_CHECKS:
+            if check in case.skip or (check in PARALLEL and not case.parallel):
+                continue
+            slow = check in PARALLEL and (name, check) not in STARTED
+            marks = [pytest.mark.slow] if slow else []
+            found.append(pytest.param(name, check, id=f"{name}-{check}", marks=marks))
+    return found
+
+
+@pytest.mark.parametrize(("name", "check"), rows())
+def test_a_transform_keeps_the_contract(name: str, check: str) -> None:
+    case = CASES[name]
+    check_transform(case.make, case.env, **case.expected, start_method="fork", checks=[check])
+
+
+def test_no_transform_that_is_exported_is_left_out() -> None:
+    exported = {getattr(torchrl_hmcts.transforms, n) for n in torchrl_hmcts.transforms.__all__}
+    transforms = {c for c in exported if issubclass(c, Transform)}
+    assert transforms == {case.covers for case in CASES.values()} - {None}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_specs_are_on_the_device_of_the_env(name: str) -> None:
+    """With an env on the meta device a tensor that was made elsewhere would be seen."""
+    case = CASES[name]
+    if "option" in name or name in ("recorder", "skill_mask", "skill_mask_one_hot_nested"):
+        pytest.skip("an OptionTransform runs its worker on real data when it is attached")
+    env = TransformedEnv(case.env().to("meta"), case.make(), auto_unwrap=True)
+    for spec in (env.full_observation_spec, env.full_state_spec, env.full_reward_spec):
+        assert all(leaf.device.type == "meta" for leaf in spec.values(True, True))
+
+
+def test_a_recorder_around_options_inside_workers_says_what_is_wrong() -> None:
+    case = CASES["recorder"]
+    env = TransformedEnv(SerialEnv(2, case.env), case.make())
+    with pytest.raises(KeyError, match="same side of a SerialEnv"):
+        env.rollout(1)
+
+
+def test_a_recorder_takes_the_trajectory_out_and_leaves_the_rest() -> None:
+    case = CASES["recorder"]
+    env, plain = on_env(case), case.env()
+    torch.manual_seed(0)
+    actual = env.rollout(4)
+    torch.manual_seed(0)
+    expected = plain.rollout(4).exclude("trajectory", ("next", "trajectory"))
+    assert set(actual.keys(True, True)) == set(expected.keys(True, True))
+    for key in expected.keys(True, True):
+        assert torch.equal(actual[key], expected[key])
+
+
+MACRO_ENVS = {name: CASES[name] for name in CASES if name.startswith(("option", "skill_mask"))}
+
+
+@pytest.mark.parametrize("name", MACRO_ENVS)
+def test_an_env_of_options_keeps_the_contract_of_a_macro_env(name: str) -> None:
+    case = MACRO_ENVS[name]
+    env = on_env(case)
+    duration = ("agent", "k") if name == "option_nested" else "duration"
+    mask = ("agent", "mask") if "nested" in name else "action_mask"
+    check_macro_env(env, duration_key=duration, mask_key=mask, tolerance=1e-5)
+
+
+def test_an_env_of_random_options_keeps_it_too() -> None:
+    torch.manual_seed(0)
+    worker = SkillPolicy(SkillActor(2, Categorical(4), 3, in_keys=["velocity"]))
+    env = TransformedEnv(PointMassEnv(), OptionTransform(worker, 3, 4))
+    check_macro_env(env, deterministic=False)
+
+
+def test_a_macro_env_of_a_batch_locked_env_cannot_be_planned_in() -> None:
+    worker = TensorDictModule(same, ["skill"], ["action"])
+    base = ChainEnv(length=5, batch_size=[2])
+    base.batch_locked = True
+    base._supports_set_state = False
+    env = TransformedEnv(base, OptionTransform(worker, 2, 3))
+    with pytest.raises(ContractError, match="ChainEnv.*set to any state"):
+        check_macro_env(env)

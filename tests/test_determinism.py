@@ -1,0 +1,144 @@
+"""The same seed gives the same figures: search and training, with one torch thread and with two.
+
+Elsewhere: train 2 n = train n, load in a new process, train n, for DIAYN (test_trainer_resume.py),
+Algorithm 3 (test_hmcts_trainer.py) and expert iteration (test_expert_iteration.py); the demo's
+figures (test_demo.py); A3C's learner (test_a3c_trainer.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv
+
+from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import (
+    PUCT,
+    UCT,
+    DirichletNoise,
+    Gumbel,
+    MCTSPlanner,
+    RadiusNovelty,
+    SampledVisits,
+    SearchBudget,
+)
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
+from torchrl_hmcts.trainers.waterworld.worker import make_training_env
+from torchrl_hmcts.transforms import OptionTransform
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    yield torch.set_num_threads
+    torch.set_num_threads(1)
+
+
+def train_diayn() -> dict[str, Any]:
+    env = make_training_env(copies=32)
+    loss = DIAYNTrainer.make_loss(env, 4, seed=0)
+    trainer = DIAYNTrainer(env, loss, total_frames=192, seed=0)
+    trainer.train()
+    return {**loss.state_dict(), **trainer.history}
+
+
+def train_hmcts() -> dict[str, Any]:
+    loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=0)
+    trainer = HMCTSTrainer(
+        partial(WaterworldMazeEnv, observation=False),
+        loss,
+        rounds=6,
+        num_init_samples=4,
+        retrain_interval=2,
+        option_steps=10,
+        make_planner=partial(
+            MCTSPlanner,
+            novelty=RadiusNovelty("position", 0.5),
+            budget=SearchBudget(expansions=3),
+        ),
+        seed=0,
+    )
+    trainer.train()
+    return {**loss.state_dict(), **trainer.records.columns}
+
+
+def search_options() -> dict[str, Any]:
+    """A search over options of a random worker, from four starts at once."""
+    env = make_training_env(copies=1)
+    loss = DIAYNTrainer.make_loss(env, 4, seed=0)
+    options = OptionTransform(SkillPolicy(loss.actor_network, deterministic=True), 4, 10)
+    macro = TransformedEnv(WaterworldMazeEnv(observation=False), Compose(options))
+    macro.set_seed(0)
+    starts = macro.reset(TensorDict(batch_size=[4]))
+    planner = MCTSPlanner(
+        macro, novelty=RadiusNovelty("position", 0.5), budget=SearchBudget(expansions=40)
+    )
+    return arrays(planner.search(starts, seed=0))
+
+
+def search_maze(**kwargs: Any) -> dict[str, Any]:
+    env = GridworldMazeEnv()
+    env.set_seed(0)
+    start = env.reset(TensorDict(batch_size=[3]))
+    planner = MCTSPlanner(env, **{"budget": SearchBudget(expansions=60), **kwargs})
+    found = arrays(planner.search(start, seed=4))
+    plans = planner.plan(start)
+    return {**found, "options": plans.options, "lengths": plans.lengths}
+
+
+def arrays(search: Any) -> dict[str, Any]:
+    tree = search.tree
+    used = int(tree.num_nodes.max())
+    assert used > 20
+    return {
+        "nodes": tree.nodes[:, :used].copy(),
+        "edges": tree.edges[:, :used].copy(),
+        "roots": tree.roots.copy(),
+        "steps": search.num_base_steps.copy(),
+    }
+
+
+def same(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
+    """Returns the names of what differs in any bit."""
+    assert list(a) == list(b)
+    return [n for n in a if np.asarray(a[n]).tobytes() != np.asarray(b[n]).tobytes()]
+
+
+@pytest.mark.parametrize("run", [train_diayn, train_hmcts, search_options])
+def test_one_thread_and_two_give_the_same_bits(
+    run: Callable[[], dict[str, Any]], threads: Callable[[int], None]
+) -> None:
+    results = []
+    for number in (1, 2):
+        threads(number)
+        torch.rand(number)  # what was drawn before does not matter
+        results.append(run())
+    assert same(*results) == []
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"tree_policy": UCT(c=1.0)},
+        {"tree_policy": PUCT(), "root_noise": DirichletNoise(0.3)},
+        {
+            "tree_policy": Gumbel(),
+            "expand": "one",
+            "budget": SearchBudget(simulations=64, until_plan=False),
+        },
+        {"final_choice": SampledVisits(temperature=1.0)},
+        {"leaves_per_wave": 4},
+    ],
+    ids=lambda parts: "+".join(parts),
+)
+def test_a_search_is_a_function_of_its_seed(parts: dict[str, Any]) -> None:
+    one = search_maze(**parts)
+    torch.rand(7)
+    assert same(one, search_maze(**parts)) == []

@@ -1,0 +1,189 @@
+"""The documentation site names everything, and what its pages say can be run.
+
+The site itself, with its tutorials, is built by ``make docs`` (in .ci/run), not here.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+GENERATED = {"auto_tutorials", "auto_reference", "auto_results", "_build"}
+PACKAGES = ("planners", "objectives", "modules", "transforms", "envs", "trainers", "testing")
+
+# Pages whose code other tests run, each beside the tests of what it shows.
+RUN_ELSEWHERE = {
+    "planning.md": "test_readme.py",
+    "skills.md": "test_readme.py",
+    "atari.md": "test_readme.py",
+    "lab_maze.md": "test_lab_maze.py",
+    "algorithms/a3c.md": "test_a3c_trainer.py",
+    "algorithms/goal_based_agent.md": "test_goal_planning.py",
+}
+BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
+
+
+def pages() -> dict[str, str]:
+    """Maps each page's name under docs/ to its text; generated ones are left out."""
+    return {
+        path.relative_to(DOCS).as_posix(): path.read_text()
+        for path in sorted([*DOCS.rglob("*.md"), *DOCS.rglob("*.rst")])
+        if not GENERATED & set(path.relative_to(DOCS).parts)
+        and path.relative_to(DOCS).parts[0] not in {"tutorials", "_templates"}
+    }
+
+
+PAGES = pages()
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.py"))
+
+
+def toctree_entries(page: str) -> list[str]:
+    """Returns the documents that a page's toctrees name, relative to docs/."""
+    text = PAGES[page]
+    blocks = re.findall(r"```\{toctree\}\n(.*?)```", text, re.DOTALL)
+    blocks += re.findall(r"^\.\. toctree::\n((?:[ \t]+.*\n|\n)+)", text, re.MULTILINE)
+    entries = []
+    for line in "\n".join(blocks).splitlines():
+        name = line.strip()
+        if name and not name.startswith(":"):
+            entries.append((DOCS / page).parent.joinpath(name).resolve())
+    return [path.relative_to(DOCS.resolve()).as_posix() for path in entries]
+
+
+def test_every_page_is_in_one_toctree_and_every_entry_is_a_page() -> None:
+    listed = [entry for page in PAGES for entry in toctree_entries(page)]
+    assert len(listed) == len(set(listed))
+    written = {page.rsplit(".", 1)[0] for page in PAGES} - {"index"}
+    generated = {entry for entry in listed if entry.split("/")[0] in GENERATED}
+    assert written == set(listed) - generated
+    assert generated == {
+        "auto_tutorials/index",
+        "auto_results/index",
+        "auto_reference/command_line",
+    }
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_is_in_the_reference_once(package: str) -> None:
+    text = PAGES[f"reference/{package}.rst"]
+    assert f".. currentmodule:: torchrl_hmcts.{package}\n" in text
+    named = re.findall(r"^ {3}([A-Za-z_]\w*)$", text, re.MULTILINE)
+    named += re.findall(r"^\.\. py:data:: (\w+)$", text, re.MULTILINE)
+    public = set(importlib.import_module(f"torchrl_hmcts.{package}").__all__)
+    assert len(named) == len(set(named))
+    assert set(named) == public, (
+        f"docs/reference/{package}.rst lacks {sorted(public - set(named))} and names "
+        f"{sorted(set(named) - public)}, which is not public: write each name into its group"
+    )
+
+
+def test_short_names_in_docstrings_are_looked_up_in_every_package_of_the_reference() -> None:
+    source = (DOCS / "_extensions" / "public_names.py").read_text()
+    looked_up = re.findall(r'^    "torchrl_hmcts\.(\w+)",$', source, re.MULTILINE)
+    assert sorted(looked_up) == sorted(PACKAGES)
+
+
+class TestTutorials:
+    def test_there_are_six_at_least(self) -> None:
+        assert len(TUTORIALS) >= 6
+
+    @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+    def test_a_tutorial_has_a_title_a_picture_and_names_only_pages_that_exist(
+        self, path: Path
+    ) -> None:
+        source = path.read_text()
+        doc = ast.get_docstring(ast.parse(source)) or ""
+        title, rule = doc.splitlines()[:2]
+        assert set(rule) == {"="}
+        assert len(rule) >= len(title)
+        assert "plt.show()" in source
+        for target in re.findall(r":doc:`(?:[^<`]*<)?([^>`]+)>?`", source):
+            if target.startswith("/"):
+                assert any((DOCS / f"{target[1:]}{end}").exists() for end in (".md", ".rst"))
+            else:
+                assert (DOCS / "tutorials" / f"{target}.py").exists(), target
+
+    @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+    def test_a_tutorial_uses_only_public_names_of_the_components(self, path: Path) -> None:
+        packages = {f"torchrl_hmcts.{package}" for package in PACKAGES}
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "") in packages:
+                exported = importlib.import_module(node.module or "").__all__
+                assert {alias.name for alias in node.names} <= set(exported)
+
+    def test_pages_that_lead_to_a_tutorial_lead_to_one_that_exists(self) -> None:
+        stems = {path.stem for path in TUTORIALS}
+        for page, text in PAGES.items():
+            for stem in re.findall(r"auto_tutorials/(\d\w+)", text):
+                assert stem in stems, f"{page} leads to the tutorial {stem}, which does not exist"
+
+
+RUN_HERE = sorted(p for p, text in PAGES.items() if BLOCK.search(text) and p not in RUN_ELSEWHERE)
+
+
+class TestCodeOfThePages:
+    def test_every_page_with_code_is_run_by_a_test(self) -> None:
+        assert len(RUN_HERE) >= 4  # here, all that are not named above
+        for page, test in RUN_ELSEWHERE.items():
+            assert BLOCK.search(PAGES[page])
+            assert page.rsplit("/", 1)[-1] in (Path(__file__).parent / test).read_text()
+
+    @pytest.mark.parametrize("page", RUN_HERE)
+    def test_every_python_block_of_a_page_runs(
+        self, page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        namespace: dict = {}
+        for block in BLOCK.findall(PAGES[page]):
+            exec(compile(block, page, "exec"), namespace)  # noqa: S102
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])
+def test_pictures_and_links_of_a_page_exist(page: str) -> None:
+    text = re.sub(r"```.*?```", "", PAGES[page], flags=re.DOTALL)
+    for target in re.findall(r"\]\((?!https?:)([^)#\s]+)(?:#[^)]*)?\)", text):
+        if not GENERATED & set(target.split("/")):
+            assert ((DOCS / page).parent / target).exists(), f"{page} leads to {target}"
+
+
+class TestResultsPage:
+    @pytest.fixture
+    def module(self, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.syspath_prepend(str(DOCS / "_extensions"))
+        return importlib.import_module("results_page")
+
+    def test_every_file_of_results_is_on_the_page(self, module) -> None:
+        page = module.page()
+        for name in module.data_files():
+            if name not in {"demo/metrics.json"}:  # its figures are a row of demo/seeds.csv
+                assert f"../results/{name}" in page, f"{name} is not on the page of results"
+
+    def test_every_data_file_says_how_it_was_made(self, module) -> None:
+        listed = module.commands((DOCS / "results" / "README.md").read_text())
+        for name in module.data_files():
+            if name.endswith((".json", ".csv")):
+                data = module.load(DOCS / "results" / name)
+                assert module.command_of(name, data, listed), f"no command for docs/results/{name}"
+
+    def test_a_file_of_another_form_is_named(self, module, tmp_path: Path) -> None:
+        (tmp_path / "README.md").write_text("")
+        (tmp_path / "skills").mkdir()
+        (tmp_path / "skills" / "worker.json").write_text('{"runs": []}')
+        with pytest.raises(ValueError, match=r"skills/worker.json is not what .* reads"):
+            module.page(tmp_path)
+
+    def test_figures_are_those_of_the_data(self, module, tmp_path: Path) -> None:
+        (tmp_path / "README.md").write_text("| `skills/training_speed.json` | `run it` |\n")
+        (tmp_path / "skills").mkdir()
+        (tmp_path / "skills" / "training_speed.json").write_text(
+            '{"runs": [{"seed": 7, "steps_per_second": {"ours": 1234.4, "theirs": 99.0}}]}'
+        )
+        page = module.page(tmp_path)
+        assert "| base steps per CPU second | seeds 7 |" in page
+        assert "| ours | 1,234 |" in page
+        assert "`run it`" in page

@@ -1,0 +1,445 @@
+"""Full disks, read-only folders, damaged and foreign checkpoints, and losses that are NaN."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+import shlex
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+from torchrl.envs import Compose, TransformedEnv
+
+from torchrl_hmcts.envs import WaterworldMazeEnv
+from torchrl_hmcts.trainers import checkpoints
+from torchrl_hmcts.trainers.checkpoints import (
+    DurableRotation,
+    check_settings,
+    find_damage,
+    plain_checkpoint,
+    write_text,
+)
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.resume import newest_checkpoint
+from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+class Big(nn.Module):
+    """Half a mebibyte of weights that say at which step they were saved."""
+
+    def __init__(self, step: int = 0) -> None:
+        super().__init__()
+        self.register_buffer("weights", torch.full((2**17,), float(step)))
+
+
+def save(folder: Path, *steps: int, keep_last: int = 9) -> DurableRotation:
+    rotation = DurableRotation(folder, keep_last=keep_last)
+    for step in steps:
+        rotation.save(plain_checkpoint(net=Big(step)), step=step)
+    return rotation
+
+
+def load(path: Path) -> float:
+    net = Big()
+    plain_checkpoint(net=net).load(path)
+    assert len(set(net.weights.tolist())) == 1
+    return float(net.weights[0])
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(content)
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def text(path: Path) -> None:
+    path.write_text("no checkpoint")
+
+
+def strip(path: Path) -> None:
+    """Leaves a valid zip without one of its arrays."""
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in content.items():
+            if not name.endswith(".memmap"):
+                archive.writestr(name, data)
+
+
+@pytest.fixture
+def trainer(tmp_path: Path) -> Iterator[Callable[..., DIAYNTrainer]]:
+    made: list[DIAYNTrainer] = []
+
+    def make(folder: Path | None = tmp_path / "run", hidden: int = 8, **kw: Any) -> DIAYNTrainer:
+        base = WaterworldMazeEnv(batch_size=[8], observation=False, max_steps=10)
+        env = TransformedEnv(base, Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()))
+        loss = DIAYNTrainer.make_loss(env, 4, hidden=(hidden,), seed=0)
+        settings = {"total_frames": 48, "frames_per_batch": 16, "batch_size": 8, "seed": 0, **kw}
+        made.append(DIAYNTrainer(env, loss, save_dir=folder, buffer_size=64, **settings))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.collector.shutdown()
+
+
+class TestDamage:
+    @pytest.mark.parametrize("damage", [cut, flip, empty, text, strip])
+    def test_the_newest_whole_checkpoint_is_taken_and_a_line_says_so(
+        self, damage: Callable[[Path], None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        newest = save(tmp_path, 1, 2, 3).checkpoints()[-1]
+        damage(newest)
+        assert load(newest_checkpoint(tmp_path)) == 2.0
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert said.startswith(f"Checkpoint {newest.name} is damaged (")
+        assert said.endswith("Going on from checkpoint-000000000002.torchrl.\n")
+
+    def test_every_cut_of_a_checkpoint_is_noticed(self, tmp_path: Path) -> None:
+        (path,) = save(tmp_path, 1).checkpoints()
+        whole = path.read_bytes()
+        for length in range(0, len(whole), len(whole) // 50):
+            path.write_bytes(whole[:length])
+            assert find_damage(path), length
+        path.write_bytes(whole)
+        assert find_damage(path) is None
+
+    def test_a_damaged_checkpoint_that_was_asked_for_is_refused(self, tmp_path: Path) -> None:
+        path = save(tmp_path, 1, 2).checkpoints()[-1]
+        flip(path)
+        with pytest.raises(CheckpointError, match=r"damaged \(.*checksum\).*Pass its folder"):
+            newest_checkpoint(path)
+
+    def test_when_all_are_damaged_each_is_named(self, tmp_path: Path) -> None:
+        for path in save(tmp_path, 1, 2).checkpoints():
+            cut(path)
+        with pytest.raises(CheckpointError, match=r"is whole.*02\.torchrl.*01\.torchrl.*anew"):
+            newest_checkpoint(tmp_path)
+
+    @pytest.mark.parametrize("damage", ["cut", "missing"])
+    def test_folders_that_torchrl_wrote_are_read_and_checked_too(
+        self, damage: str, tmp_path: Path
+    ) -> None:
+        rotation = CheckpointRotation(tmp_path, keep_last=2)
+        for step in (1, 2):
+            rotation.save(Checkpoint(net=Big(step)), step=step)
+        assert load(newest_checkpoint(tmp_path)) == 2.0
+        (array,) = (tmp_path / "checkpoint-000000000002").rglob("*.memmap")
+        cut(array) if damage == "cut" else array.unlink()
+        assert load(newest_checkpoint(tmp_path)) == 1.0
+
+    def test_torchrl_reads_what_is_written_here(self, tmp_path: Path) -> None:
+        save(tmp_path, 7)
+        net = Big()
+        CheckpointRotation(tmp_path, keep_last=1).load_latest(Checkpoint(net=net))
+        assert net.weights[0] == 7.0
+
+    def test_every_kind_of_entry_comes_back_as_it_was(self, tmp_path: Path) -> None:
+        class Holder:
+            state: dict[Any, Any] = {
+                "scalar": torch.tensor(2.5),
+                "none": torch.zeros(0, 3),
+                "half": torch.ones(3, dtype=torch.bfloat16),
+                "flags": torch.tensor([True, False]),
+                "strided": torch.arange(6).view(2, 3).t(),
+                3: [1, None, "x", (True, 1e-9)],
+            }
+
+            def state_dict(self) -> dict[Any, Any]:
+                return Holder.state
+
+            def load_state_dict(self, state: dict[Any, Any]) -> None:
+                self.got = state
+
+        path = plain_checkpoint(it=Holder()).save(tmp_path / "c")
+        other = Holder()
+        plain_checkpoint(it=other).load(path)
+        assert list(other.got) == list(Holder.state)
+        assert other.got[3] == Holder.state[3]
+        for name, value in Holder.state.items():
+            if isinstance(value, torch.Tensor):
+                assert other.got[name].dtype == value.dtype
+                assert torch.equal(other.got[name], value), name
+
+
+class TestRotation:
+    def test_only_the_newest_are_kept(self, tmp_path: Path) -> None:
+        rotation = save(tmp_path, 1, 2, 3, 4, keep_last=2)
+        assert [load(path) for path in rotation.checkpoints()] == [3.0, 4.0]
+        assert len(names(tmp_path)) == 2
+
+    def test_a_damaged_one_does_not_count_so_that_the_last_good_one_stays(
+        self, tmp_path: Path
+    ) -> None:
+        rotation = save(tmp_path, 1, 2, 3)
+        rotation.keep_last = 1
+        for path in rotation.checkpoints()[1:]:
+            flip(path)
+        rotation.prune()
+        assert len(names(tmp_path)) == 3
+        assert load(newest_checkpoint(tmp_path)) == 1.0
+
+    def test_after_a_fall_back_the_new_ones_count_as_the_newest(self, tmp_path: Path) -> None:
+        rotation = save(tmp_path, 100, 200, keep_last=1)
+        flip(rotation.checkpoints()[-1])
+        rotation.save(plain_checkpoint(net=Big(150)), step=150)
+        assert names(tmp_path) == ["checkpoint-000000000150.torchrl"]
+        assert load(newest_checkpoint(tmp_path)) == 150.0
+
+    def test_the_same_step_can_be_saved_again(self, tmp_path: Path) -> None:
+        rotation = save(tmp_path, 5)
+        rotation.save(plain_checkpoint(net=Big(6)), step=5)
+        assert load(newest_checkpoint(tmp_path)) == 6.0
+
+    def test_what_a_killed_process_left_is_removed(self, tmp_path: Path) -> None:
+        gone = subprocess.Popen([sys.executable, "-c", ""])
+        gone.wait()
+        left = tmp_path / f"..checkpoint-000000000001.torchrl.writing-{gone.pid}.stage-0a"
+        left.mkdir()
+        (left / "x.memmap").write_bytes(b"x")
+        other = tmp_path / f".checkpoint-000000000001.torchrl.writing-{os.getppid()}"
+        other.write_bytes(b"x")
+        save(tmp_path, 2)
+        assert names(tmp_path) == [other.name, "checkpoint-000000000002.torchrl"]
+
+
+class TestDisk:
+    def full_after(self, monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
+        """Makes the write of a checkpoint fail at one of its files."""
+        real, left = Path.write_bytes, [calls]
+
+        def write(self: Path, data: bytes) -> int:
+            left[0] -= 1
+            if left[0] < 0:
+                real(self, data[: len(data) // 2])
+                raise FULL
+            return real(self, data)
+
+        monkeypatch.setattr(Path, "write_bytes", write)
+
+    @pytest.mark.parametrize("where", ["arrays", "archive", "fsync", "rename"])
+    def test_a_full_disk_loses_no_checkpoint_and_is_named(
+        self, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def fail(*_: Any, **__: Any) -> None:
+            raise FULL
+
+        rotation = save(tmp_path, 1, 2)
+        before = names(tmp_path)
+        with monkeypatch.context() as patch:
+            if where == "arrays":
+                self.full_after(patch, 0)
+            elif where == "archive":
+                patch.setattr(zipfile.ZipFile, "write", fail)
+            else:
+                patch.setattr(os, {"fsync": "fsync", "rename": "replace"}[where], fail)
+            with pytest.raises(
+                OSError,
+                match=r"of step 3 .*No space left.*MiB free\).*Kept: .*01\.torchrl, .*02",
+            ) as caught:
+                rotation.save(plain_checkpoint(net=Big(3)), step=3)
+        assert caught.value.errno == errno.ENOSPC
+        assert names(tmp_path) == before
+        rotation.save(plain_checkpoint(net=Big(4)), step=4)  # there is room again
+        assert load(newest_checkpoint(tmp_path)) == 4.0
+
+    def test_a_small_disk_that_really_is_full_ends_in_an_error(self, tmp_path: Path) -> None:
+        """Memory maps, which TorchRL writes by, would kill the process: hence a process."""
+        disk = tmp_path / "disk"
+        disk.mkdir()
+        script = (
+            f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+            f"from pathlib import Path; from {Path(__file__).stem} import *\n"
+            f"disk = Path({str(disk)!r})\n"
+            "try:\n    save(disk, *range(9))\n"
+            "finally:\n    print([load(path) for path in DurableRotation(disk).checkpoints()])"
+        )
+        mount = f"mount -t tmpfs -o size=2m tmpfs {shlex.quote(str(disk))}"
+        private = ["unshare", "-m", "sh", "-c"]  # the disk vanishes with the process
+        if not shutil.which("unshare") or subprocess.run([*private, mount]).returncode:
+            pytest.skip("needs the right to mount a file system")
+        command = f"{mount} && exec {shlex.quote(sys.executable)} -c {shlex.quote(script)}"
+        done = subprocess.run([*private, command], capture_output=True, text=True)
+        assert done.returncode == 1, done.returncode  # and no signal
+        assert "No space left on device; " in done.stderr.splitlines()[-1]
+        assert done.stdout.splitlines()[-1] == "[0.0, 1.0]"
+
+    def test_a_folder_that_cannot_be_written_is_named_before_any_work(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        with pytest.raises(OSError, match="cannot be written to '.*file/run' .Not a directory"):
+            DurableRotation(tmp_path / "file" / "run")
+
+    def test_a_read_only_folder_is_named_before_any_work_and_can_be_read(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def read_only(*_: Any, **__: Any) -> None:
+            raise OSError(errno.EROFS, "Read-only file system")
+
+        save(tmp_path, 1)
+        with monkeypatch.context() as patch:  # for root, no folder is read-only
+            patch.setattr(checkpoints.tempfile, "TemporaryFile", read_only)
+            with pytest.raises(OSError, match=r"Read-only file system.*Choose a save_dir"):
+                DurableRotation(tmp_path)
+            assert load(newest_checkpoint(tmp_path)) == 1.0
+
+    def test_a_text_is_replaced_in_one_move_or_not_at_all(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = tmp_path / "metrics.json"
+        write_text(path, "old")
+
+        def fail(*_: Any) -> None:
+            raise FULL
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", fail)
+            with pytest.raises(OSError, match="No space"):
+                write_text(path, "new")
+        assert path.read_text() == "old"
+        assert names(tmp_path) == ["metrics.json"]
+        write_text(path, "new")
+        assert path.read_text() == "new"
+
+
+class TestForeign:
+    def rewrite(self, path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+        with zipfile.ZipFile(path) as archive:
+            content = {name: archive.read(name) for name in archive.namelist()}
+        manifest = json.loads(content["manifest.json"])
+        change(manifest)
+        content["manifest.json"] = json.dumps(manifest).encode()
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in content.items():
+                archive.writestr(name, data)
+
+    def test_a_newer_version_is_named_and_nothing_older_is_taken_instead(
+        self, tmp_path: Path
+    ) -> None:
+        path = save(tmp_path, 1, 2).checkpoints()[-1]
+        self.rewrite(
+            path,
+            lambda m: m["metadata"]["torchrl_hmcts"].update(version="9.1", checkpoint_version=7),
+        )
+        with pytest.raises(CheckpointError, match=r"written by torchrl_hmcts 9\.1.*version 7"):
+            newest_checkpoint(tmp_path)
+        self.rewrite(path, lambda m: m.update(format_version=8, metadata={}))
+        with pytest.raises(CheckpointError, match="Unsupported newer checkpoint format version 8"):
+            newest_checkpoint(tmp_path)
+
+    def test_a_run_with_other_settings_is_refused_with_both_values(
+        self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+    ) -> None:
+        trainer().train()
+        with pytest.raises(
+            CheckpointError, match="other settings: batch_size was 8 and is 16 here.*Build it as"
+        ):
+            trainer(tmp_path / "new", batch_size=16).load(tmp_path / "run")
+        other = trainer(tmp_path / "new")
+        other.run_settings["loss_module"] = "METRALoss"
+        with pytest.raises(CheckpointError, match="loss_module was 'DIAYNLoss' and is 'METRALoss'"):
+            other.load(tmp_path / "run")
+
+    def test_networks_of_other_sizes_are_refused(
+        self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+    ) -> None:
+        trainer().train()
+        with pytest.raises(CheckpointError, match="size mismatch|shape"):
+            trainer(tmp_path / "new", hidden=9).load(tmp_path / "run")
+
+    def test_settings_are_compared_as_they_come_back_from_json(self, tmp_path: Path) -> None:
+        rotation = DurableRotation(tmp_path)
+        rotation.settings = {"hidden": (8, 8), "fraction": None}
+        path = rotation.save(plain_checkpoint(net=Big()), step=0)
+        check_settings(path, {"hidden": (8, 8), "fraction": None, "new": 1})
+        with pytest.raises(CheckpointError, match=r"hidden was \[8, 8\] and is \[8\] here"):
+            check_settings(path, {"hidden": (8,)})
+
+    def test_a_pickle_inside_a_checkpoint_is_not_opened(self, tmp_path: Path) -> None:
+        class Bomb:
+            def __reduce__(self) -> Any:
+                return os.mkdir, (str(tmp_path / "exploded"),)
+
+        path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
+        (state,) = path.rglob("state")
+        for name, where in (("other.pickle", state), ("state.pt", state.parent)):
+            bomb = where / name
+            bomb.write_bytes(pickle.dumps(Bomb()))
+            with pytest.raises(CheckpointError, match=f"holds '{name}'.*could execute code"):
+                load(path)
+            bomb.unlink()
+        assert not (tmp_path / "exploded").exists()
+        assert load(path) == 0.0
+
+
+class TestNaN:
+    @pytest.mark.parametrize("how", ["loss", "gradient"])
+    def test_it_stops_the_training_unchanged_and_names_the_last_good_checkpoint(
+        self, how: str, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+    ) -> None:
+        one = trainer(total_frames=160, save_trainer_interval=15)
+        forward, weights = one.loss_module.forward, {}
+
+        def poisoned(td: Any) -> Any:
+            out = forward(td)
+            if one.collected_frames >= 64:
+                weights.update({k: v.clone() for k, v in one.loss_module.state_dict().items()})
+                actor = out["loss_actor"]
+                if how == "loss":
+                    out["loss_actor"] = actor * float("nan")
+                else:  # a finite loss whose gradient is not: d sqrt(x) / dx at 0
+                    out["loss_actor"] = actor + (actor - actor).sqrt()
+            return out
+
+        one.loss_module.forward = poisoned
+        where = "loss_actor is nan" if how == "loss" else "The gradient's norm is nan"
+        newest = tmp_path / "run" / "checkpoint-000000000048.torchrl"
+        message = f"{where} in update 10, after 64 base steps.*not applied.*is '{newest}'.*learning"
+        with pytest.raises(FloatingPointError, match=message):
+            one.train()
+        for name, value in one.loss_module.state_dict().items():
+            assert torch.equal(value, weights[name]), name
+        again = trainer(total_frames=80, save_trainer_interval=15).load(tmp_path / "run")
+        assert again.collected_frames == 48
+        again.train()
+
+    def test_without_checkpoints_the_error_says_how_to_have_some(
+        self, trainer: Callable[..., DIAYNTrainer]
+    ) -> None:
+        one = trainer(folder=None)
+        with torch.no_grad():
+            next(one.loss_module.parameters()).fill_(float("inf"))
+        with pytest.raises(FloatingPointError, match="There is no checkpoint: pass save_dir"):
+            one.train()
+
+
+def test_a_folder_that_vanishes_while_training_is_made_again(tmp_path: Path) -> None:
+    rotation = save(tmp_path / "run", 1)
+    shutil.rmtree(tmp_path / "run")
+    rotation.save(plain_checkpoint(net=Big(2)), step=2)
+    assert load(newest_checkpoint(tmp_path / "run")) == 2.0

@@ -1,0 +1,102 @@
+"""Memory stays flat over thousands of searches and a million base steps."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
+from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.testing import ChainEnv
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.waterworld.worker import make_training_env
+
+MIB = 2**20
+
+
+def resident() -> int:
+    """Bytes of this process that are in memory."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096
+
+
+def growth(step: Callable[[], Any], number: int, warm_up: int) -> tuple[float, int]:
+    """Returns the growth in MiB and in Python objects over ``number`` steps after the first."""
+    for _ in range(warm_up):
+        step()
+    gc.collect()
+    memory, objects = resident(), len(gc.get_objects())
+    for _ in range(number):
+        step()
+    gc.collect()
+    return (resident() - memory) / MIB, len(gc.get_objects()) - objects
+
+
+def searches() -> Callable[[], Any]:
+    planner = MCTSPlanner(
+        ChainEnv(length=6),
+        novelty=RadiusNovelty("state", 0.5),
+        budget=SearchBudget(expansions=8),
+    )
+    start = planner.env.reset() if hasattr(planner, "env") else ChainEnv(length=6).reset()
+    return lambda: planner.plan(start.clone())
+
+
+def steps(copies: int) -> Callable[[], Any]:
+    env = WaterworldMazeEnv(maze_pool("train"), observation=False, batch_size=[copies])
+    env.set_seed(0)
+    state = [env.reset()]
+
+    def step() -> None:
+        state[0]["action"] = env.action_spec.rand()
+        _, state[0] = env.step_and_maybe_reset(state[0])
+
+    return step
+
+
+def check(figures: tuple[float, int], mib: float) -> None:
+    grown, objects = figures
+    assert grown < mib, f"{grown:.1f} MiB more"
+    assert objects < 500, f"{objects} Python objects more"
+
+
+def test_searches_leave_nothing_behind() -> None:
+    check(growth(searches(), 300, warm_up=60), 12.0)
+
+
+def test_base_steps_leave_nothing_behind() -> None:
+    check(growth(steps(64), 300, warm_up=60), 12.0)
+
+
+@pytest.mark.slow
+def test_ten_thousand_searches_leave_nothing_behind() -> None:
+    check(growth(searches(), 10_000, warm_up=200), 16.0)
+
+
+@pytest.mark.slow
+def test_a_million_base_steps_leave_nothing_behind() -> None:
+    check(growth(steps(500), 2_000, warm_up=200), 16.0)
+
+
+def test_a_trainer_that_is_gone_frees_its_memory() -> None:
+    def build() -> None:
+        env = make_training_env(copies=8)
+        loss = DIAYNTrainer.make_loss(env, 4, hidden=(4,))
+        trainer = DIAYNTrainer(env, loss, total_frames=64, batch_size=8, buffer_size=64)
+        trainer.train()
+
+    grown, _ = growth(build, 8, warm_up=3)
+    assert grown < 16.0, f"{grown:.1f} MiB more"
+
+
+def test_the_check_notices_a_leak() -> None:
+    kept: list[Any] = []
+    # Blocks so large that each is asked of the system, whatever other tests have given back.
+    grown, _ = growth(lambda: kept.append(torch.ones(2**24)), 4, warm_up=1)
+    assert grown > 200.0
+    assert growth(lambda: kept.append(TensorDict(a=torch.ones(1))), 400, 2)[1] > 500

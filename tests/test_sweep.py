@@ -1,0 +1,214 @@
+"""Sweeps: what may vary, trials as runs of their own, going on, giving up early, importances."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, Experiment
+from torchrl_hmcts.trainers.experiments.sweep_space import Choice, Range, parse_space
+
+optuna = pytest.importorskip("optuna")
+
+
+@dataclass
+class ParabolaConfig:
+    """An experiment without any training: y = -(x - 3)^2, z does nothing."""
+
+    seed: int = 0
+    """Of nothing."""
+    out: str = "runs/parabola"
+    """Folder."""
+    x: float = 0.0
+    """Where."""
+    z: int = 1
+    """Nothing."""
+    steps: int = 3
+    """Values logged on the way."""
+    logger: str = "csv"
+    """As elsewhere."""
+
+
+RUNS: list[ParabolaConfig] = []
+
+
+def run_parabola(config: ParabolaConfig) -> dict[str, Any]:
+    from torchrl_hmcts.trainers.experiments.loggers import make_logger
+
+    print("a trial talks")
+    RUNS.append(config)
+    y = -((config.x - 3.0) ** 2)
+    logger = make_logger(config)
+    for step in range(config.steps):
+        logger.log_scalar("on_the_way", y, step=step)
+    logger.close()
+    metrics = {"test": {"y": y, "cost": -y}}
+    (Path(config.out) / "metrics.json").write_text(json.dumps(metrics))
+    return metrics
+
+
+@pytest.fixture(autouse=True)
+def parabola(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The parabola among the experiments."""
+    RUNS.clear()
+    found = Experiment("parabola", "", "", "", objective="test.y", progress="on_the_way")
+    monkeypatch.setitem(EXPERIMENTS, "parabola", found)
+    both = {"config_class": ParabolaConfig, "function": run_parabola}
+    for name, value in both.items():
+        original = getattr(Experiment, name)
+
+        def chosen(self: Experiment, value: Any = value, original: Any = original) -> Any:
+            return value if self.name == "parabola" else original.fget(self)
+
+        monkeypatch.setattr(Experiment, name, property(chosen))
+
+
+def sweep(out: Path, *words: str) -> int:
+    return main(["sweep", "experiment=parabola", f"out={out}", *words])
+
+
+def told(out: Path) -> dict[str, Any]:
+    return json.loads((out / "sweep.json").read_text())
+
+
+def test_what_varies_is_typed_as_lists_and_ranges() -> None:
+    words = [
+        "num_skills=[3, 4,6]",
+        "gamma=0.9..0.99",
+        "option_steps=10..50:20",
+        "novelty_radius=0.1..10:log",
+        "out=x",
+    ]
+    space, fixed = parse_space(DemoConfig, words)
+    assert space == [
+        Choice("num_skills", (3, 4, 6)),
+        Range("gamma", 0.9, 0.99, integer=False),
+        Range("option_steps", 10, 50, integer=True, step=20),
+        Range("novelty_radius", 0.1, 10.0, integer=False, log=True),
+    ]
+    assert fixed == ["out=x"]
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("gama=1..2", "Did you mean: gamma"),
+        ("gamma=[0.9]", "leaves nothing to choose"),
+        ("gamma=[0.9,high]", "high"),
+        ("gamma=2..1", "empty range"),
+        ("gamma=0..1:log", "lower end above 0"),
+        ("mazes=1..2.5", "no range of whole numbers"),
+        ("mazes=1..9:20", "steps of 20"),
+        ("mazes", "no key=value"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(word: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_space(DemoConfig, [word])
+
+
+def test_a_sweep_finds_the_best_and_each_trial_is_a_run(tmp_path, capsys) -> None:
+    assert sweep(tmp_path, "x=0..6", "z=[1,2]", "trials=12", "seed=5") == 0
+    found = told(tmp_path)
+    assert len(found["trials"]) == 12
+    best = found["trials"][0]
+    assert best["value"] == max(t["value"] for t in found["trials"] if t["value"] is not None)
+    assert abs(best["params"]["x"] - 3.0) < 1.0
+    assert all(config.seed == 5 for config in RUNS)
+    run = json.loads((tmp_path / best["folder"] / "run.json").read_text())
+    assert run["config"]["x"] == best["params"]["x"]
+    assert run["status"] in ("finished", "given up")
+    printed = capsys.readouterr().out
+    assert "a trial talks" not in printed
+    assert "Best of 12 trials: test.y = " in printed
+
+
+def test_the_key_that_matters_has_the_larger_importance_and_a_picture(tmp_path) -> None:
+    assert sweep(tmp_path, "x=0..6", "z=[1,2]", "trials=14", "prune=false") == 0
+    shares = told(tmp_path)["importances"]
+    assert shares["x"] > shares["z"]
+    assert sum(shares.values()) == pytest.approx(1.0)
+    page = (tmp_path / "index.html").read_text()
+    for picture in ("importances.png", "trials.png"):
+        assert f'src="{picture}"' in page
+        assert (tmp_path / picture).stat().st_size > 1_000
+
+
+def test_less_is_better_with_a_minus(tmp_path) -> None:
+    words = ("x=0..6", "trials=8", "objective=-test.cost", "prune=false")
+    assert sweep(tmp_path, *words) == 0
+    values = [t["value"] for t in told(tmp_path)["trials"]]
+    assert values == sorted(values)
+
+
+def test_the_same_command_goes_on(tmp_path) -> None:
+    words = ("x=[1,2,3]", "prune=false")
+    assert sweep(tmp_path, *words, "trials=3") == 0
+    first = {t["trial"]: t["value"] for t in told(tmp_path)["trials"]}
+    assert sweep(tmp_path, *words, "trials=5") == 0
+    both = {t["trial"]: t["value"] for t in told(tmp_path)["trials"]}
+    assert len(RUNS) == 5
+    assert both.items() >= first.items()
+    assert sweep(tmp_path, *words, "trials=5") == 0
+    assert len(RUNS) == 5  # nothing left to do
+
+
+def test_ctrl_c_says_how_to_go_on(tmp_path, capsys, monkeypatch) -> None:
+    def interrupted(config: ParabolaConfig) -> dict[str, Any]:
+        if len(RUNS) == 2:
+            raise KeyboardInterrupt
+        return run_parabola(config)
+
+    monkeypatch.setattr(Experiment, "function", property(lambda self: interrupted))
+    assert sweep(tmp_path, "x=[1,2,3]", "trials=4") == 130
+    assert "go on with: hmcts sweep experiment=parabola" in capsys.readouterr().err
+    monkeypatch.setattr(Experiment, "function", property(lambda self: run_parabola))
+    assert sweep(tmp_path, "x=[1,2,3]", "trials=4") == 0
+    states = [t["state"] for t in told(tmp_path)["trials"]]
+    assert states.count("complete") == 4
+    assert states.count("fail") == 1
+
+
+def test_a_trial_that_lags_behind_is_given_up(tmp_path) -> None:
+    words = ("x=[3,100]", "trials=12")
+    assert sweep(tmp_path, *words) == 0
+    rows = told(tmp_path)["trials"]
+    given_up = [t for t in rows if t["state"] == "given up"]
+    assert given_up
+    assert all(t["params"]["x"] == 100.0 for t in given_up)
+    run = json.loads((tmp_path / given_up[0]["folder"] / "run.json").read_text())
+    assert run["status"] == "given up"
+
+
+def test_a_folder_of_another_sweep_is_refused(tmp_path, capsys) -> None:
+    assert sweep(tmp_path, "x=[1,2]", "trials=1") == 0
+    assert sweep(tmp_path, "z=[1,2]", "trials=1") == 2
+    assert "sweep of something else" in capsys.readouterr().err
+
+
+def test_any_storage_of_optunas_will_do(tmp_path) -> None:
+    url = f"sqlite:///{tmp_path}/trials.db"
+    assert sweep(tmp_path, "x=[1,2]", "trials=2", f"storage={url}") == 0
+    study = optuna.load_study(study_name=f"parabola-{tmp_path.name}", storage=url)
+    assert len(study.trials) == 2
+    assert not (tmp_path / "journal.log").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["trials=2"], "nothing varies"),
+        (["x=[1,2]", "trials=none"], "whole number above 0; got 'none'"),
+        (["x=[1,2]", "trials=1", "objective=test.w"], "no figure 'test.w'. It has: test.cost"),
+        (["y=[1,2]"], "Unknown key 'y'"),
+    ],
+)
+def test_what_a_sweep_cannot_do_is_said(tmp_path, capsys, words, message) -> None:
+    assert sweep(tmp_path, *words) == 2
+    assert message in capsys.readouterr().err

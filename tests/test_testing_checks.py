@@ -1,0 +1,603 @@
+"""The checks for users refuse parts that are broken on purpose, and name what is wrong."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs import StepCounter, Transform
+
+from torchrl_hmcts.modules import SkillDiscriminator, SkillPrior
+from torchrl_hmcts.objectives import SkillDiscriminatorLoss
+from torchrl_hmcts.planners import (
+    PUCT,
+    UCT,
+    Gumbel,
+    MCTSPlanner,
+    NodeStatistics,
+    RadiusNovelty,
+    TorchRLScore,
+    WidthNovelty,
+)
+from torchrl_hmcts.testing import (
+    ChainEnv,
+    ContractError,
+    PointMassEnv,
+    TableEnv,
+    check_env,
+    check_evaluator,
+    check_loss,
+    check_macro_env,
+    check_novelty,
+    check_option_prior,
+    check_planner,
+    check_skill_objective,
+    check_skill_prior,
+    check_termination,
+    check_transform,
+    check_tree_policy,
+    check_worker,
+)
+
+# ----------------------------------------------------------------------------------- envs
+
+
+class RandomWithoutSeed(ChainEnv):
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = super()._step(tensordict)
+        noise = np.random.default_rng().random()
+        return out.set("reward", out["reward"] + noise)
+
+
+class IgnoresStep(ChainEnv):
+    """Of a fixed batch size, and so itself to look at ``"_step"``, which it does not."""
+
+    batch_locked = True
+
+
+class ForgetsItsState(ChainEnv):
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        return super()._reset(tensordict)
+
+
+class HiddenClock(ChainEnv):
+    """Its reward depends on a counter that is in no spec."""
+
+    steps = 0
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.steps = 0
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.steps += 1
+        out = super()._step(tensordict)
+        return out.set("reward", out["reward"] + self.steps)
+
+
+class WritesIntoItsInput(ChainEnv):
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = super()._step(tensordict)
+        tensordict["state"].copy_(out["state"])
+        return out
+
+
+class LooksAtItsNeighbours(ChainEnv):
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = super()._step(tensordict)
+        return out.set("reward", out["reward"] + float(tensordict["state"].numel()))
+
+
+class WrongDtype(ChainEnv):
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = super()._step(tensordict)
+        return out.set("reward", out["reward"].double())
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (WrongDtype(), "WrongDtype fails TorchRL's check_env_specs"),
+        (RandomWithoutSeed(), r"RandomWithoutSeed: two rollouts with seed 0 differ in .*reward"),
+        (IgnoresStep(batch_size=[4]), "IgnoresStep: 'state' changed where \"_step\" is False"),
+    ],
+)
+def test_an_env_that_is_broken_is_refused(env: ChainEnv, message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_env(env)
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (ForgetsItsState(), "set to a state it shows another 'state'"),
+        (HiddenClock(), "HiddenClock: .*'reward'"),
+        (LooksAtItsNeighbours(), "set to a state and stepped it gives 'reward'"),
+        (WritesIntoItsInput(), "WritesIntoItsInput.*'state'"),
+        (PointMassEnv(continuous=True), "PointMassEnv fails as the simulator .* discrete action"),
+        (
+            TableEnv({(0, 0): (1, 0.0, 0), (1, 0): (0, 0.0, 1)}),
+            "a step took 0 base steps",
+        ),
+    ],
+)
+def test_an_env_that_cannot_be_planned_in_is_refused(env: Any, message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_macro_env(env)
+
+
+# ------------------------------------------------------------------------------ transforms
+
+
+class Adds(Transform):
+    """Writes what is not in the specs."""
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set("extra", torch.zeros(*next_tensordict.batch_size, 1))
+
+    def _reset(self, tensordict: TensorDictBase, reset: TensorDictBase) -> TensorDictBase:
+        return reset.set("extra", torch.zeros(*reset.batch_size, 1))
+
+
+class Doubles(Transform):
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set("reward", 2 * next_tensordict["reward"] + 1)
+
+
+class KeepsNothing(Transform):
+    """A state dict with one entry that loading forgets."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros(()))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.count += 1
+        return next_tensordict
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("make", "check", "kwargs", "message"),
+    [
+        (Adds, "single", {}, r"(?s)Adds fails on an env \('single'\).*extra"),
+        (Adds, "trans_serial", {}, r"Adds fails around a SerialEnv \('trans_serial'\)"),
+        (Adds, "serial", {"inside_workers": False}, "Adds is silently accepted inside a SerialEnv"),
+        (Adds, "replay_buffer", {}, "Adds is silently accepted on a replay buffer"),
+        (StepCounter, "env", {"writes": ["count"]}, r"StepCounter wrote no \('next', 'count'\)"),
+        (Doubles, "env", {}, r"Doubles changed \('next', 'reward'\) of the env"),
+        (StepCounter, "inverse", {"inverse_writes": ["push"]}, "inv wrote no 'push'"),
+        (KeepsNothing, "state_dict", {}, "count' of the state dict is another"),
+    ],
+)
+def test_a_transform_that_is_broken_is_refused(
+    make: Callable, check: str, kwargs: dict, message: str
+) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_transform(make, ChainEnv, checks=[check], **kwargs)
+
+
+def test_a_transform_is_to_be_made_anew_and_checks_have_names() -> None:
+    one = StepCounter()
+    with pytest.raises(ContractError, match="gave the same StepCounter twice"):
+        check_transform(lambda: one, ChainEnv)
+    with pytest.raises(ValueError, match="no check 'paralel'"):
+        check_transform(StepCounter, ChainEnv, checks=["paralel"])
+
+
+def test_a_transform_of_data_is_checked_on_data() -> None:
+    data = TensorDict(state=torch.arange(3), batch_size=[3])
+
+    class Plus(Transform):
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            return tensordict.set("plus", tensordict["state"] + 1)
+
+    places = ["no_env", "compose", "model", "replay_buffer"]
+    check_transform(Plus, ChainEnv, data=data, data_writes=["plus"], checks=places)
+    for place in places:
+        with pytest.raises(ContractError, match="Plus wrote no 'minus'"):
+            check_transform(Plus, ChainEnv, data=data, data_writes=["minus"], checks=[place])
+    with pytest.raises(ContractError, match="Plus is silently accepted on data"):
+        check_transform(Plus, ChainEnv, checks=["no_env"])
+
+
+# ---------------------------------------------------------------------------------- losses
+
+
+def transitions() -> TensorDict:
+    after = TensorDict(displacement=torch.randn(4, 2), batch_size=[4])
+    return TensorDict(skill=torch.arange(4) % 3, next=after, batch_size=[4])
+
+
+class Good(SkillDiscriminatorLoss):
+    pass
+
+
+class Undetached(Good):
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        out = super().losses(tensordict)
+        return {**out, "discriminator_accuracy": out["loss_discriminator"] * 1.0}
+
+
+class ReducesTwice(Good):
+    def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        return super()._reduce(loss, tensordict) / (2.0 if self.reduction == "mean" else 1.0)
+
+
+class ForgetsKeys(Good):
+    def skill_logits(self, tensordict: TensorDictBase) -> Tensor:
+        tensordict.get("skill").sum()  # by a name of its own
+        return super().skill_logits(tensordict)
+
+
+class Lazy(Good):
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        self.register_buffer("late", torch.zeros(()))
+        return super().losses(tensordict)
+
+
+class Detached(Good):
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        return {key: value.detach() for key, value in super().losses(tensordict).items()}
+
+
+class Spoils(Good):
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        out = super().losses(tensordict)
+        tensordict["skill"].zero_()
+        return out
+
+
+class Asks(Good):
+    @property
+    def next_features(self) -> list:  # type: ignore[override]
+        return [*super().next_features, "velocity"]
+
+
+class AsksItsNeighbours(Good):
+    def reward(self, tensordict: TensorDictBase) -> Tensor:
+        reward = super().reward(tensordict)
+        return reward - reward.mean()
+
+
+class WithGradient(Good):
+    def reward(self, tensordict: TensorDictBase) -> Tensor:
+        return self.skill_logits(tensordict)[..., :1]
+
+
+def factory(cls: type) -> Callable[..., SkillDiscriminatorLoss]:
+    def make(name: Callable, **kwargs: Any) -> SkillDiscriminatorLoss:
+        keys = {"in_keys": [name("displacement")], "skill_logits_key": name("skill_logits")}
+        return cls(SkillDiscriminator(2, 3, **keys), **kwargs)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("cls", "check", "message"),
+    [
+        (Undetached, "out_keys", "'discriminator_accuracy' has a gradient"),
+        (Spoils, "out_keys", "changed 'skill' of its input"),
+        (ReducesTwice, "reduction", r"ReducesTwice\(reduction='mean'\): 'loss_discriminator'"),
+        (Detached, "gradients", "has no gradient for 'discriminator_params'"),
+        (Asks, "dispatch", r"announces the in_key \('next', 'velocity'\)"),
+        (ForgetsKeys, "nested_keys", "ForgetsKeys fails with renamed keys"),
+        (Lazy, "state_dict", "its first use changed the state dict by .*late"),
+        (Good, "target_networks", "SkillDiscriminatorLoss|Good has no target_actor_params"),
+    ],
+)
+def test_a_loss_that_is_broken_is_refused(cls: type, check: str, message: str) -> None:
+    gradients = {"loss_discriminator": ["discriminator_params"]}
+    targets = ["actor"] if check == "target_networks" else []
+    with pytest.raises(ContractError, match=message):
+        check_loss(
+            factory(cls), transitions(), gradients=gradients, targets=targets, checks=[check]
+        )
+
+
+def test_a_gradient_that_strays_is_named() -> None:
+    with pytest.raises(ContractError, match="has a gradient for .*discriminator_params.* only"):
+        check_loss(
+            factory(Good),
+            transitions(),
+            gradients={"loss_discriminator": ["encoder_params"]},
+            checks=["gradients"],
+        )
+
+
+@pytest.mark.parametrize(
+    ("cls", "message"),
+    [
+        (AsksItsNeighbours, "AsksItsNeighbours.reward gives transition 0 .* alone"),
+        (WithGradient, "WithGradient.reward has a gradient"),
+    ],
+)
+def test_an_objective_whose_reward_is_broken_is_refused(cls: type, message: str) -> None:
+    check_skill_objective(factory(Good), transitions(), checks=["out_keys"])
+    with pytest.raises(ContractError, match=message):
+        check_skill_objective(factory(cls), transitions(), checks=[])
+
+
+class Prior(SkillPrior):
+    def __init__(self, p: list[float], log_p: list[float] | None = None) -> None:
+        super().__init__(2)
+        self.p, self.log_p = torch.tensor(p), log_p
+
+    def probs(self) -> Tensor:
+        return self.p
+
+    def log_probs(self) -> Tensor:
+        return super().log_probs() if self.log_p is None else torch.tensor(self.log_p)
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (Prior([0.5, 0.6]), "Prior: probs.. sums to 1.1, not 1"),
+        (Prior([1.5, -0.5]), "gives -0.5, below 0"),
+        (Prior([1.0]), r"gives \[1\]; it must give \[2\]"),
+        (Prior([0.5, 0.5], [0.0, 0.0]), "log_probs.. is not the logarithm"),
+    ],
+)
+def test_a_prior_that_is_no_distribution_is_refused(prior: Prior, message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_skill_prior(prior)
+
+
+# --------------------------------------------------------------------------------- workers
+
+
+def module(function: Callable) -> TensorDictModule:
+    return TensorDictModule(function, ["skill"], ["action"])
+
+
+class Normalised(nn.Module):
+    """Its action depends on the mean of the batch."""
+
+    def forward(self, skill: Tensor) -> Tensor:
+        return (skill.float() - skill.float().mean() > -0.1).long()
+
+
+def changes_the_state(td: TensorDictBase) -> TensorDictBase:
+    return td.set("state", td["state"] * 0 + 1).set("action", td["skill"])
+
+
+def one_dimension(skill: Tensor) -> Tensor:
+    if skill.ndim > 1:
+        raise ValueError("only one batch dimension")
+    return skill
+
+
+@pytest.mark.parametrize(
+    ("worker", "message"),
+    [
+        (module(lambda skill: skill + 5), "TensorDictModule fails as the worker .*action"),
+        (TensorDictModule(lambda x: x, ["x"], ["action"]), "reads 'x'"),
+        (changes_the_state, "function changed 'state' of its input"),
+        (module(one_dimension), r"acting for a batch of shape \[2, 2\].*one batch dimension"),
+        (module(Normalised()), "the actions of an element alone and among others"),
+    ],
+)
+def test_a_worker_that_is_broken_is_refused(worker: Any, message: str) -> None:
+    check_worker(module(lambda skill: skill), ChainEnv(), 2)
+    with pytest.raises(ContractError, match=message):
+        check_worker(worker, ChainEnv(), 2)
+
+
+@pytest.mark.parametrize(
+    ("termination", "message"),
+    [
+        (lambda td: td["duration"], r"must give bool \[3\].*torch.int64"),
+        (lambda td: (td["duration"] > 2).any().expand(td.batch_size), "element 0 among others"),
+        (lambda td: td.set("end", td["duration"] > 2)["end"], "changed its input"),
+        (lambda td: td["durations"] > 2, "fails asked about a batch"),
+    ],
+)
+def test_a_termination_that_is_broken_is_refused(termination: Callable, message: str) -> None:
+    td = TensorDict(duration=torch.tensor([[1], [2], [3]]), batch_size=[3])
+    check_termination(lambda td: td["duration"] > 2, td)
+    with pytest.raises(ContractError, match=message):
+        check_termination(termination, td)
+
+
+# ---------------------------------------------------------------------------------- search
+
+
+def ucb(nodes: NodeStatistics) -> Tensor:
+    return nodes.option_values + (nodes.node_visits[:, None] / (1 + nodes.option_visits)).sqrt()
+
+
+@pytest.mark.parametrize("policy", [UCT(), PUCT(), Gumbel(scale=0.0), ucb])
+def test_a_tree_policy_that_works_passes(policy: Any) -> None:
+    check_tree_policy(policy)
+
+
+def test_a_score_of_torchrl_passes() -> None:
+    scores = pytest.importorskip("torchrl.modules.mcts.scores")
+    check_tree_policy(TorchRLScore(scores.PUCTScore(c=1.25)))
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (
+            lambda nodes: nodes.option_values / nodes.option_visits,
+            "NaN for an option with 0 visits",
+        ),
+        (lambda nodes: nodes.node_values, r"gives \[6\] for 6 nodes of 3 options"),
+        (
+            lambda nodes: nodes.option_values - nodes.option_values.mean(0) - nodes.option_visits,
+            "Judge a node by its own row",
+        ),
+        (lambda nodes: nodes.option_visits.zero_(), "changed 'option_visits' of the nodes"),
+        (7, "int is no tree policy"),
+    ],
+)
+def test_a_tree_policy_that_is_broken_is_refused(policy: Any, message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_tree_policy(policy)
+
+
+class Novelty(RadiusNovelty):
+    """A test that works, to be broken by the classes below."""
+
+    def __init__(self) -> None:
+        super().__init__("x", 0.1)
+
+
+class AcceptsAll(Novelty):
+    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        return np.ones(len(roots), np.bool_)
+
+
+class OneMemory(Novelty):
+    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        return super().accept(np.zeros_like(roots), features, base_steps)
+
+
+class NeverForgets(Novelty):
+    def restart(self, root: int) -> None:
+        pass
+
+
+class RelaxesForEver(Novelty):
+    def relax(self, root: int) -> bool:
+        return True
+
+
+class MixesFeatures(Novelty):
+    def features(self, tensordict: TensorDictBase) -> np.ndarray:
+        x = super().features(tensordict)
+        return x - x.mean(0)
+
+
+class SharesItsMemory(Novelty):
+    """A copy that is started writes into the memory of the original."""
+
+    def start(self, num_roots: int) -> None:
+        if not hasattr(self, "known"):
+            self.known: dict[int, set] = {}
+        self.known.clear()
+
+    def restart(self, root: int) -> None:
+        self.known.pop(root, None)
+
+    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        out = []
+        for root, row in zip(roots.tolist(), features.tolist(), strict=True):
+            seen = self.known.setdefault(root, set())
+            out.append(tuple(row) not in seen)
+            seen.add(tuple(row))
+        return np.array(out)
+
+
+STATES = TensorDict(x=torch.tensor([[0.0], [1.0], [2.0]]), batch_size=[3])
+
+
+def test_novelty_tests_that_work_pass() -> None:
+    check_novelty(Novelty(), STATES)
+    check_novelty(RadiusNovelty("x", 0.1, shorter_paths=True), STATES)
+    check_novelty(WidthNovelty("x"), STATES.to(torch.int64))
+
+
+@pytest.mark.parametrize(
+    ("cls", "message"),
+    [
+        (AcceptsAll, "AcceptsAll accepts state .0. a second time"),
+        (OneMemory, "what root 0 has seen counts for root 1"),
+        (NeverForgets, r"restart\(0\) does not forget"),
+        (RelaxesForEver, "was True 10000 times"),
+        (MixesFeatures, "features of state 0 are others alone"),
+        (SharesItsMemory, "a copy that was started shares what it knows"),
+    ],
+)
+def test_a_novelty_test_that_is_broken_is_refused(cls: type, message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_novelty(cls(), STATES)
+
+
+def test_what_lacks_the_members_of_a_novelty_test_is_refused() -> None:
+    with pytest.raises(ContractError, match="object lacks .*'accept'"):
+        check_novelty(object(), STATES)  # type: ignore[arg-type]
+    with pytest.raises(ContractError, match="reads 'y'"):
+        check_novelty(RadiusNovelty("y", 1.0), STATES)
+
+
+@pytest.mark.parametrize(
+    ("evaluator", "message"),
+    [
+        (lambda td: td["x"].expand(-1, 2), r"gives values \[3, 2\]"),
+        (lambda td: td["x"].log(), "which is not finite"),
+        (lambda td: td["x"] - td["x"].mean(), "gives state 0 the value"),
+        (lambda td: td["x"].zero_(), "changed 'x' of the states"),
+        (lambda td: 0.0, "gives float; it must give a tensor"),
+    ],
+)
+def test_an_evaluator_that_is_broken_is_refused(evaluator: Callable, message: str) -> None:
+    check_evaluator(lambda td: td["x"], STATES)
+    with pytest.raises(ContractError, match=message):
+        check_evaluator(evaluator, STATES.clone())
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (lambda td: td["x"], r"gives \[3, 1\] for 3 states of 2 options"),
+        (lambda td: torch.cat([td["x"], -td["x"]], -1), "probabilities are not negative"),
+        (lambda td: torch.cat([td["x"], td["x"]], -1), "not all 0"),
+    ],
+)
+def test_an_option_prior_that_is_broken_is_refused(prior: Callable, message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_option_prior(prior, STATES.clone(), 2)
+
+
+class NoOption(MCTSPlanner):
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return super().forward(tensordict).exclude("action")
+
+
+class WrongOption(MCTSPlanner):
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = super().forward(tensordict)
+        return out.set("action", out["action"] + 9)
+
+
+class MovesTheState(MCTSPlanner):
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = super().forward(tensordict)
+        return out.set("state", out["state"] + 1)
+
+
+@pytest.mark.parametrize(
+    ("cls", "message"),
+    [
+        (NoOption, "NoOption wrote no 'action'"),
+        (WrongOption, "WrongOption wrote 'action' .* does not fit"),
+        (MovesTheState, "MovesTheState changed 'state'"),
+    ],
+)
+def test_a_planner_that_is_broken_is_refused(cls: type, message: str) -> None:
+    env = ChainEnv(length=4)
+    with pytest.raises(ContractError, match=message):
+        check_planner(cls(env), env)
+
+
+def test_a_check_leaves_torchs_generator_as_it_was() -> None:
+    before = torch.get_rng_state()
+    check_env(ChainEnv(length=4))
+    check_loss(factory(Good), transitions_of_one_kind(), checks=["out_keys"])
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def transitions_of_one_kind() -> TensorDict:
+    after = TensorDict(displacement=torch.ones(4, 2), batch_size=[4])
+    return copy.deepcopy(TensorDict(skill=torch.arange(4) % 3, next=after, batch_size=[4]))

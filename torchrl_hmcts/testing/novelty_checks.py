@@ -1,0 +1,156 @@
+"""Checks of novelty tests.
+
+Letters: m states, F features.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+from tensordict import TensorDictBase
+
+from torchrl_hmcts.planners.novelty import NoveltyTest
+from torchrl_hmcts.testing.claims import ContractError, during, require
+
+_MANY = 10_000
+_MEMBERS = ("in_keys", "start", "restart", "features", "accept", "relax")
+
+
+def check_novelty(novelty: NoveltyTest, states: TensorDictBase) -> None:
+    """Check that a novelty test can decide which nodes are worth searching.
+
+    It has the members of :class:`~torchrl_hmcts.planners.NoveltyTest`; its features are numbers,
+    one row per state, and of that state only; in an empty tree the first state is novel, and is so
+    no more when it comes again; roots know nothing of each other, and forget when they are
+    restarted; a search has a copy of its own; relaxing it comes to an end.
+
+    Args:
+        novelty (NoveltyTest): the test; it is started anew.
+        states (TensorDictBase): states ``[m]`` with its ``in_keys``, at least two that differ.
+
+    Raises:
+        ContractError: if it cannot.
+        ValueError: if there are not two states.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.planners import RadiusNovelty
+        >>> from torchrl_hmcts.testing import check_novelty
+        >>> states = TensorDict(position=torch.rand(5, 2), batch_size=[5])
+        >>> check_novelty(RadiusNovelty("position", 0.1), states)
+    """
+    name = type(novelty).__name__
+    if len(states.batch_size) != 1 or len(states) < 2:
+        raise ValueError(
+            f"check_novelty needs states [m], two at least; got batch size "
+            f"{list(states.batch_size)}."
+        )
+    missing = [member for member in _MEMBERS if not hasattr(novelty, member)]
+    require(
+        not missing,
+        f"{name} lacks {missing}. A novelty test has the members of "
+        "torchrl_hmcts.planners.NoveltyTest.",
+    )
+    for key in novelty.in_keys:
+        require(
+            states.get(key, None) is not None,
+            f"{name} reads {key!r}, which the states do not have. Add it, or correct in_keys.",
+        )
+    m = len(states)
+    with during(name, "reading features"):
+        novelty.start(1)
+        features = novelty.features(states.clone())
+        single = [novelty.features(states[i : i + 1].clone()) for i in range(m)]
+    good = isinstance(features, np.ndarray) and features.ndim == 2 and len(features) == m
+    if not good or features.dtype.kind not in "biuf":
+        got = (
+            f"{features.dtype} {list(features.shape)}"
+            if isinstance(features, np.ndarray)
+            else type(features).__name__
+        )
+        raise ContractError(
+            f"{name}.features gives {got} for {m} states; it must give a numeric array [{m}, F]."
+        )
+    for i, alone in enumerate(single):
+        require(
+            np.array_equal(alone[0], features[i]),
+            f"{name}.features of state {i} are others alone than among the rest. Let them depend "
+            "on their own state only.",
+        )
+    _check_accept(name, novelty, features)
+
+
+def _check_accept(name: str, novelty: NoveltyTest, features: np.ndarray) -> None:
+    m = len(features)
+    steps = np.arange(m, dtype=np.int64)
+
+    def ask(test: NoveltyTest, root: int, at: int = 0) -> np.ndarray:
+        with during(name, "asked about new states"):
+            accepted = test.accept(np.full(m, root, np.int64), features, steps + at)
+        if not isinstance(accepted, np.ndarray) or accepted.dtype != np.bool_:
+            raise ContractError(
+                f"{name}.accept gives {type(accepted).__name__} "
+                f"{getattr(accepted, 'dtype', '')}; it must give a bool array, True where a state "
+                "is novel."
+            )
+        require(
+            accepted.shape == (m,),
+            f"{name}.accept gives {list(accepted.shape)} for {m} states; it must give [{m}].",
+        )
+        return accepted
+
+    novelty.start(3)
+    first = ask(novelty, 0)
+    require(first[0], f"{name} refuses the first state of an empty tree. Nothing is known there.")
+    again = ask(novelty, 0, at=m)
+    twice = np.flatnonzero(again & first)
+    require(
+        not len(twice),
+        f"{name} accepts state {twice[:1]} a second time. Remember what was accepted, or a search "
+        "goes round in a circle.",
+    )
+    require(
+        np.array_equal(ask(novelty, 1), first),
+        f"{name}: what root 0 has seen counts for root 1. Keep what is known per root.",
+    )
+    with during(name, "restarting a root"):
+        novelty.restart(0)
+    require(
+        np.array_equal(ask(novelty, 0), first),
+        f"{name}.restart(0) does not forget the states of root 0.",
+    )
+    require(
+        not ask(novelty, 1, at=m)[first].any(),
+        f"{name}.restart(0) forgot the states of root 1 too. Forget those of one root.",
+    )
+    twin = copy.copy(novelty)
+    twin.start(3)
+    ask(twin, 2)
+    require(
+        np.array_equal(ask(novelty, 2), first),
+        f"{name}: a copy that was started shares what it knows with the original. Assign new "
+        "arrays in start(): each search starts a shallow copy.",
+    )
+    for times in range(_MANY + 1):
+        with during(name, "relaxed"):
+            relaxed = novelty.relax(0)
+        require(
+            isinstance(relaxed, (bool, np.bool_)),
+            f"{name}.relax gives {relaxed!r}; it must give True, or False if it cannot.",
+        )
+        if not relaxed:
+            break
+        require(
+            times < _MANY,
+            f"{name}.relax(0) was True {_MANY} times. Give False at last, or an exhausted search "
+            "never ends.",
+        )
+    statistics = getattr(novelty, "statistics", None)
+    if statistics is not None:
+        counts = statistics()
+        good = isinstance(counts, dict) and all(
+            isinstance(count, (int, float)) for count in counts.values()
+        )
+        require(good, f"{name}.statistics gives {counts!r}; it must give a dict of numbers.")

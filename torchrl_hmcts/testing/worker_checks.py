@@ -1,0 +1,218 @@
+"""Checks of what runs inside an option: the worker that acts, the condition that ends it.
+
+Letters: *B batch of a tensordict, A options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_hmcts.testing.claims import ContractError, different, during, leaves, require, seeded
+from torchrl_hmcts.transforms.option import OptionTransform
+
+
+def check_worker(
+    worker: Callable[[TensorDictBase], TensorDictBase],
+    env: EnvBase,
+    num_options: int,
+    *,
+    skill_key: NestedKey = "skill",
+    deterministic: bool = True,
+    tolerance: float = 1e-6,
+) -> None:
+    """Check that a worker can carry options out in an env.
+
+    It reads what the env has and writes actions of its spec, for every option; it changes nothing
+    else of its input and leaves its own parameters alone; it takes any batch shape, and what it
+    does in one element depends on that element only: a planner runs it on all elements at once, and
+    the env on one.
+
+    Args:
+        worker (callable): a TensorDictModule that reads entries of the env and ``skill_key``, and
+            writes the env's action.
+        env (EnvBase): the env it acts in, without the
+            :class:`~torchrl_hmcts.transforms.OptionTransform`. If it is stateless (``batch_locked``
+            is False) batches are tried.
+        num_options (int): A, the options it knows.
+        skill_key (NestedKey): by which it is told its option, int64 ``[*B]``. Default ``"skill"``.
+        deterministic (bool): whether state and option decide the action. Default ``True``; with
+            ``False`` the same seed must give the same action.
+        tolerance (float): difference between a float action alone and among others that is allowed,
+            relative and absolute; discrete actions must agree. Default 1e-6.
+
+    Raises:
+        ContractError: if it cannot.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl_hmcts.testing import ChainEnv, check_worker
+        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+        >>> check_worker(worker, ChainEnv(), num_options=2)
+    """
+    name = type(worker).__name__
+    with during(name, "as the worker of an OptionTransform"):
+        TransformedEnv(env, OptionTransform(worker, num_options, 1, skill_key=skill_key))
+    states = _states(env, num_options)
+    options = torch.arange(states.batch_size.numel()).reshape(states.batch_size) % num_options
+    given = states.clone().set(skill_key, options.to(states.device or "cpu"))
+    weights = _weights(worker)
+    shapes = [given] if env.batch_locked else [given, given.reshape(2, -1), given[:1]]
+    for td in shapes:
+        out = _act(name, worker, td)
+        for key in map(unravel_key, env.action_keys):
+            action = out.get(key, None)
+            require(
+                action is not None,
+                f"{name} wrote no {key!r} for a batch of shape {list(td.batch_size)}.",
+            )
+            spec = env.full_action_spec_unbatched[key].expand(
+                (*td.batch_size, *env.full_action_spec_unbatched[key].shape)
+            )
+            require(
+                action.shape == spec.shape and action.dtype == spec.dtype and spec.is_in(action),
+                f"{name} wrote {key!r} = {action.dtype} {list(action.shape)} for a batch of shape "
+                f"{list(td.batch_size)}, which does not fit the spec {spec}.",
+            )
+        where = different(td, out, leaves(td) & leaves(out))
+        require(
+            where is None and leaves(td) <= leaves(out),
+            f"{name} changed {where and where[0]!r} of its input. A worker writes actions; the "
+            "env writes the rest.",
+        )
+        _same(name, env, out, _act(name, worker, td), 0.0, "of two calls with the same seed")
+    for key, before in weights.items():
+        require(
+            torch.equal(before, _weights(worker)[key]),
+            f"{name} changed its own {key!r} while acting. Call eval() first, or keep running "
+            "statistics out of it.",
+        )
+    if deterministic and not env.batch_locked:
+        together = _act(name, worker, given)
+        for b in range(given.batch_size.numel()):
+            alone = _act(name, worker, given[b])
+            told = f"of an element alone and among others (option {int(options[b])})"
+            _same(name, env, together[b], alone, tolerance, told)
+
+
+def _states(env: EnvBase, num_options: int) -> TensorDictBase:
+    """Roots after no, one, two ... random steps; a batch for a stateless env."""
+    with seeded(0):
+        env.set_seed(0)
+        if env.batch_locked or env.batch_size:
+            td = env.reset()
+            return td.exclude("next", *env.action_keys)
+        n = 2 * num_options
+        td = env.reset(TensorDict(batch_size=[n]))
+        for _ in range(3):
+            _, td = env.step_and_maybe_reset(env.rand_action(td))
+        return td.exclude("next", *env.action_keys)
+
+
+def _weights(worker: object) -> dict[str, Tensor]:
+    if not isinstance(worker, torch.nn.Module):
+        return {}
+    state = worker.state_dict()
+    return {key: value.clone() for key, value in state.items() if isinstance(value, Tensor)}
+
+
+def _act(
+    name: str, worker: Callable[[TensorDictBase], TensorDictBase], td: TensorDictBase
+) -> TensorDictBase:
+    td = td.clone()
+    where = f"acting for a batch of shape {list(td.batch_size)}"
+    with during(name, where, "A worker takes tensordicts of any batch shape."):
+        with torch.no_grad(), seeded(0):
+            out = worker(td)
+    return td if out is None else out
+
+
+def _same(
+    name: str, env: EnvBase, one: TensorDictBase, two: TensorDictBase, tolerance: float, told: str
+) -> None:
+    where = different(one, two, list(map(unravel_key, env.action_keys)), tolerance)
+    require(
+        where is None,
+        f"{name}: the actions {told} differ: {where and one.get(where[0])!s:.100} and "
+        f"{where and two.get(where[0])!s:.100}. Read nothing of other elements (no batch "
+        "statistics), and draw random numbers from torch's generator or your own, seeded; for a "
+        "random worker pass deterministic=False.",
+    )
+
+
+def check_termination(
+    termination: Callable[[TensorDictBase], Tensor],
+    tensordict: TensorDictBase,
+    *,
+    deterministic: bool = True,
+) -> None:
+    """Check that a condition can end options.
+
+    It gives one bool per element, for any batch shape, leaves its input as it was, and asks of an
+    element nothing about the others.
+
+    Args:
+        termination (callable): ``termination(td) -> bool [*B]`` or ``[*B, 1]``, as
+            :class:`~torchrl_hmcts.transforms.OptionTransform` takes it.
+        tensordict (TensorDictBase): entries after a base step, ``[m]``, with the option under its
+            ``skill_key`` and the base steps taken under ``"duration"``; of some variety.
+        deterministic (bool): whether it draws no random numbers. Default ``True``.
+
+    Raises:
+        ContractError: if it cannot.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.modules import StallTermination
+        >>> from torchrl_hmcts.testing import check_termination
+        >>> td = TensorDict(stalled_steps=torch.tensor([[1], [3]]),
+        ...                 duration=torch.tensor([[9], [9]]), batch_size=[2])
+        >>> check_termination(StallTermination(3), td)
+    """
+    name = getattr(termination, "__name__", type(termination).__name__)
+    if len(tensordict.batch_size) != 1 or not len(tensordict):
+        raise ValueError(
+            f"check_termination needs a tensordict [m] of states; got batch size "
+            f"{list(tensordict.batch_size)}."
+        )
+    for key in getattr(termination, "in_keys", ()):
+        require(
+            tensordict.get(key, None) is not None,
+            f"{name} reads {key!r}, which the tensordict does not have. Add it.",
+        )
+    for shape in ((len(tensordict),), (1, len(tensordict))):
+        td = tensordict.clone().reshape(shape)
+        held = td.clone()
+        with during(name, f"asked about a batch of shape {list(shape)}"):
+            with torch.no_grad():
+                ends = termination(td)
+        good = isinstance(ends, Tensor) and ends.dtype == torch.bool
+        good = good and ends.shape in (torch.Size(shape), torch.Size((*shape, 1)))
+        if not good:
+            got = f"{ends.dtype} {list(ends.shape)}" if isinstance(ends, Tensor) else repr(ends)
+            raise ContractError(
+                f"{name} must give bool {list(shape)} or {[*shape, 1]}, True where the option "
+                f"ends; got {got}."
+            )
+        where = different(held, td, leaves(held))
+        require(
+            where is None and leaves(td) == leaves(held),
+            f"{name} changed its input. Write to a copy: td.copy().",
+        )
+    if deterministic:
+        with torch.no_grad():
+            together = termination(tensordict.clone()).reshape(-1)
+            for i in range(len(tensordict)):
+                alone = termination(tensordict[i : i + 1].clone()).reshape(-1)
+                require(
+                    alone[0] == together[i],
+                    f"{name} says {bool(together[i])} of element {i} among others and "
+                    f"{bool(alone[0])} of it alone. Ask about each element by itself; for a random "
+                    "condition pass deterministic=False.",
+                )

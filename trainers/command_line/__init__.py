@@ -1,0 +1,5 @@
+"""The verbs of the command ``hmcts``, which ``torchrl_hmcts.trainers.cli`` joins."""
+
+from __future__ import annotations
+
+__all__: list[str] = []

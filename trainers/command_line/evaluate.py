@@ -1,0 +1,64 @@
+"""``hmcts evaluate run=DIR key=value ...``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
+from torchrl_hmcts.trainers.command_line.words import split_words
+from torchrl_hmcts.trainers.config import parse_overrides
+from torchrl_hmcts.trainers.experiments.run_folder import (
+    add_evaluation,
+    load_config,
+    read_run,
+    shown_word,
+)
+
+
+def evaluate(words: Sequence[str]) -> int:
+    """Test a run's newest checkpoint again and add the figures to its ``evaluation.json``."""
+    try:
+        own, rest = split_words(words, ["run"])
+        if "run" not in own:
+            raise ValueError("say which run: run=DIR, the folder that a training wrote.")
+        run = read_run(own["run"])
+        experiment, saved = load_config(run)
+        changed = parse_overrides(
+            experiment.config_class, rest, base=saved, others=["run", "log_level"]
+        )
+        if changed.out != saved.out:
+            raise ValueError("the figures go to the folder of the run, next to its own; no out=.")
+        changes = {
+            field.name: getattr(changed, field.name)
+            for field in dataclasses.fields(changed)
+            if getattr(changed, field.name) != getattr(saved, field.name)
+        }
+        function = experiment.evaluation
+    except ModuleNotFoundError as error:
+        return missing(error)
+    except ValueError as error:
+        return refuse("evaluate", error)
+    from torchrl_hmcts.trainers.figures.report import machine, versions, write_run_page
+
+    try:
+        with said(own.get("log_level", "info")):
+            results = function(changed)
+    except FileNotFoundError as error:
+        return fail("evaluate", error)
+    except ValueError as error:
+        return refuse("evaluate", error)
+    evaluation: dict[str, Any] = {
+        "changes": changes,
+        "results": results,
+        "command": " ".join(map(shown_word, ["hmcts", "evaluate", *words])),
+        "versions": versions(),
+        "machine": machine(),
+    }
+    file = add_evaluation(run.path, evaluation)
+    write_run_page(run.path)
+    print(json.dumps(results, indent=1))
+    print(f"Figures: {file}; with all others: {run.path / 'index.html'}")
+    return 0

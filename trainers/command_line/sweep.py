@@ -1,0 +1,110 @@
+"""``hmcts sweep experiment=NAME key=[a,b] key=low..high trials=N``."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+from collections.abc import Iterator, Sequence
+
+from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
+from torchrl_hmcts.trainers.command_line.words import LOG_LEVELS, set_log_level, split_words
+from torchrl_hmcts.trainers.config import parse_overrides
+from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, find_experiment
+from torchrl_hmcts.trainers.experiments.run_folder import shown_word
+from torchrl_hmcts.trainers.experiments.sweep_space import parse_space
+
+_OWN = ("experiment", "trials", "objective", "storage", "prune", "out")
+_DEFAULT_TRIALS = 20
+
+
+def sweep(words: Sequence[str]) -> int:
+    """Run trials until as many as asked for are finished, and write the page of the sweep."""
+    try:
+        own, rest = split_words(words, _OWN)
+        if "experiment" not in own:
+            raise ValueError(f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))}.")
+        experiment = find_experiment(own["experiment"])
+        space, fixed = parse_space(experiment.config_class, rest, [*_OWN, "log_level"])
+        folder = own.get("out", f"runs/sweep_{experiment.name}")
+        config = parse_overrides(experiment.config_class, [*fixed, f"out={folder}"])
+        trials = _whole("trials", own.get("trials", str(_DEFAULT_TRIALS)))
+        objective = own.get("objective", experiment.objective)
+        if not objective:
+            raise ValueError("say what to improve, e.g. objective=test.solved.")
+        prune = _yes_or_no("prune", own.get("prune", "true"))
+        level = own.get("log_level", "info")
+        if level not in LOG_LEVELS:
+            set_log_level(level)  # raises
+        from torchrl_hmcts.trainers.experiments.sweep import Sweep
+
+        plan = Sweep(experiment, config, space, objective, own.get("storage"), prune, config.seed)
+        study = plan.study()  # before any trial: says what is wrong with storage or folder
+    except ModuleNotFoundError as error:
+        return missing(error)
+    except ValueError as error:
+        return refuse("sweep", error)
+    except OSError as error:
+        return fail("sweep", f"{error}. Choose another folder with out=DIR.")
+    command = " ".join(map(shown_word, ["hmcts", "sweep", *words]))
+    try:
+        # Optuna says what came of each trial; what the trials say is for those who ask for it.
+        with said(level), said_by_trials(level):
+            study = plan.run(trials)
+    except KeyboardInterrupt:
+        _page(plan, study, command)
+        again = " ".join(["hmcts", "sweep", *words])
+        print(f"\nhmcts sweep: stopped; go on with: {again}", file=sys.stderr)
+        return 130
+    except ValueError as error:
+        return refuse("sweep", error)
+    best = _page(plan, study, command)
+    print(best)
+    return 0
+
+
+def _page(plan: object, study: object, command: str) -> str:
+    from torchrl_hmcts.trainers.experiments.sweep import Sweep, importances, trial_rows
+    from torchrl_hmcts.trainers.figures.sweep_page import write_sweep_page
+
+    assert isinstance(plan, Sweep)
+    rows, shares = trial_rows(study), importances(study)  # type: ignore[arg-type]
+    content = {"objective": plan.objective, "trials": rows, "importances": shares}
+    (plan.folder / "sweep.json").write_text(json.dumps(content, indent=1) + "\n")
+    page = write_sweep_page(
+        plan.folder,
+        experiment=plan.experiment.name,
+        objective=plan.objective,
+        rows=rows,
+        importances=shares,
+        command=command,
+    )
+    best = next((row for row in rows if row["value"] is not None), None)
+    if best is None:
+        return f"No trial has finished. Page: {page}"
+    values = " ".join(f"{key}={value}" for key, value in best["params"].items())
+    name = plan.objective.removeprefix("-")
+    return f"Best of {len(rows)} trials: {name} = {best['value']:.6g} with {values}\nPage: {page}"
+
+
+@contextlib.contextmanager
+def said_by_trials(level: str) -> Iterator[None]:
+    """Keep what experiments print to themselves, unless the level is ``"debug"``."""
+    if level == "debug":
+        yield
+        return
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+def _whole(key: str, value: str) -> int:
+    if not value.isdigit() or int(value) < 1:
+        raise ValueError(f"{key} must be a whole number above 0; got {value!r}.")
+    return int(value)
+
+
+def _yes_or_no(key: str, value: str) -> bool:
+    if value.lower() not in ("true", "false"):
+        raise ValueError(f"{key} is true or false; got {value!r}.")
+    return value.lower() == "true"

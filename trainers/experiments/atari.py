@@ -1,0 +1,423 @@
+"""Chapter 5's experiment: tree search over options on Atari's RAM."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from torchrl_hmcts.envs import AtariOptionPool, OptionWorker
+from torchrl_hmcts.envs.atari_emulator import find_game
+from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariProgress, AtariSearch
+from torchrl_hmcts.trainers.atari.goals import GoalSearch
+from torchrl_hmcts.trainers.atari.sources import (
+    DIAYNSource,
+    DistilledSource,
+    GoalSource,
+    Options,
+    RepeatSource,
+    WorkerSource,
+    load_options,
+)
+from torchrl_hmcts.trainers.atari.tuning import Tuned, tune_search
+from torchrl_hmcts.trainers.checkpoints import write_text
+from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
+from torchrl_hmcts.trainers.experiments.registry import ExperimentError
+from torchrl_hmcts.trainers.figures.atari_figures import plot_scores, write_atari_gif
+from torchrl_hmcts.trainers.figures.report import versions, write_page
+
+TOY: dict[str, Any] = {
+    "frames": 20_000,
+    "max_episode_frames": 2_000,
+    "source": "repeat",
+    "option_steps": 10,
+    "ratio": 5.0,
+    "skill_base_steps": 512,
+}
+FRAMES_PER_STEP = 4
+_FREE = ("out", "resume", "frames", "options_from", "num_processes")  # may change on the way
+
+
+def run_atari(config: AtariConfig) -> dict[str, Any]:
+    """Run ``hmcts train experiment=atari`` and return its figures, as in ``metrics.json``.
+
+    Finds options, then plays episodes until the frames are spent. A run that is stopped goes on
+    with ``resume=true`` from its newest checkpoint; what it would have found does not change.
+
+    Args:
+        config: see :class:`~torchrl_hmcts.trainers.experiments.atari_config.AtariConfig`.
+
+    Returns:
+        The figures; ``score_max`` is the best episode, ``score_final`` the last.
+
+    Raises:
+        ExperimentError: if there is no such game, or a checkpoint is of a run with other settings.
+
+    Reference:
+        Dissertation, chapter 5.
+    """
+    if config.toy:
+        config = dataclasses.replace(config, **TOY)
+    torch.set_num_threads(1)
+    try:
+        find_game(config.game)
+    except ValueError as error:
+        raise ExperimentError(str(error)) from None
+    out = Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    run = AtariRun(config)
+    saved = out / "checkpoints" / "run.pt"
+    if config.resume and saved.is_file():
+        run.load_state_dict(torch.load(saved, weights_only=True))
+    save = lambda: _save(saved, run.state_dict())  # noqa: E731
+    begin = time.perf_counter()
+    with tqdm(total=config.frames, unit=" frames", unit_scale=True, disable=None) as bar:
+        try:
+            run.play(save, lambda: (bar.update(run.num_frames - bar.n), None)[1])
+        finally:
+            run.close()
+    metrics = {
+        **run.figures(),
+        "seconds_of_this_part": round(time.perf_counter() - begin, 1),
+        "config": dataclasses.asdict(config),
+        "versions": versions(),
+    }
+    _write_curves(run, out / "curves.csv")
+    pictures = draw(run, out)
+    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    title = f"{config.game} by planning over options, {config.protocol}"
+    write_page(out / "index.html", title=title, metrics=metrics, pictures=pictures)
+    print(
+        f"{config.game}: {len(run.scores)} episodes, best {metrics['score_max']:g}, last "
+        f"{metrics['score_final']:g}, {run.num_frames:,} frames. "
+        f"Pictures and figures: {out / 'index.html'}"
+    )
+    return metrics
+
+
+class AtariRun:
+    """A run: options, how they are searched, and the episodes so far.
+
+    Args:
+        config: of the experiment.
+
+    Attributes:
+        scores: of the episodes that are over: dicts with ``frames`` (emulated so far), ``score``,
+            ``real_frames`` and ``seed``.
+        options: what the source has found; None before.
+        tuned: how long an option is, and PUCT's c; None before.
+    """
+
+    def __init__(self, config: AtariConfig) -> None:
+        self.config = config
+        self.scores: list[dict[str, float]] = []
+        self.points: list[tuple[int, float]] = []  # running score against frames
+        self.options: Options | None = None
+        self.tuned: Tuned | None = None
+        self.agent: AtariAgent | None = None
+        self._frames_before = 0  # of pools that are closed, and of earlier parts of the run
+        self._resumed: dict[str, Any] | None = None
+        self.seconds = 0.0
+
+    # ---------------------------------------------------------------- pools
+
+    def make_pool(
+        self,
+        worker: OptionWorker,
+        max_steps: int,
+        *,
+        sticky: bool = False,
+        record: bool = False,
+        seed: int | None = None,
+    ) -> AtariOptionPool:
+        """Make a pool of the game's emulators; to play in if sticky or recorded, else to plan."""
+        config = self.config
+        processes = None if config.num_processes < 0 else config.num_processes
+        return AtariOptionPool(
+            config.game,
+            worker,
+            max_steps=max_steps,
+            num_processes=0 if sticky or record else processes,
+            record=record,
+            gamma=config.gamma,
+            repeat_action_probability=0.25 if sticky else 0.0,
+            max_frames=config.max_episode_frames,
+            seed=config.seed if seed is None else seed,
+        )
+
+    @property
+    def num_frames(self) -> int:
+        """Frames emulated so far, for all purposes."""
+        return self._frames_before + (0 if self.agent is None else self.agent.num_frames)
+
+    # ---------------------------------------------------------------- playing
+
+    def play(self, save: Callable[[], None], tick: Callable[[], None]) -> None:
+        """Play until the frames are spent.
+
+        Args:
+            save: called where the run can go on from exactly.
+            tick: called after every decision.
+        """
+        config = self.config
+        begin = time.perf_counter()
+        if self.options is None and config.options_from:
+            self._take_over(Path(config.options_from))
+        if self.options is None:
+            self.options = self._source().find(
+                config.game, self.make_pool, seed=config.seed, log=print
+            )
+            self._frames_before += self.options.num_frames
+        if self.tuned is None:
+            self.tuned = tune_search(self.options, self.make_pool, config, log=print)
+            self._frames_before += self.tuned.num_frames
+        self.seconds += time.perf_counter() - begin
+        agent = self._agent()
+        fresh = self._resumed is None
+        if self._resumed is not None:
+            self._seed_episode(agent)
+            agent.load_state_dict(self._resumed)
+            self._resumed = None
+            self._frames_before -= agent.num_frames  # a console's start is no part of the run
+        else:
+            self._frames_before -= agent.num_frames
+            self._seed_episode(agent)
+            agent.begin()
+        if fresh:
+            save()
+        while True:
+            begin = time.perf_counter()
+            # To the next checkpoint, which is where the tree is planted anew.
+            rest = config.replant_every - agent.progress.decisions % config.replant_every
+            for _ in range(rest):
+                if agent.play(1).done:
+                    break
+                tick()
+            self.seconds += time.perf_counter() - begin
+            progress = agent.progress
+            self.points.append((self.num_frames, progress.score))
+            if progress.done:
+                self._end_episode(progress)
+                if self.num_frames >= config.frames:
+                    save()
+                    return
+                self._seed_episode(agent)
+                agent.begin()
+            save()
+
+    def _take_over(self, folder: Path) -> None:
+        """Take options and their length from another run, and what it spent on them."""
+        path = folder / "checkpoints" / "run.pt"
+        if not path.is_file():
+            raise ExperimentError(f"options_from={folder} is no run of this experiment: no {path}.")
+        other = torch.load(path, weights_only=True)
+        if other["config"]["game"] != self.config.game:
+            raise ExperimentError(
+                f"options_from={folder} is a run of {other['config']['game']}, not of "
+                f"{self.config.game}, whose actions are others."
+            )
+        saved = other["options"]
+        self.options = Options(load_options(saved["saved"]), **saved)
+        self.tuned = Tuned(**other["tuned"])
+        self._frames_before += self.options.num_frames + self.tuned.num_frames
+
+    def _seed_episode(self, agent: AtariAgent) -> None:
+        """Give an episode a start and draws of its own, whatever was played before."""
+        agent.seed = self.config.seed * 10_000 + len(self.scores)
+        for pool in (agent.pool, agent.real):
+            pool.set_seed(agent.seed + (7_654_321 if pool is not agent.pool else 0))
+
+    def _end_episode(self, progress: AtariProgress) -> None:
+        row = {
+            "frames": self.num_frames,
+            "score": progress.score,
+            "real_frames": progress.real_steps * FRAMES_PER_STEP,
+            "decisions": progress.decisions,
+        }
+        self.scores.append(row)
+        print(f"episode {len(self.scores)}: {row}", flush=True)
+
+    def _source(self) -> WorkerSource:
+        config = self.config
+        if config.source == "repeat":
+            return RepeatSource()
+        if config.source.startswith("goals"):
+            goals = GoalSource(GoalSearch(trial_steps=config.trial_steps), self.search())
+            return DistilledSource(goals) if config.source == "goals_network" else goals
+        kind = config.source.partition("_")[2] or "state"
+        return DIAYNSource(config.num_skills, config.skill_base_steps, discriminator=kind)
+
+    def search(self) -> AtariSearch:
+        """How the agent searches."""
+        config = self.config
+        return AtariSearch(
+            ratio=config.ratio,
+            tree_policy=config.tree_policy,
+            c=config.c if self.tuned is None else self.tuned.c,
+            rollout_options=config.rollout_options,
+            leaves_per_wave=config.leaves_per_wave,
+            width_novelty=config.width_novelty,
+        )
+
+    def _agent(self) -> AtariAgent:
+        assert self.options is not None
+        assert self.tuned is not None
+        config, worker, steps = self.config, self.options.worker, self.tuned.option_steps
+        pool = self.make_pool(worker, steps)
+        real = None
+        if config.protocol == "sticky":
+            real = self.make_pool(worker, steps, sticky=True, seed=config.seed + 7_654_321)
+        self.agent = AtariAgent(
+            pool,
+            self.search(),
+            play_in=real,
+            replant_every=config.replant_every,
+            seed=config.seed,
+        )
+        return self.agent
+
+    def close(self) -> None:
+        """Stop the processes."""
+        if self.agent is not None:
+            self._frames_before = self.num_frames
+            for pool in {id(p): p for p in (self.agent.pool, self.agent.real)}.values():
+                pool.close()
+            self.agent = None
+
+    # ---------------------------------------------------------------- what came of it
+
+    def figures(self) -> dict[str, Any]:
+        """Return the run's figures."""
+        assert self.options is not None
+        assert self.tuned is not None
+        config = self.config
+        scores = [row["score"] for row in self.scores]
+        return {
+            "game": config.game,
+            "protocol": config.protocol,
+            "source": config.source,
+            "seed": config.seed,
+            "score_max": max(scores),
+            "score_final": scores[-1],
+            "score_mean": sum(scores) / len(scores),
+            "episodes": self.scores,
+            "frames": self.num_frames,
+            "base_steps": self.num_frames // FRAMES_PER_STEP,
+            "options": self.options.names,
+            "option_steps": self.tuned.option_steps,
+            "c": self.tuned.c,
+            "frames_finding_options": self.options.num_frames,
+            "frames_tuning": self.tuned.num_frames,
+            "seconds": round(self.seconds, 1),
+            "finding": self.options.report,
+            "tuning": self.tuned.trials,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what is needed to go on from a checkpoint, plain data and tensors."""
+        assert self.options is not None
+        assert self.tuned is not None
+        assert self.agent is not None
+        ours = dataclasses.asdict(self.config)
+        return {
+            "config": {k: v for k, v in ours.items() if k not in _FREE},
+            "options": {
+                "names": self.options.names,
+                "num_frames": self.options.num_frames,
+                "report": self.options.report,
+                "saved": self.options.saved,
+            },
+            "tuned": dataclasses.asdict(self.tuned),
+            "frames": self.num_frames,
+            "seconds": self.seconds,
+            "scores": list(self.scores),
+            "points": list(self.points),
+            "agent": self.agent.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a checkpoint.
+
+        Args:
+            state_dict: as :meth:`state_dict` returned it.
+
+        Raises:
+            ExperimentError: if it is of a run with other settings.
+        """
+        ours = dataclasses.asdict(self.config)
+        theirs = state_dict["config"]
+        others = [k for k, v in theirs.items() if k not in _FREE and ours.get(k, v) != v]
+        if others:
+            changed = ", ".join(f"{k}={ours.get(k)!r} instead of {theirs[k]!r}" for k in others)
+            raise ExperimentError(
+                f"The checkpoint is of a run with other settings: {changed}. Resume with the same, "
+                f"or start anew in another folder."
+            )
+        saved = state_dict["options"]
+        self.options = Options(load_options(saved["saved"]), **saved)
+        self.tuned = Tuned(**state_dict["tuned"])
+        self.scores = [dict(row) for row in state_dict["scores"]]
+        self.points = [(int(x), float(y)) for x, y in state_dict["points"]]
+        self._frames_before = int(state_dict["frames"])
+        self.seconds = float(state_dict["seconds"])
+        self._resumed = state_dict["agent"]
+
+
+def draw(run: AtariRun, out: Path) -> dict[str, str]:
+    """Draw a run's pictures into a folder; return their captions by file.
+
+    Args:
+        run: with at least one episode.
+        out: folder.
+    """
+    plot_scores(run.scores, out / "scores.png", title=run.config.game)
+    pictures = {"scores.png": "Score of each episode against emulated frames, real and simulated."}
+    assert run.options is not None
+    assert run.tuned is not None
+    pool = run.make_pool(run.options.worker, run.tuned.option_steps)
+    recorder = run.make_pool(run.options.worker, run.tuned.option_steps, record=True)
+    try:
+        search = dataclasses.replace(run.search(), ratio=min(run.config.ratio, 10.0))
+        agent = AtariAgent(pool, search, seed=run.config.seed)
+        steps = 60 if run.config.toy else 450
+        write_atari_gif(agent, recorder, out / "episode.gif", real_steps=steps)
+    finally:
+        pool.close()
+        recorder.close()
+    pictures["episode.gif"] = "The first minute of an episode, planned with fewer simulations."
+    return pictures
+
+
+def _write_curves(run: AtariRun, path: Path) -> None:
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["step", "name", "value"])
+    best = float("-inf")
+    for row in run.scores:
+        steps = int(row["frames"]) // FRAMES_PER_STEP
+        best = max(best, row["score"])
+        rows.writerow([steps, "score", row["score"]])
+        rows.writerow([steps, "score_max", best])
+    for frames, score in run.points:
+        rows.writerow([frames // FRAMES_PER_STEP, "score_of_the_running_episode", score])
+    write_text(path, text.getvalue())
+
+
+def _save(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint in one move: there is always a whole one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.writing-{os.getpid()}")
+    with temporary.open("wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)

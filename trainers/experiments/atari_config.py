@@ -1,0 +1,104 @@
+"""Configuration of the ``atari`` experiment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchrl_hmcts.arguments import name_arguments
+
+PROTOCOLS = ("deterministic", "sticky")
+SOURCES = ("goals", "goals_network", "repeat", "diayn", "diayn_displacement", "diayn_controllable")
+
+
+@name_arguments
+@dataclass
+class AtariConfig:
+    """What ``hmcts train experiment=atari`` does.
+
+    A base step is 4 frames of the game. All emulated frames count: real, simulated, and those spent
+    on finding options.
+
+    Example:
+        >>> AtariConfig(game="Pong").protocol
+        'deterministic'
+    """
+
+    game: str = "Breakout"
+    """The game; needs the extra `atari`, which brings the games along."""
+    seed: int = 0
+    """Seed of starts, searches and of what is learned."""
+    out: str = "runs/atari"
+    """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
+    protocol: str = "deterministic"
+    """"deterministic" (comparable with the source and the planning papers) or "sticky" (actions
+    stick with probability 0.25, and the planner is given no random generator)."""
+    source: str = "goals"
+    """Where options come from: "goals" (found by a probe and trials), "goals_network" (the
+    same, carried out by one network that learned them), "repeat" (one for each
+    action), "diayn" (the source's worker), "diayn_displacement", "diayn_controllable"."""
+    frames: int = 40_000_000
+    """Emulated frames in all, the source's 10 million base steps; the last episode is finished."""
+    max_episode_frames: int = 108_000
+    """Real frames after which an episode ends, the community's half an hour."""
+    options_from: str = ""
+    """Folder of another run of the game, whose options and their length are taken over; what it
+    spent on finding them counts."""
+    option_steps: int = 0
+    """Base steps of an option (the source's N_worker_samples); 0: chosen by trials."""
+    tune_trials: int = 4
+    """Lengths of options that are tried where `option_steps=0`, of 5, 10, 20, 30."""
+    tune_with: str = "grid"
+    """"grid" tries the lengths one by one; "optuna" draws lengths and PUCT's c (needs optuna)."""
+    num_skills: int = 3
+    """Skills of a DIAYN worker (the source's N_policies)."""
+    skill_base_steps: int = 40_000
+    """Base steps of a DIAYN worker's training."""
+    ratio: float = 25.0
+    """Simulated base steps per real one."""
+    rollout_options: int = 5
+    """Options of the rollouts that stay in the tree."""
+    tree_policy: str = "puct"
+    """"puct" (max backup, values scaled to [0, 1]) or "uct" (mean backup), e.g. to compare with."""
+    c: float = 2.0
+    """Weight of exploration; for UCT in units of the greatest reward seen."""
+    gamma: float = 0.99
+    """Discount per base step."""
+    width_novelty: bool = False
+    """Prune states without a RAM byte value that is new to the tree (width-1 search)."""
+    leaves_per_wave: int = 4
+    """Leaves of the tree that are simulated together."""
+    num_processes: int = -1
+    """Processes that emulate; 0: in the command's own; -1: one for each core."""
+    trial_steps: int = 300
+    """Real base steps of a trial in which options are compared."""
+    replant_every: int = 100
+    """Decisions between checkpoints, at which the tree is planted anew so that a resumed run goes
+    on exactly."""
+    resume: bool = False
+    """Go on from the newest checkpoint in `out`."""
+    toy: bool = False
+    """A run of seconds, to see that everything works."""
+
+    def __post_init__(self) -> None:
+        for name, value, choices in (
+            ("protocol", self.protocol, PROTOCOLS),
+            ("source", self.source, SOURCES),
+            ("tune_with", self.tune_with, ("grid", "optuna")),
+            ("tree_policy", self.tree_policy, ("puct", "uct")),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
+        for name in (
+            "frames", "max_episode_frames", "tune_trials", "num_skills", "skill_base_steps",
+            "leaves_per_wave", "trial_steps", "replant_every",
+        ):  # fmt: skip
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        for name, low in (("option_steps", 0), ("rollout_options", 0), ("num_processes", -1)):
+            if getattr(self, name) < low:
+                raise ValueError(f"{name} must be at least {low}; got {getattr(self, name)}.")
+        for name in ("ratio", "c"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")
+        if not 0.0 < self.gamma <= 1.0:
+            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")

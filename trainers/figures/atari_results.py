@@ -1,0 +1,258 @@
+"""Chapter 5: scores in seven games, ours beside the source's and the baselines' of its Table A.1.
+
+Runs of the experiment ``atari`` have in ``metrics.json`` the entries ``game``, ``protocol``
+(``"deterministic"`` or ``"sticky"``), ``seed``, ``score_max``, ``score_final`` and ``frames``, and
+in ``curves.csv`` the curves ``score`` and ``score_max`` against emulated steps. Files in
+``docs/results/atari`` are lists of such summaries, with an entry ``curves`` for the figures:
+``{"score": {"step": [...], "value": [...]}, "score_max": {...}}``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from torchrl_hmcts.trainers.experiments.run_folder import RunCurve
+from torchrl_hmcts.trainers.figures.curve_panels import common_steps
+from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
+from torchrl_hmcts.trainers.figures.intervals import bootstrap
+from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
+
+_DPI = 110
+_COLORS = {"deterministic": "#1d4ed8", "sticky": "#16a34a"}
+
+
+@dataclass(frozen=True)
+class SourceScore:
+    """A row of the dissertation's Table 5.1.
+
+    ``score`` is the highest of training; ``num_skills`` its N_policies and ``option_steps`` its
+    N_worker_samples, found by grid search.
+    """
+
+    score: int
+    num_skills: int
+    option_steps: int
+
+
+TABLE_5_1 = {
+    "BeamRider": SourceScore(6823, 3, 20),
+    "Breakout": SourceScore(464, 3, 30),
+    "Enduro": SourceScore(708, 4, 20),
+    "SpaceInvaders": SourceScore(1343, 4, 30),
+    "Qbert": SourceScore(19839, 5, 10),
+    "Seaquest": SourceScore(1904, 5, 10),
+    "Pong": SourceScore(20, 3, 10),
+}
+"""The dissertation's Table 5.1, by game."""
+
+_A_1_GAMES = ("Enduro", "SpaceInvaders", "Qbert", "Seaquest", "Pong", "BeamRider", "Breakout")
+TABLE_A_1 = {
+    algorithm: dict(zip(_A_1_GAMES, scores, strict=True))
+    for algorithm, scores in {
+        "ppo2": (350.22, 557.28, 7012.06, 1218.87, 13.68, 1299.25, 114.26),
+        "deepq": (479.75, 459.86, 3254.83, 1164.08, 16.49, 1582.34, 131.46),
+        "acktr": (0.0, 557.19, 4429.3, 1201.16, 9.56, 2171.19, 113.58),
+        "acer": (0.0, 656.91, 6433.38, 1065.98, 3.11, 1959.22, 82.94),
+        "ppo2_mpi": (207.47, 459.89, 7184.73, 1383.38, 13.9, 594.45, 81.61),
+        "a2c": (0.0, 463.06, 2047.07, 1150.66, 1.0, 1302.61, 59.72),
+        "trpo_mpi": (24.83, 457.7, 2486.18, 710.07, 2.82, 683.11, 14.98),
+    }.items()
+}
+"""The dissertation's Table A.1: mean scores of OpenAI Baselines after 10M steps, by algorithm."""
+
+
+def best_baseline(game: str) -> tuple[str, float]:
+    """Return the best algorithm of Table A.1 in a game, and its mean score.
+
+    Args:
+        game: e.g. ``"Breakout"``.
+
+    Example:
+        >>> best_baseline("Breakout")
+        ('deepq', 131.46)
+    """
+    return max(((name, row[game]) for name, row in TABLE_A_1.items()), key=lambda pair: pair[1])
+
+
+def summaries(sources: Sources) -> list[dict[str, Any]]:
+    """Return the summaries of the runs given, else those of ``docs/results/atari``.
+
+    Args:
+        sources: of the figures.
+    """
+    runs = []
+    for run in sources.of("atari"):
+        if "game" in {**run.config, **run.metrics}:
+            runs.append({**run.config, **run.metrics, "curves": run.curves})
+    folder = sources.result("atari")
+    if runs or folder is None:
+        return runs
+    for file in sorted(folder.glob("*.json")):
+        rows = json.loads(file.read_text())
+        for row in rows if isinstance(rows, list) else []:
+            curves = {
+                name: RunCurve(name, curve["step"], curve["value"], "steps")
+                for name, curve in row.get("curves", {}).items()
+            }
+            runs.append({**row, "curves": curves})
+    return runs
+
+
+def by_protocol(rows: Sequence[Mapping[str, Any]], game: str) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the summaries of a game, by protocol."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        if row.get("game") == game:
+            groups.setdefault(str(row.get("protocol", "deterministic")), []).append(row)
+    return groups
+
+
+def draw_game(sources: Sources, path: Path, name: str) -> str:
+    """Draw the scores in a game against emulated steps: mean, least and largest over the seeds.
+
+    Args:
+        sources: of the figures.
+        path: PNG to write.
+        name: of the figure, which says the game.
+
+    Returns:
+        The caption.
+
+    Raises:
+        MissingData: if there is no run with curves.
+
+    Reference:
+        Dissertation, figures 5.1 to 5.7.
+    """
+    figure = find_figure(name)
+    game = figure.argument
+    groups = {
+        protocol: [row for row in rows if row.get("curves")]
+        for protocol, rows in by_protocol(summaries(sources), game).items()
+    }
+    groups = {protocol: rows for protocol, rows in groups.items() if rows}
+    if not groups:
+        raise figure.how_to_get_data(f"there is no run of {game} with its curves.")
+    shown = Figure(figsize=(10.0, 4.2), layout="constrained")
+    panels = shown.subplots(1, 2)
+    titles = {"score": "score of an episode", "score_max": "highest score so far"}
+    for axes, (entry, title) in zip(panels, titles.items(), strict=True):
+        for protocol, rows in groups.items():
+            curves = [row["curves"][entry] for row in rows if entry in row["curves"]]
+            if not curves:
+                continue
+            steps, values = common_steps(curves)
+            color = _COLORS.get(protocol, "#7c3aed")
+            if len(curves) > 1:
+                axes.fill_between(
+                    steps, values.min(0), values.max(0), color=color, alpha=0.16, linewidth=0
+                )
+            label = f"{protocol}, {len(curves)} seed{'s' if len(curves) > 1 else ''}"
+            axes.plot(steps, values.mean(0), color=color, linewidth=2.0, label=label)
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.grid(alpha=0.25)
+        axes.set_xlim(left=0)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.spines[["top", "right"]].set_visible(False)
+    source, (algorithm, baseline) = TABLE_5_1[game], best_baseline(game)
+    panels[1].axhline(
+        source.score, color="#d97706", linestyle="--", linewidth=1.4, label="the source's highest"
+    )
+    panels[0].axhline(
+        baseline, color="#71717a", linestyle=":", linewidth=1.4, label=f"{algorithm} (Table A.1)"
+    )
+    for axes in panels:
+        axes.legend(frameon=False, fontsize=9)
+    shown.supxlabel("emulated steps", fontsize=10)
+    shown.suptitle(game, fontsize=11, x=0.01, ha="left")
+    shown.savefig(path, dpi=_DPI)
+    return f"{game}: mean, least and largest over the seeds, against emulated steps."
+
+
+def write_table(sources: Sources, path: Path, name: str) -> str:
+    """Write Table 5.1 with our scores beside the source's, as a page and as Markdown beside it.
+
+    Args:
+        sources: of the figures.
+        path: HTML to write.
+        name: of the table.
+
+    Returns:
+        What to say about it.
+
+    Raises:
+        MissingData: if there is no run.
+
+    Reference:
+        Dissertation, tables 5.1 and A.1.
+    """
+    rows = summaries(sources)
+    if not rows:
+        raise find_figure(name).how_to_get_data("there is no run of atari.")
+    protocols = sorted({str(row.get("protocol", "deterministic")) for row in rows})
+    head = ["game", "source: highest", "source: skills, steps", "best of Table A.1"]
+    for protocol in protocols:
+        head += [f"ours, {protocol}: highest", f"ours, {protocol}: at the end", "seeds"]
+    cells = []
+    for game, source in TABLE_5_1.items():
+        algorithm, baseline = best_baseline(game)
+        line: list[Any] = [
+            game,
+            source.score,
+            f"{source.num_skills}, {source.option_steps}",
+            Number(f"{text(baseline)} <small>{text(algorithm)}</small>"),
+        ]
+        groups = by_protocol(rows, game)
+        for protocol in protocols:
+            group = groups.get(protocol, [])
+            highest = [float(row["score_max"]) for row in group if "score_max" in row]
+            line.append(max(highest) if highest else "-")
+            line.append(_interval([float(r["score_final"]) for r in group if "score_final" in r]))
+            line.append(len(group))
+        cells.append(line)
+    baselines = [
+        [algorithm, *(row[game] for game in TABLE_5_1)] for algorithm, row in TABLE_A_1.items()
+    ]
+    note = (
+        "The source gives the highest score of training, with the best of a grid of skills and "
+        "steps. Scores at the end are means over the seeds with 95 % bootstrap intervals."
+    )
+    path.write_text(
+        page(
+            "Table 5.1",
+            Html(f'<p class="lead">{text(note)}</p>'),
+            table(cells, head),
+            Html("<h2>Table A.1: means of OpenAI Baselines, as the source gives them</h2>"),
+            table(baselines, ["", *TABLE_5_1]),
+        )
+    )
+    markdown = [" | ".join(head), " | ".join("---" for _ in head)]
+    markdown += [" | ".join(_as_plain(cell) for cell in line) for line in cells]
+    text_file = path.with_suffix(".md")
+    text_file.write_text("\n".join(f"| {line} |" for line in markdown) + "\n")
+    return f"Table 5.1 with {len(rows)} run(s) of ours; as Markdown: {text_file.name}."
+
+
+def _interval(values: list[float]) -> Html | str:
+    if not values:
+        return "-"
+    mean = bootstrap(values)
+    shown = text(plain(mean.middle))
+    if mean.count > 1:
+        shown += f" <small>{text(mean.low)} to {text(mean.high)}</small>"
+    return Number(shown)
+
+
+def _as_plain(cell: Any) -> str:
+    words = plain(cell)
+    for tag in ("<small>", "</small>"):
+        words = words.replace(tag, "")
+    return words
