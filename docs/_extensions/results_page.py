@@ -69,7 +69,6 @@ _ATARI = {
             "Seven games",
             "atari/runs.json",
             atari_section,
-            also=("atari/summary.json", "atari/compared/uct.json"),
         ),
     )
 }
