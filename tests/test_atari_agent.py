@@ -266,6 +266,15 @@ def test_a_run_in_pieces_is_the_run_in_one(tmp_path) -> None:
     second.play(nothing, nothing)
     assert second.scores == whole.scores
     assert second.points == whole.points
+    longer = AtariRun(AtariConfig(**{**config.__dict__, "frames": whole.scores[-1]["frames"] + 1}))
+    whole_again = AtariRun(config)
+    ended: list[dict] = []
+    whole_again.play(lambda: ended.append(whole_again.state_dict()), nothing)
+    longer.load_state_dict(ended[-1])
+    longer.play(nothing, nothing)  # one episode more, and none twice
+    assert longer.scores[: len(whole.scores)] == whole.scores
+    assert len(longer.scores) == len(whole.scores) + 1
+    assert longer.scores[-1]["frames"] > whole.scores[-1]["frames"]
     other = AtariRun(AtariConfig(**{**config.__dict__, "ratio": 4.0}))
     with pytest.raises(ValueError, match="other settings: ratio=4.0 instead of 3.0"):
         other.load_state_dict(saved[-1])

@@ -188,6 +188,11 @@ class AtariRun:
             agent.load_state_dict(self._resumed)
             self._resumed = None
             self._frames_before -= agent.num_frames  # a console's start is no part of the run
+            if agent.progress.done:  # the frames were spent then, and may be more now
+                if self.num_frames >= config.frames:
+                    return
+                self._seed_episode(agent)
+                agent.begin()
         else:
             self._frames_before -= agent.num_frames
             self._seed_episode(agent)

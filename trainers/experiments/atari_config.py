@@ -24,7 +24,7 @@ class AtariConfig:
     """
 
     game: str = "Breakout"
-    """The game; needs the extra `atari`, which brings the games along."""
+    """The game; needs the extra atari, which brings the games along."""
     seed: int = 0
     """Seed of starts, searches and of what is learned."""
     out: str = "runs/atari"

@@ -25,6 +25,8 @@ from torchrl_hmcts.trainers.figures.intervals import bootstrap
 from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
 
 _DPI = 110
+_FEW = 30
+_SECOND = {"deterministic": "#db2777", "sticky": "#65a30d"}
 _COLORS = {"deterministic": "#1d4ed8", "sticky": "#16a34a"}
 
 
@@ -114,6 +116,19 @@ def by_protocol(rows: Sequence[Mapping[str, Any]], game: str) -> dict[str, list[
     return groups
 
 
+def _by_source(
+    groups: Mapping[str, list[Mapping[str, Any]]],
+) -> dict[str, list[Mapping[str, Any]]]:
+    """Split the runs of a protocol by where their options come from, if from several sources."""
+    split: dict[str, list[Mapping[str, Any]]] = {}
+    for protocol, rows in groups.items():
+        found = sorted({str(row.get("source", "")) for row in rows})
+        for source in found:
+            name = protocol if len(found) == 1 else f"{protocol}, options: {source}"
+            split[name] = [row for row in rows if str(row.get("source", "")) == source]
+    return split
+
+
 def draw_game(sources: Sources, path: Path, name: str) -> str:
     """Draw the scores in a game against emulated steps: mean, least and largest over the seeds.
 
@@ -137,25 +152,33 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
         protocol: [row for row in rows if row.get("curves")]
         for protocol, rows in by_protocol(summaries(sources), game).items()
     }
-    groups = {protocol: rows for protocol, rows in groups.items() if rows}
+    groups = _by_source({protocol: rows for protocol, rows in groups.items() if rows})
     if not groups:
         raise figure.how_to_get_data(f"there is no run of {game} with its curves.")
     shown = Figure(figsize=(10.0, 4.2), layout="constrained")
     panels = shown.subplots(1, 2)
     titles = {"score": "score of an episode", "score_max": "highest score so far"}
     for axes, (entry, title) in zip(panels, titles.items(), strict=True):
+        shown_before: list[str] = []
         for protocol, rows in groups.items():
             curves = [row["curves"][entry] for row in rows if entry in row["curves"]]
             if not curves:
                 continue
             steps, values = common_steps(curves)
-            color = _COLORS.get(protocol, "#7c3aed")
+            name = protocol.partition(",")[0]
+            color, style = _COLORS.get(name, "#7c3aed"), "-"
+            if any(other.partition(",")[0] == name for other in shown_before):
+                color, style = _SECOND.get(name, "#db2777"), "--"  # another source of options
+            shown_before.append(protocol)
             if len(curves) > 1:
                 axes.fill_between(
                     steps, values.min(0), values.max(0), color=color, alpha=0.16, linewidth=0
                 )
             label = f"{protocol}, {len(curves)} seed{'s' if len(curves) > 1 else ''}"
-            axes.plot(steps, values.mean(0), color=color, linewidth=2.0, label=label)
+            marker = "o" if len(steps) <= _FEW else ""  # a single episode is no line
+            axes.plot(
+                steps, values.mean(0), style, color=color, linewidth=2.0, marker=marker, label=label
+            )
         axes.set_title(title, fontsize=10, loc="left")
         axes.grid(alpha=0.25)
         axes.set_xlim(left=0)

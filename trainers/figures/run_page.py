@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -67,11 +67,25 @@ def _tables(metrics: Mapping[str, Any], prefix: str) -> list[Html]:
             rows.append((key, Html(f"{text(value['mean'])} <small>{text(others)}</small>")))
         elif isinstance(value, Mapping):
             inner += _tables(value, f"{prefix}{name}.")
+        elif _are_records(value):
+            head = [column.replace("_", " ") for column in value[0]]
+            title = (prefix + name).replace(".", ": ").replace("_", " ")
+            shown = table(([plain(x) for x in row.values()] for row in value), head)
+            inner.append(Html(f"<h3>{text(title)}</h3>" + shown))
         else:
             rows.append((key, value))
     heading = prefix.rstrip(".").replace(".", ": ").replace("_", " ")
     own = [Html((f"<h3>{text(heading)}</h3>" if heading else "") + table(rows))] if rows else []
     return own + inner
+
+
+def _are_records(value: Any) -> bool:
+    """Whether a figure is a list of rows with the same columns, e.g. one for each episode."""
+    return (
+        isinstance(value, Sequence)
+        and len(value) > 0
+        and all(isinstance(row, Mapping) and list(row) == list(value[0]) for row in value)
+    )
 
 
 def is_spread(value: Any) -> bool:
