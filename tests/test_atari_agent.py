@@ -114,7 +114,7 @@ def test_options_are_built_again_from_what_was_saved(kind) -> None:
 def test_the_goals_of_breakout_are_found_without_being_told() -> None:
     settings = GoalSearch(probe_states=150, screen_steps=300)
     finder = GoalFinder(make_pool, settings, seed=0)
-    candidates, states = finder._probe()
+    candidates, states = finder.probe()
     assert finder.report["controllable"] == [72]  # the paddle
     assert 99 in finder.report["moving"]  # the ball
     ranked = finder._screen(candidates, states[:1])

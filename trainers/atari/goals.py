@@ -223,7 +223,7 @@ class GoalFinder:
 
     def find(self) -> list[Candidate]:
         """Return the options, the most useful first."""
-        candidates, states = self._probe()
+        candidates, states = self.probe()
         ranked = self._screen(candidates, states[:1])
         return self._choose(ranked)
 
@@ -231,7 +231,8 @@ class GoalFinder:
         self.num_frames += pool.num_frames
         pool.close()
 
-    def _probe(self) -> tuple[list[Candidate], TensorDictBase]:
+    def probe(self) -> tuple[list[Candidate], TensorDictBase]:
+        """Return the candidates, and the states ``[S]`` in which the actions were tried."""
         settings = self.settings
         pool = self.make_pool(RepeatActions(1), settings.hold_steps)
         names = list(pool.action_names)

@@ -146,7 +146,7 @@ class DIAYNSource:
         bytes_seen = list(range(128))
         if self.discriminator == "controllable":
             finder = GoalFinder(make_pool, GoalSearch(), seed=seed)
-            finder._probe()
+            finder.probe()
             frames += finder.num_frames
             report["controllable"] = bytes_seen = finder.report["controllable"]
             if not bytes_seen:
