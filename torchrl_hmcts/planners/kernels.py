@@ -5,6 +5,9 @@ simulation. This module is imported when the first search starts, since numba ta
 load. Fields are read as ``record["field"]``, not ``record.field``, so that the kernels also run as
 plain Python under ``NUMBA_DISABLE_JIT=1``, for a debugger.
 
+Those that allocate nothing are compiled without reference counts (``_nrt=False``, as numba compiles its
+own string functions): counting the views of arrays took a third of the time of a descent.
+
 They share one file, long as it is, because numba's cache looks at the file of the compiled function
 only: an inner function kept elsewhere could change and its callers would not notice.
 """
@@ -35,6 +38,10 @@ UCT_SCORE, PUCT_SCORE, GUMBEL_SCORE = 0, 1, 2
 MEAN_BACKUP, MAX_BACKUP = 0, 1
 RAW_VALUES, SIBLINGS, WHOLE_TREE = 0, 1, 2
 
+FACTORS = 256  # visits of a node up to which its exploration factor is looked up
+BLOCK = 32  # trees that go down in step: what they touch fits in the first-level cache
+AHEAD = 4  # outcomes; by so many the insertion is ahead in asking for memory
+
 # How a search is set up: one record instead of a dozen arguments, which cost 0.1 us each a call.
 SETTINGS = np.dtype(
     [
@@ -52,6 +59,7 @@ SETTINGS = np.dtype(
         ("twins", np.int64),
         ("widening", np.float64),  # 0: one outcome per option
         ("widening_exponent", np.float64),
+        ("factors", np.float64, FACTORS),
     ],
     align=True,
 )
@@ -67,69 +75,93 @@ _MAX_REVISITS = 10_000
 # ------------------------------------------------------------------------------ choosing an option
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
+def exploration(s, total):
+    """The part of the exploration term that all options of a node share, after ``total`` visits."""
+    if s["score"] == PUCT_SCORE:
+        c = s["c"]
+        under_root = float(total)
+        if s["c_base"] > 0.0:
+            under_root += 1.0
+            c += math.log((under_root + s["c_base"] + 1.0) / s["c_base"])
+        return c * math.sqrt(under_root)
+    return math.log(total + 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
+def fill_factors(settings):
+    """Fill the table of :func:`exploration`, whose logarithm costs as much as an option's score."""
+    s = settings[0]
+    for total in range(FACTORS):
+        s["factors"][total] = exploration(s, total)
+
+
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _best_option(nodes, edges, root, s, gumbel, b, n, revisit):
     """The option with the highest score; ties go to the higher prior, then the lower index."""
     num_options = edges.shape[-1]
     if s["score"] == GUMBEL_SCORE:
         return _gumbel_option(nodes, edges, s, gumbel, b, n)
+    normalize = s["normalize"]
     total = 0
-    for a in range(num_options):
-        total += edges[n, a]["visits"] + edges[n, a]["in_flight"]
     low, span = 0.0, 1.0
-    if s["normalize"] == SIBLINGS:
-        low = nodes[n]["value"]
-        high = low
+    if normalize == SIBLINGS:
+        own = nodes[n]["value"]
+        lowest, highest = own, own
         for a in range(num_options):
-            if edges[n, a]["visits"] > 0:
-                low = min(low, edges[n, a]["value"])
-                high = max(high, edges[n, a]["value"])
-        span = max(high - low, 1e-8)
-    elif s["normalize"] == WHOLE_TREE:  # the only value so far counts as 0, whatever its size
-        low = root["lowest"]
-        span = max(root["highest"] - low, 1e-8)
-    c = s["c"]
-    under_root = float(total)
-    if s["c_base"] > 0.0:
-        under_root += 1.0
-        c += math.log((under_root + s["c_base"] + 1.0) / s["c_base"])
-    if s["score"] == PUCT_SCORE:
-        factor = c * math.sqrt(under_root)
+            edge = edges[n, a]
+            visits, value = edge["visits"], edge["value"]
+            total += visits + edge["in_flight"]
+            value = value if visits > 0 else own
+            lowest = value if value < lowest else lowest
+            highest = value if value > highest else highest
+        low = float(lowest)
+        span = max(highest - low, 1e-8)
     else:
-        factor = math.log(total + 1.0)
+        for a in range(num_options):
+            total += edges[n, a]["visits"] + edges[n, a]["in_flight"]
+        # The only value so far counts as 0, whatever its size.
+        if normalize == WHOLE_TREE and root["lowest"] <= root["highest"]:
+            low = root["lowest"]
+            span = max(root["highest"] - low, 1e-8)
+    factors = s["factors"]
+    factor = factors[total] if total < FACTORS else exploration(s, total)
+    c = s["c"]
+    puct = s["score"] == PUCT_SCORE
+    raw = normalize == RAW_VALUES
+    unvisited = s["unvisited_value"] if raw else low
     best, best_score, best_prior = -1, -np.inf, -np.inf
     for a in range(num_options):
         edge = edges[n, a]
         if edge["closed"] and (not revisit or edge["closed"] == FORBIDDEN):
             continue
-        visits = edge["visits"]
+        visits, q, prior = edge["visits"], float(edge["value"]), edge["prior"]
         tried = visits + edge["in_flight"]
-        if s["normalize"] == RAW_VALUES:
-            q = edge["value"] if visits > 0 else s["unvisited_value"]
-        else:
-            q = (edge["value"] - low) / span if visits > 0 else 0.0
-        if s["score"] == PUCT_SCORE:
-            value = q + factor * edge["prior"] / (1.0 + tried)
+        q = ((q if visits > 0 else unvisited) - low) / span
+        if puct:
+            value = q + factor * prior / (1.0 + tried)
         elif tried == 0:
             value = np.inf
         else:
             value = q + c * math.sqrt(factor / tried)
-        if value > best_score or (value == best_score and edge["prior"] > best_prior):
-            best, best_score, best_prior = a, value, edge["prior"]
+        # No branches here: which option is best is what a processor cannot predict.
+        better = (value > best_score) | ((value == best_score) & (prior > best_prior))
+        best = a if better else best
+        best_score = value if better else best_score
+        best_prior = prior if better else best_prior
     return best
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def _log(p):
     return math.log(p) if p > 0.0 else -np.inf
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _completed_values(nodes, edges, s, n, out):
-    """Write sigma(Q) of the options of a node, unvisited ones completed by the mixed value."""
-    num_options = edges.shape[-1]
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
+def _completion(nodes, edges, s, n):
+    """The mixed value of a node, and the lowest value and the scale of sigma(Q) of its options."""
     visits, most, seen, weighted = 0, 0, 0.0, 0.0
-    for a in range(num_options):
+    for a in range(edges.shape[-1]):
         edge = edges[n, a]
         if edge["closed"] != FORBIDDEN and edge["visits"] > 0:
             visits += edge["visits"]
@@ -137,24 +169,26 @@ def _completed_values(nodes, edges, s, n, out):
             prior = max(edge["prior"], 1.1754944e-38)
             seen += prior
             weighted += prior * edge["value"]
-    mixed = nodes[n]["raw_value"]
+    mixed = float(nodes[n]["raw_value"])
     if visits > 0:
         mixed = (mixed + visits * weighted / seen) / (visits + 1.0)
     low, high = np.inf, -np.inf
-    for a in range(num_options):
+    for a in range(edges.shape[-1]):
         edge = edges[n, a]
-        out[a] = edge["value"] if edge["visits"] > 0 else mixed
-        low, high = min(low, out[a]), max(high, out[a])
-    scale = (s["c"] + most) * s["c_scale"]
-    for a in range(num_options):
-        out[a] = scale * (out[a] - low) / max(high - low, 1e-8)
+        value = edge["value"] if edge["visits"] > 0 else mixed
+        low, high = min(low, value), max(high, value)
+    return mixed, low, (s["c"] + most) * s["c_scale"] / max(high - low, 1e-8)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
+def _sigma(edge, mixed, low, scale):
+    return scale * ((edge["value"] if edge["visits"] > 0 else mixed) - low)
+
+
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def _gumbel_option(nodes, edges, s, gumbel, b, n):
     num_options = edges.shape[-1]
-    sigma = np.empty(num_options)
-    _completed_values(nodes, edges, s, n, sigma)
+    mixed, low, scale = _completion(nodes, edges, s, n)
     total = 0
     for a in range(num_options):
         total += edges[n, a]["visits"]
@@ -166,30 +200,32 @@ def _gumbel_option(nodes, edges, s, gumbel, b, n):
             edge = edges[0, a]
             if edge["closed"] == FORBIDDEN or edge["visits"] != considered:
                 continue
-            score = gumbel[b, a] + sigma[a]
+            score = gumbel[b, a] + _sigma(edge, mixed, low, scale)
             if score > best_score or best < 0:
                 best, best_score = a, score
         return best
     top = -np.inf
     for a in range(num_options):
-        if edges[n, a]["closed"] != FORBIDDEN:
-            sigma[a] += _log(edges[n, a]["prior"])
-            top = max(top, sigma[a])
+        edge = edges[n, a]
+        if edge["closed"] != FORBIDDEN:
+            top = max(top, _sigma(edge, mixed, low, scale) + _log(edge["prior"]))
     norm = 0.0
     for a in range(num_options):
-        if edges[n, a]["closed"] != FORBIDDEN:
-            norm += math.exp(sigma[a] - top)
+        edge = edges[n, a]
+        if edge["closed"] != FORBIDDEN:
+            norm += math.exp(_sigma(edge, mixed, low, scale) + _log(edge["prior"]) - top)
     for a in range(num_options):
         edge = edges[n, a]
         if edge["closed"] == FORBIDDEN:
             continue
-        score = math.exp(sigma[a] - top) / norm - edge["visits"] / (1.0 + total)
+        share = math.exp(_sigma(edge, mixed, low, scale) + _log(edge["prior"]) - top) / norm
+        score = share - edge["visits"] / (1.0 + total)
         if score > best_score:
             best, best_score = a, score
     return best
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _outcome(nodes, first):
     """The outcome of an option to go on from: visits follow how often each was drawn."""
     best, best_share = first, -1.0
@@ -202,7 +238,7 @@ def _outcome(nodes, first):
     return best
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _wants_sample(edge, s):
     """Whether progressive widening asks for one more outcome of an option that has some."""
     if s["widening"] <= 0.0 or edge["in_flight"] > 0 or edge["samples"] >= 65_535:
@@ -214,7 +250,7 @@ def _wants_sample(edge, s):
 # ------------------------------------------------------------------------------------------ select
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _release(nodes, edges, n):
     """Take back the in-flight counts of the options from the root to node ``n``."""
     while True:
@@ -225,7 +261,7 @@ def _release(nodes, edges, n):
         n = parent
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _refresh_twins(nodes, edges, n):
     """Give the options of ``n`` that lead to a state known elsewhere the value it has there now."""
     for a in range(edges.shape[-1]):
@@ -237,7 +273,7 @@ def _refresh_twins(nodes, edges, n):
                 edges[n, a]["value"] = node["reward"] + node["discount"] * node["value"]
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _descend(nodes, edges, root, s, gumbel, b, n, revisit):
     """Go down from node ``n``; return what was met, the node and the option to simulate."""
     mark = s["mark"]
@@ -287,25 +323,34 @@ def _prefetch(typing_context, record):
     return types.none(record), codegen
 
 
-@numba.njit(forceinline=True, error_model="numpy")
-def _walk_together(nodes, edges, roots, s, gumbel, at, choice):
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
+def _prefetch_node(nodes, edges, b, n):
+    """Ask for the memory of a node and of its edges; a middle edge is on one of their lines."""
+    _prefetch(nodes[b, n])
+    _prefetch(edges[b, n, 0])
+    _prefetch(edges[b, n, edges.shape[2] - 1])
+
+
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
+def _walk_together(nodes, edges, roots, s, gumbel, first, last):
     """Take all active roots down level by level; write their node, and the option to simulate.
 
     One tree after the other would wait for memory at every node; in step, the nodes of the next
     level are fetched while the other trees choose.
     """
-    for b in range(roots.shape[0]):
-        at[b] = 0
-        choice[b] = -1
-    alive = np.arange(roots.shape[0])
-    count = roots.shape[0]
+    for b in range(first, last):
+        _prefetch_node(nodes, edges, b, 0)
+        roots[b]["at"] = 0
+        roots[b]["choice"] = -1
+        roots[b]["queue"] = b
+    count = last - first
     while count > 0:
         kept = 0
         for i in range(count):
-            b = alive[i]
+            b = roots[first + i]["queue"]
             root = roots[b]
             tree, links = nodes[b], edges[b]
-            n = at[b]
+            n = root["at"]
             flags = tree[n]["flags"]
             if not root["active"] or flags & (TERMINAL | PRUNED):
                 continue
@@ -317,21 +362,19 @@ def _walk_together(nodes, edges, roots, s, gumbel, at, choice):
             if a < 0:
                 continue
             if links[n, a]["child"] < 0 or _wants_sample(links[n, a], s):
-                choice[b] = a
+                root["choice"] = a
                 continue
             child = links[n, a]["child"]
             if s["widening"] > 0.0 and tree[child]["sibling"] >= 0:
                 child = _outcome(tree, child)
-            _prefetch(tree[child])
-            _prefetch(links[child, 0])
-            _prefetch(links[child, links.shape[1] - 1])
-            at[b] = child
-            alive[kept] = b
+            _prefetch_node(nodes, edges, b, child)
+            root["at"] = child
+            roots[first + kept]["queue"] = b
             kept += 1
         count = kept
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _revisit(nodes, edges, root, s, n):
     """Back the known value of leaf ``n`` up once more: a simulation without the simulator."""
     nodes[n]["visits"] += 1
@@ -340,7 +383,7 @@ def _revisit(nodes, edges, root, s, n):
     root["revisits"] += 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def select(nodes, edges, roots, settings, gumbel, wave):
     """Descend to the leaves of every active root; return how many outcomes to simulate.
 
@@ -351,10 +394,11 @@ def select(nodes, edges, roots, settings, gumbel, wave):
     count = 0
     num_options = edges.shape[-1]
     together = roots.shape[0] >= 64 and not s["mark"]
-    at = np.empty(roots.shape[0] if together else 0, np.int64)
-    choice = np.empty_like(at)
     if together:
-        _walk_together(nodes, edges, roots, s, gumbel, at, choice)
+        for first in range(0, roots.shape[0], BLOCK):
+            _walk_together(
+                nodes, edges, roots, s, gumbel, first, min(first + BLOCK, roots.shape[0])
+            )
     for b in range(roots.shape[0]):
         root = roots[b]
         if not root["active"]:
@@ -362,7 +406,7 @@ def select(nodes, edges, roots, settings, gumbel, wave):
         tree, links = nodes[b], edges[b]
         start, chosen = 0, -1
         if together:
-            start, chosen = at[b], choice[b]
+            start, chosen = root["at"], root["choice"]
         scheduled = 0
         revisits = 0
         for _ in range(s["leaves"]):
@@ -407,14 +451,14 @@ def select(nodes, edges, roots, settings, gumbel, wave):
     return count
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _schedule(wave, i, b, n, a):
     wave[i]["root"] = b
     wave[i]["node"] = n
     wave[i]["option"] = a
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def extend(nodes, edges, roots, settings, ended, draws, wave):
     """Schedule an option of each new node ``ended``, by its prior; return how many there are.
 
@@ -456,7 +500,7 @@ def extend(nodes, edges, roots, settings, ended, draws, wave):
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def cancel(nodes, edges, settings, wave):
     """Forget a wave that was selected and will never be inserted."""
     s = settings[0]
@@ -474,7 +518,7 @@ def cancel(nodes, edges, settings, wave):
 # ------------------------------------------------------------------------------------------ insert
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _write_node(nodes, edges, n, parent, option, value, priors, masks, i):
     num_options = edges.shape[-1]
     node = nodes[n]
@@ -505,7 +549,7 @@ def _write_node(nodes, edges, n, parent, option, value, priors, masks, i):
     node["open_options"] = opened
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def add_roots(nodes, edges, roots, rows, values, closed, priors, masks):
     """Write node 0 of the roots ``rows`` and forget all that was known of them."""
     for i in range(rows.shape[0]):
@@ -533,7 +577,7 @@ def add_roots(nodes, edges, roots, rows, values, closed, priors, masks):
         root["highest"] = -np.inf
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def begin(roots, limit):
     """Count what is spent from 0, up to a number of simulations."""
     for b in range(roots.shape[0]):
@@ -549,7 +593,7 @@ def begin(roots, limit):
         root["base_steps_to_plan"] = 0 if found else -1
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _option_value(nodes, first):
     """Q of an option from its outcomes, each weighted by how often it was drawn."""
     node = nodes[first]
@@ -565,7 +609,7 @@ def _option_value(nodes, first):
     return total / weight
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _back_up(nodes, edges, root, s, n):
     """Carry the value of node ``n`` up to its root."""
     num_options = edges.shape[-1]
@@ -593,7 +637,7 @@ def _back_up(nodes, edges, root, s, n):
         n = parent
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _close(nodes, edges, n):
     """Close node ``n`` and every ancestor whose last open option that was."""
     while True:
@@ -611,7 +655,7 @@ def _close(nodes, edges, n):
         n = parent
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _append(nodes, edges, root, n, a, reward, discount, duration, done, value, priors, masks, i):
     """Write a new node behind option ``a`` of node ``n``; return it."""
     new = root["num_nodes"]
@@ -640,7 +684,7 @@ def _append(nodes, edges, root, n, a, reward, discount, duration, done, value, p
     return new
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _count_plan(nodes, root, new):
     if nodes[new]["path_return"] > root["best_return"]:
         root["best_return"] = nodes[new]["path_return"]
@@ -650,7 +694,7 @@ def _count_plan(nodes, root, new):
         root["base_steps_to_plan"] = root["base_steps"]
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _arrived(nodes, edges, roots, s, wave, count):
     """Take back what is in flight before any value is written, and count the expansions."""
     for i in range(count):
@@ -678,7 +722,7 @@ def number_nodes(roots, rows):
     return numbers
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def insert(
     nodes,
     edges,
@@ -741,7 +785,7 @@ def insert(
             _close(tree, links, new)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def advance(
     nodes, edges, roots, settings, gumbel, wave, masks, stored, states, count,
     rewards, discounts, values, priors, new_states,
@@ -773,6 +817,10 @@ def advance(
     if count:
         _arrived(nodes, edges, roots, s, wave, count)
     for i in range(count):
+        if i + AHEAD < count:
+            b = wave[i + AHEAD]["root"]
+            _prefetch_node(nodes, edges, b, wave[i + AHEAD]["node"])
+            _prefetch_node(nodes, edges, b, roots[b]["num_nodes"])
         b, n, a = wave[i]["root"], wave[i]["node"], wave[i]["option"]
         tree, links, root = nodes[b], edges[b], roots[b]
         root["simulations"] += 1
@@ -847,7 +895,7 @@ def advance_at(at, count, rewards, discounts, values, priors, embedding):
 # ------------------------------------------------------------------------- reopening and re-rooting
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def reopen(trees, links, b, n):
     """Undo the pruning of node ``n``: it and its ancestors may be searched again."""
     nodes, edges = trees[b], links[b]
@@ -924,7 +972,7 @@ def reroot(trees, links, roots, b, root, kept):
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def solve(trees, links, roots, b, tolerance, max_sweeps):
     """Sweep over a finished tree with twins until every value is that of its best option."""
     nodes, edges = trees[b], links[b]
@@ -949,7 +997,7 @@ def solve(trees, links, roots, b, tolerance, max_sweeps):
     return False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def still_active(
     nodes, roots, active, expansions, base_steps, num_nodes, until_plan, improve, kept, stuck
 ):
@@ -980,13 +1028,13 @@ def still_active(
 # ------------------------------------------------------- for descents that are controlled by Python
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def release_all(nodes, edges, rows, leaves):
     for i in range(rows.shape[0]):
         _release(nodes[rows[i]], edges[rows[i]], leaves[i])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def revisit_all(nodes, edges, roots, settings, rows, leaves):
     for i in range(rows.shape[0]):
         _release(nodes[rows[i]], edges[rows[i]], leaves[i])
@@ -994,7 +1042,7 @@ def revisit_all(nodes, edges, roots, settings, rows, leaves):
         _revisit(nodes[b], edges[b], roots[b], settings[0], leaves[i])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def refresh_all(nodes, edges, rows, leaves):
     for i in range(rows.shape[0]):
         _refresh_twins(nodes[rows[i]], edges[rows[i]], leaves[i])
@@ -1018,6 +1066,9 @@ def outcomes(nodes, rows, first):
     return chosen
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", _nrt=False)
 def completed_values(nodes, edges, settings, b, n, out):
-    _completed_values(nodes[b], edges[b], settings[0], n, out)
+    """Write sigma(Q) of the options of a node, unvisited ones completed by the mixed value."""
+    mixed, low, scale = _completion(nodes[b], edges[b], settings[0], n)
+    for a in range(edges.shape[-1]):
+        out[a] = _sigma(edges[b, n, a], mixed, low, scale)

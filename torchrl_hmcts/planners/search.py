@@ -205,6 +205,8 @@ class Search:
             settings["c_scale"] = tree_policy.c_scale
         else:
             self._scores, settings["mark"] = tree_policy, 1
+        if isinstance(tree_policy, UCT | PUCT):
+            kernels.fill_factors(self.settings)
 
     # ------------------------------------------------------------------ what is known of the roots
 

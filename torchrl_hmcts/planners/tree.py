@@ -73,6 +73,9 @@ ROOT = np.dtype(
         ("base_steps_to_plan", np.int64),
         ("lowest", np.float64),
         ("highest", np.float64),
+        ("at", np.int64),  # the descent: the node reached, the option chosen there, ...
+        ("choice", np.int64),
+        ("queue", np.int64),  # ... and, in row i, the i-th root that is still going down
     ],
     align=True,
 )
