@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.base import NO_DEFAULT
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -152,12 +153,12 @@ class GridworldMazeEnv(EnvBase):
             self._generator.manual_seed(seed)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        maze = tensordict.get("maze_index")
-        target = tensordict.get("target_tile")
-        index = torch.add(tensordict.get("player_tile"), maze, alpha=self._num_tiles)
-        index = torch.add(tensordict.get("action"), index, alpha=len(_MOVES))
+        entry = tensordict._get_str  # TensorDict.get takes five times as long
+        maze, target = entry("maze_index", NO_DEFAULT), entry("target_tile", NO_DEFAULT)
+        index = torch.add(entry("player_tile", NO_DEFAULT), maze, alpha=self._num_tiles)
+        index = torch.add(entry("action", NO_DEFAULT), index, alpha=len(_MOVES))
         player = self._next_tile.take(index)
-        step_count = tensordict.get("step_count") + 1
+        step_count = entry("step_count", NO_DEFAULT) + 1
         terminated = torch.eq(player, target).unsqueeze_(-1)
         truncated = step_count.ge(self.max_steps)
         return self._write_state(

@@ -28,6 +28,7 @@ from torchrl_hmcts.trainers.checkpoints import (
     check_settings,
     find_damage,
     plain_checkpoint,
+    write_json,
     write_text,
 )
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
@@ -443,3 +444,11 @@ def test_a_folder_that_vanishes_while_training_is_made_again(tmp_path: Path) -> 
     shutil.rmtree(tmp_path / "run")
     rotation.save(plain_checkpoint(net=Big(2)), step=2)
     assert load(newest_checkpoint(tmp_path / "run")) == 2.0
+
+
+def test_numbers_that_are_not_finite_are_null_in_json(tmp_path: Path) -> None:
+    content = {"a": [1, float("nan")], "b": {"c": float("inf"), "d": 0.5}, "e": "nan", "f": None}
+    write_json(tmp_path / "a.json", content)
+    text = (tmp_path / "a.json").read_text()
+    assert json.loads(text) == {"a": [1, None], "b": {"c": None, "d": 0.5}, "e": "nan", "f": None}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]

@@ -327,6 +327,28 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
         )
 
 
+def write_json(path: str | Path, content: Any) -> None:
+    """Write numbers and texts as JSON in one move; what is no finite number becomes null.
+
+    Args:
+        path (path): file.
+        content: dicts, lists, texts and numbers.
+
+    Examples:
+        >>> from torchrl_hmcts.trainers.checkpoints import write_json
+        >>> write_json("metrics.json", {"solved": 0, "frames": float("nan")})
+    """
+    write_text(path, json.dumps(_finite(content), indent=2) + "\n")
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a file in one move: whoever reads it finds the old text or the new one.
 

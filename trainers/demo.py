@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.checkpoints import write_text
+from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
@@ -100,7 +99,7 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     plot_search(planner.last_search, real.base_env, out / "search.png")
     write_episode_gif(real.base_env, starts[shown], episodes[shown], out / "episode.gif")
     metrics["seconds"] = round(time.perf_counter() - begin, 2)
-    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    write_json(out / "metrics.json", metrics)
     write_page(
         out / "index.html",
         title="Solving random mazes by planning over learned skills",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import json
 import os
 import time
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from torchrl_hmcts.trainers.atari.sources import (
     load_options,
 )
 from torchrl_hmcts.trainers.atari.tuning import Tuned, tune_search
-from torchrl_hmcts.trainers.checkpoints import write_text
+from torchrl_hmcts.trainers.checkpoints import write_json, write_text
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
 from torchrl_hmcts.trainers.experiments.registry import ExperimentError
 from torchrl_hmcts.trainers.figures.atari_figures import plot_scores, write_atari_gif
@@ -93,7 +92,7 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     }
     _write_curves(run, out / "curves.csv")
     pictures = draw(run, out)
-    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    write_json(out / "metrics.json", metrics)
     title = f"{config.game} by planning over options, {config.protocol}"
     write_page(out / "index.html", title=title, metrics=metrics, pictures=pictures)
     print(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import draw_first_person
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
-from torchrl_hmcts.trainers.checkpoints import write_text
+from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.figures.lab_figures import (
@@ -124,7 +123,7 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     print("Drawing ...", flush=True)
     draw(config, trained, out, unsolved=test["unsolved"])
     metrics["seconds"] = round(time.perf_counter() - begin, 1)
-    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    write_json(out / "metrics.json", metrics)
     title = "DeepMind Lab's random maze, by planning over learned skills"
     write_page(out / "index.html", title=title, metrics=metrics, pictures=_PICTURES)
     print(

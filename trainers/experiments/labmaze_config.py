@@ -9,6 +9,7 @@ from torchrl_hmcts.trainers.config import check_logger
 
 _ALGORITHMS = ("diayn", "hmcts")
 _COLLECTORS = ("local", "ray")
+_KEEP = ("best", "last")
 BATCH_STEPS = 64  # base steps of a batch of DIAYN's training
 
 
@@ -73,6 +74,9 @@ class LabMazeConfig:
     """Held-out mazes, other than the test mazes, in which the worker is tried while it learns."""
     curve_points: int = 10
     """How often it is tried."""
+    keep: str = "best"
+    """Which worker of DIAYN's training to keep: "best", that which solved the most of those mazes
+    (of several the latest), or "last". Algorithm 3 keeps its last."""
     robust_mazes: int = 40
     """Test mazes to solve where clock and friction differ from the model's, for each sign."""
     robust_error: float = 0.05
@@ -109,6 +113,8 @@ class LabMazeConfig:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
         if self.algorithm not in _ALGORITHMS:
             raise ValueError(f"algorithm is one of {_ALGORITHMS}; got {self.algorithm!r}.")
+        if self.keep not in _KEEP:
+            raise ValueError(f"keep is one of {_KEEP}; got {self.keep!r}.")
         check_logger(self.logger)
         if self.collector not in _COLLECTORS:
             raise ValueError(f"collector is one of {_COLLECTORS}; got {self.collector!r}.")

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.trainers.a3c import A3CTrainer
-from torchrl_hmcts.trainers.checkpoints import write_text
+from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.experiments.waterworld_config import (
@@ -165,7 +165,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
             metrics["test"][f"{key}_mean"] = round(float(sampled.last[key].double().mean()), 3)
     metrics["config"] = dataclasses.asdict(config)
     metrics["versions"] = versions()
-    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    write_json(out / "metrics.json", metrics)
     pictures = {"learning.png": "Test mazes solved and base steps of an episode while it learns."}
     plot_learning_curves(
         {name: [learning_curve(history)]},

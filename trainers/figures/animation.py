@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,10 +10,10 @@ import imageio.v3 as iio
 import numpy as np
 from tensordict import TensorDictBase
 
-from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.figures.plots import option_rgb
 
 if TYPE_CHECKING:
+    from torchrl_hmcts.envs import WaterworldMazeEnv
     from torchrl_hmcts.trainers.demo import Episode
 
 
@@ -47,8 +48,32 @@ def write_episode_gif(
         paths = [*plan, (trail, colors)] if step else plan
         frames.append(env.render(state, paths=paths))
     rate = 1.0 / (env.TIME_STEP * steps_per_frame)
-    durations = [1000.0 / (2.0 * rate)] * (len(frames) - 1) + [1500.0]  # twice real time
-    iio.imwrite(path, np.stack(frames), extension=".gif", duration=durations, loop=0)
+    write_gif(frames, path, milliseconds=1000.0 / (2.0 * rate))  # twice real time
+
+
+def write_gif(
+    frames: Sequence[np.ndarray], path: Path, *, milliseconds: float, last: float | None = 1500.0
+) -> None:
+    """Write pictures as an endless GIF.
+
+    Args:
+        frames: uint8 ``[height, width, 3]`` each. Where several in a row are the same, one is
+            written that is shown as long as all of them.
+        path: file to write.
+        milliseconds: for which a frame is shown.
+        last: milliseconds for which the last one is shown. Default: a second and a half; ``None``:
+            as long as the others.
+    """
+    kept, durations = [frames[0]], [0.0]
+    for frame in frames:
+        if not np.array_equal(frame, kept[-1]):
+            kept.append(frame)
+            durations.append(0.0)
+        durations[-1] += milliseconds
+    if last is not None:
+        durations[-1] += last - milliseconds
+    shown: float | list[float] = durations if len(kept) > 1 else durations[0]
+    iio.imwrite(path, np.stack(kept), extension=".gif", duration=shown, loop=0)
 
 
 def _pale(color: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv
 from torchrl_hmcts.trainers.atari.agent import AtariAgent
+from torchrl_hmcts.trainers.figures.animation import write_gif
 
 _EVERY = 3  # base steps between two pictures
 
@@ -64,5 +64,5 @@ def write_atari_gif(
             if i % _EVERY == 0:
                 pictures.append(env.render())
     seconds = _EVERY * recorder.frame_skip / 60.0
-    frames = np.stack([p.repeat(2, axis=1) for p in pictures])  # a console's pixels are wide
-    iio.imwrite(path, frames, extension=".gif", duration=1000.0 * seconds, loop=0)
+    frames = [p.repeat(2, axis=1) for p in pictures]  # a console's pixels are wide
+    write_gif(frames, path, milliseconds=1000.0 * seconds, last=None)

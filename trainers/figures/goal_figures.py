@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,6 +17,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.envs.rendering import PLAYER_COLOR, TARGET_COLOR
 from torchrl_hmcts.planners.drawing import option_color
+from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.plots import legend_below
 from torchrl_hmcts.trainers.waterworld.goal_episodes import GoalTrack
 from torchrl_hmcts.trainers.waterworld.goal_planning import make_tile_planner
@@ -120,10 +120,8 @@ def write_goal_gif(
         raise ValueError(f"write_goal_gif needs steps_per_frame >= 1; got {steps_per_frame}.")
     last = len(track.positions) - 1
     steps = [*range(0, last, steps_per_frame), last]
-    frames = np.stack([draw_goals(env, start, track, step) for step in steps])
-    milliseconds = 1000.0 * env.TIME_STEP * steps_per_frame / 2.0
-    durations = [milliseconds] * (len(frames) - 1) + [1500.0]
-    iio.imwrite(path, frames, extension=".gif", duration=durations, loop=0)
+    frames = [draw_goals(env, start, track, step) for step in steps]
+    write_gif(frames, path, milliseconds=1000.0 * env.TIME_STEP * steps_per_frame / 2.0)
 
 
 def plot_macro_env(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -21,6 +20,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person
 from torchrl_hmcts.planners import Plan, Search
 from torchrl_hmcts.planners.drawing import option_color
+from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.plots import legend_below, option_rgb
 from torchrl_hmcts.trainers.figures.solving_curves import draw_band, save_curves, show_shares
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
@@ -251,9 +251,7 @@ def write_episode_gif(
         height = above.shape[0]
         seen = draw_first_person(env, states[step], width=height * 4 // 3, height=height)
         pictures.append(np.concatenate((above, seen), 1))
-    milliseconds = 1000.0 * env.num_steps * steps_per_picture / 60.0
-    durations = [milliseconds] * (len(pictures) - 1) + [1500.0]
-    iio.imwrite(path, np.stack(pictures), extension=".gif", duration=durations, loop=0)
+    write_gif(pictures, path, milliseconds=1000.0 * env.num_steps * steps_per_picture / 60.0)
 
 
 def _draw_maze(axes: Axes, env: LabMazeEnv, maze: int) -> None:

@@ -106,10 +106,12 @@ def train_worker(
     if config.resume and save_dir is not None and any(Path(save_dir).glob("*")):
         trainer.load(save_dir)
     trainer.train()
+    if isinstance(tests, CurveTests) and config.keep == "best":
+        tests.restore_best()
     return TrainedWorker(
         loss,
         Curves(trainer.history),
-        tests,
+        tests.records if isinstance(tests, CurveTests) else tests,
         trainer.collected_frames,
         len(trainer.records) if isinstance(trainer, HMCTSTrainer) else 0,
         round(time.process_time() - begin, 1),
@@ -174,7 +176,7 @@ def _make_diayn(
     save_dir: str | Path | None,
     progress: Callable[..., Progress] | None,
     logger: Logger | None,
-) -> tuple[ResumableTrainer, RoundRecords]:
+) -> tuple[ResumableTrainer, CurveTests]:
     env = make_training_env(
         num_skills=config.num_skills,
         skill_steps=config.skill_steps,
@@ -195,7 +197,7 @@ def _make_diayn(
         seed=config.seed,
     )
     tests = CurveTests(trainer, config, interval)
-    return trainer, tests.records
+    return trainer, tests
 
 
 def _curve_budget(config: LabMazeConfig) -> SearchBudget:
@@ -208,7 +210,8 @@ def _curve_budget(config: LabMazeConfig) -> SearchBudget:
 class CurveTests:
     """Tries the worker in held-out mazes while a ``DIAYNTrainer`` trains it, for Figure 4.10.
 
-    Random numbers of the training are not touched.
+    Random numbers of the training are not touched. The networks that solved the most mazes are
+    kept, of several the latest: skills drift while they learn, and two may meet near the end.
 
     Args:
         trainer: whose loss has the actor.
@@ -220,6 +223,7 @@ class CurveTests:
         self.trainer, self.config, self.interval = trainer, config, interval
         self.records = RoundRecords()
         self._at = -1  # base steps at the latest test
+        self._best: dict[str, Any] = {}  # "solved", how many, and the "loss" that did
         worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
         mazes = held_out_seeds(config.curve_mazes, first=CURVE_SEED)
         self.model, self.real = (make_maze_env(config, worker, mazes, 9) for _ in range(2))
@@ -241,6 +245,13 @@ class CurveTests:
             )
             results = plan_and_carry_out(planner, self.real, self.starts)
         self.records.add(results, np.arange(len(results.solved)), steps)
+        solved = int(results.solved.sum())
+        if solved >= self._best.get("solved", 0):
+            state = self.trainer.loss_module.state_dict()
+            self._best = {
+                "solved": solved,
+                "loss": {name: value.clone() for name, value in state.items()},
+            }
         logger = self.trainer.logger
         if logger is not None:
             frames = np.where(
@@ -251,9 +262,14 @@ class CurveTests:
             logger.log_scalar("test_solved", float(results.solved.mean()), step=steps)
             logger.log_scalar("test_frames", float(frames.mean()), step=steps)
 
+    def restore_best(self) -> None:
+        """Give the loss back the networks that solved the most mazes."""
+        self.trainer.loss_module.load_state_dict(self._best["loss"])
+
     def state_dict(self) -> dict[str, Any]:
-        return {"at": self._at, "records": self.records.state_dict()}
+        return {"at": self._at, "records": self.records.state_dict(), "best": self._best}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         self._at = int(state_dict["at"])
         self.records.load_state_dict(state_dict["records"])
+        self._best = dict(state_dict["best"])
