@@ -321,6 +321,7 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
         [
             "AtariAgent",
             "GoalFinder",
+            "ActionSource",
             "RepeatSource",
             "GoalSource",
             "DIAYNSource",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         GoalSearch,
     )
     from torchrl_hmcts.trainers.atari.sources import (
+        ActionSource,
         DIAYNSource,
         DistilledSource,
         GoalSource,
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "A3CTrainer",
+    "ActionSource",
     "AtariAgent",
     "AtariProgress",
     "AtariSearch",
@@ -127,6 +129,7 @@ __all__ = [
 # Imported when asked for: the command line answers --help without loading torch.
 _MODULES = {
     "A3CTrainer": "a3c",
+    "ActionSource": "atari.sources",
     "AtariAgent": "atari.agent",
     "AtariProgress": "atari.agent",
     "AtariSearch": "atari.agent",

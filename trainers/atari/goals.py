@@ -225,7 +225,7 @@ class GoalFinder:
         """Return the options, the most useful first."""
         candidates, states = self.probe()
         ranked = self._screen(candidates, states[:1])
-        return self._choose(ranked)
+        return self.choose(ranked)
 
     def _spent(self, pool: AtariOptionPool) -> None:
         self.num_frames += pool.num_frames
@@ -268,7 +268,12 @@ class GoalFinder:
         self.log(f"screened: {self.report['screened']}")
         return [candidates[i] for i in order]
 
-    def _choose(self, ranked: list[Candidate]) -> list[Candidate]:
+    def choose(self, ranked: Sequence[Candidate]) -> list[Candidate]:
+        """Return the set of candidates with which trials score best, found one by one.
+
+        Args:
+            ranked: candidates, the better ones first.
+        """
         settings = self.settings
         chosen: list[Candidate] = []
         reached: list[float] = []  # by the first 1, 2, ... options

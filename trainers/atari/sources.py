@@ -25,7 +25,13 @@ from torchrl_hmcts.envs import (
 )
 from torchrl_hmcts.modules import SkillMLP
 from torchrl_hmcts.trainers.atari.agent import AtariSearch
-from torchrl_hmcts.trainers.atari.goals import Candidate, GoalFinder, GoalSearch, random_states
+from torchrl_hmcts.trainers.atari.goals import (
+    Candidate,
+    GoalFinder,
+    GoalSearch,
+    random_states,
+    repeat_candidates,
+)
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
@@ -83,6 +89,39 @@ class RepeatSource:
         pool.close()
         worker = RepeatActions(len(names))
         return Options(worker, names, frames, saved={"parts": [_plain(worker)]})
+
+
+@dataclass(frozen=True)
+class ActionSource:
+    """Actions to repeat, chosen by trials: with fewer options a search looks further ahead.
+
+    Attributes:
+        settings: how much to try; what it says of goals and screening is not used.
+        search: the planner of the trials.
+
+    Example:
+        >>> from torchrl_hmcts.envs import AtariOptionPool
+        >>> from torchrl_hmcts.trainers import ActionSource, GoalSearch
+        >>> def make_pool(worker, max_steps):
+        ...     return AtariOptionPool("Pong", worker, max_steps=max_steps, num_processes=0)
+        >>> small = GoalSearch(min_options=1, options=1, trial_steps=4, trial_ratio=1.0)
+        >>> len(ActionSource(small).find("Pong", make_pool, seed=0, log=lambda text: None).names)
+        1
+    """
+
+    settings: GoalSearch = field(default_factory=GoalSearch)
+    search: AtariSearch = field(default_factory=AtariSearch)
+
+    def find(
+        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
+    ) -> Options:
+        """Return the options of a game."""
+        finder = GoalFinder(make_pool, self.settings, search=self.search, seed=seed, log=log)
+        pool = make_pool(RepeatActions(1), 1)
+        candidates = repeat_candidates(pool)
+        finder.num_frames += pool.num_frames
+        pool.close()
+        return _joined(finder.choose(candidates), finder.num_frames, finder.report)
 
 
 @dataclass(frozen=True)

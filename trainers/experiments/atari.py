@@ -19,6 +19,7 @@ from torchrl_hmcts.envs.atari_emulator import find_game
 from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariProgress, AtariSearch
 from torchrl_hmcts.trainers.atari.goals import GoalSearch
 from torchrl_hmcts.trainers.atari.sources import (
+    ActionSource,
     DIAYNSource,
     DistilledSource,
     GoalSource,
@@ -254,8 +255,11 @@ class AtariRun:
         config = self.config
         if config.source == "repeat":
             return RepeatSource()
+        settings = GoalSearch(trial_steps=config.trial_steps, trial_ratio=config.trial_ratio)
+        if config.source == "actions":
+            return ActionSource(settings, self.search())
         if config.source.startswith("goals"):
-            goals = GoalSource(GoalSearch(trial_steps=config.trial_steps), self.search())
+            goals = GoalSource(settings, self.search())
             return DistilledSource(goals) if config.source == "goals_network" else goals
         kind = config.source.partition("_")[2] or "state"
         return DIAYNSource(config.num_skills, config.skill_base_steps, discriminator=kind)

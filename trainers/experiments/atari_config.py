@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from torchrl_hmcts.arguments import name_arguments
 
 PROTOCOLS = ("deterministic", "sticky")
-SOURCES = ("goals", "goals_network", "repeat", "diayn", "diayn_displacement", "diayn_controllable")
+SOURCES = (
+    "goals", "goals_network", "actions", "repeat", "diayn", "diayn_displacement",
+    "diayn_controllable",
+)  # fmt: skip
 
 
 @name_arguments
@@ -34,8 +37,9 @@ class AtariConfig:
     stick with probability 0.25, and the planner is given no random generator)."""
     source: str = "goals"
     """Where options come from: "goals" (found by a probe and trials), "goals_network" (the
-    same, carried out by one network that learned them), "repeat" (one for each
-    action), "diayn" (the source's worker), "diayn_displacement", "diayn_controllable"."""
+    same, carried out by one network that learned them), "repeat" (one for each action), "actions"
+    (some of these, chosen by trials), "diayn" (the source's worker), "diayn_displacement",
+    "diayn_controllable"."""
     frames: int = 40_000_000
     """Emulated frames in all, the source's 10 million base steps; the last episode is finished."""
     max_episode_frames: int = 108_000
@@ -71,6 +75,8 @@ class AtariConfig:
     """Processes that emulate; 0: in the command's own; -1: one for each core."""
     trial_steps: int = 300
     """Real base steps of a trial in which options are compared."""
+    trial_ratio: float = 5.0
+    """Simulated base steps per real one in such a trial."""
     replant_every: int = 100
     """Decisions between checkpoints, at which the tree is planted anew so that a resumed run goes
     on exactly."""
@@ -97,7 +103,7 @@ class AtariConfig:
         for name, low in (("option_steps", 0), ("rollout_options", 0), ("num_processes", -1)):
             if getattr(self, name) < low:
                 raise ValueError(f"{name} must be at least {low}; got {getattr(self, name)}.")
-        for name in ("ratio", "c"):
+        for name in ("ratio", "c", "trial_ratio"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")
         if not 0.0 < self.gamma <= 1.0:
