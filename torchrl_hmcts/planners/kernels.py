@@ -5,8 +5,8 @@ simulation. This module is imported when the first search starts, since numba ta
 load. Fields are read as ``record["field"]``, not ``record.field``, so that the kernels also run as
 plain Python under ``NUMBA_DISABLE_JIT=1``, for a debugger.
 
-Those that allocate nothing are compiled without reference counts (``_nrt=False``, as numba compiles its
-own string functions): counting the views of arrays took a third of the time of a descent.
+Those that allocate nothing are compiled without reference counts (``_nrt=False``, as numba
+compiles its own string functions): counting the views of arrays took a third of a descent's time.
 
 They share one file, long as it is, because numba's cache looks at the file of the compiled function
 only: an inner function kept elsewhere could change and its callers would not notice.
