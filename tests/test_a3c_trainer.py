@@ -399,8 +399,13 @@ class TestProcesses:
             eval_interval=SEGMENT,
             save_dir=tmp_path,
         )
-        with pytest.raises(KeyboardInterrupt):
-            trainer.train()
+        # A shell without job control has its background processes ignore Ctrl-C.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                trainer.train()
+        finally:
+            signal.signal(signal.SIGINT, before)
         assert len(pids) == 2
         assert not any(alive(pid) for pid in pids)
         message = f"saved at {trainer.frames} frames. Go on with trainer.load({str(tmp_path)!r})"

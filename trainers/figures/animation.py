@@ -52,7 +52,11 @@ def write_episode_gif(
 
 
 def write_gif(
-    frames: Sequence[np.ndarray], path: Path, *, milliseconds: float, last: float | None = 1500.0
+    frames: Sequence[np.ndarray],
+    path: str | Path,
+    *,
+    milliseconds: float,
+    last: float | None = 1500.0,
 ) -> None:
     """Write pictures as an endless GIF.
 
