@@ -36,7 +36,7 @@ from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 
-OPTION_STEPS, RADIUS, GAMMA = 25, 0.7, 0.99  # those of the demo
+OPTION_STEPS, RADIUS, GAMMA = 25, DemoConfig().novelty_radius, 0.99  # those of the demo
 
 
 def make_planner(env: Any, leaves: int, radius: float = RADIUS, **budget: Any) -> MCTSPlanner:
