@@ -211,7 +211,7 @@ class CurveTests:
     """Tries the worker in held-out mazes while a ``DIAYNTrainer`` trains it, for Figure 4.10.
 
     Random numbers of the training are not touched. The networks that solved the most mazes are
-    kept, of several the latest: skills drift while they learn, and two may meet near the end.
+    kept, of several the latest: skills go on changing, and the last ones need not be the best.
 
     Args:
         trainer: whose loss has the actor.
@@ -263,8 +263,12 @@ class CurveTests:
             logger.log_scalar("test_frames", float(frames.mean()), step=steps)
 
     def restore_best(self) -> None:
-        """Give the loss back the networks that solved the most mazes."""
-        self.trainer.loss_module.load_state_dict(self._best["loss"])
+        """Give the loss back the networks that solved the most mazes.
+
+        Those of the end stay where nothing is known of them, in a run from before they were kept.
+        """
+        if self._best:
+            self.trainer.loss_module.load_state_dict(self._best["loss"])
 
     def state_dict(self) -> dict[str, Any]:
         return {"at": self._at, "records": self.records.state_dict(), "best": self._best}
@@ -272,4 +276,4 @@ class CurveTests:
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         self._at = int(state_dict["at"])
         self.records.load_state_dict(state_dict["records"])
-        self._best = dict(state_dict["best"])
+        self._best = dict(state_dict.get("best", {}))
