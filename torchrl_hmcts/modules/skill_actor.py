@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -18,9 +19,27 @@ from torchrl.data import (
     OneHot,
     TensorSpec,
 )
-from torchrl.modules import OneHotCategorical, ProbabilisticActor
+from torchrl.modules import OneHotCategorical, ProbabilisticActor, ReparamGradientStrategy
 
 from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
+
+
+class _OneHotCategorical(OneHotCategorical):
+    """TorchRL's, which takes the logits ``[B, 1]`` of a single action for those of B actions."""
+
+    def __init__(
+        self,
+        logits: Tensor | None = None,
+        probs: Tensor | None = None,
+        grad_method: ReparamGradientStrategy = ReparamGradientStrategy.PassThrough,
+        **kwargs: Any,
+    ) -> None:
+        given = probs if logits is None else logits
+        if given is None or given.shape[-1] != 1:
+            super().__init__(logits, probs, grad_method, **kwargs)
+            return
+        torch.distributions.Categorical.__init__(self, probs, logits, **kwargs)
+        self.grad_method, self.num_samples = grad_method, 1
 
 
 class SkillActor(ProbabilisticActor):
@@ -86,7 +105,7 @@ class SkillActor(ProbabilisticActor):
             in_keys={"logits": logits_key},
             out_keys=[action_key],
             spec=Composite({action_key: spec}),
-            distribution_class=OneHotCategorical if one_hot else torch.distributions.Categorical,
+            distribution_class=_OneHotCategorical if one_hot else torch.distributions.Categorical,
             return_log_prob=False,
         )
         self.num_skills = num_skills
