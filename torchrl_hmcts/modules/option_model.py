@@ -198,10 +198,11 @@ class OptionModel(TensorDictModuleBase):
         if self.num_models == 1:
             outputs: Tensor = self._run(self.network_params[0], *inputs).unsqueeze(0)
         else:
+            params = self.network_params
+            if torch.compiler.is_compiling():  # of locked ones in a graph tensordict warns
+                params = TensorDict(dict(params.items(True, True)), batch_size=params.batch_size)
             in_dims = (0, *[None] * len(inputs))
-            outputs = torch.vmap(self._run, in_dims, randomness="different")(
-                self.network_params, *inputs
-            )
+            outputs = torch.vmap(self._run, in_dims, randomness="different")(params, *inputs)
         shape = (self.num_models, *tensordict.batch_size, self.num_deltas + 3)
         if outputs.shape != torch.Size(shape):
             raise ValueError(
