@@ -77,8 +77,20 @@ class OneHotChain(ChainEnv):
         return super()._step(tensordict.copy().set("action", index))
 
 
+class OneHotPoint(PointMassEnv):
+    """A point mass whose action is one-hot."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_spec = OneHot(4)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        index = tensordict.get("action").long().argmax(-1)
+        return super()._step(tensordict.copy().set("action", index))
+
+
 class NestedPoint(EnvBase):
-    """A point mass whose entries and action are nested."""
+    """A point mass whose entries, action and reward are nested."""
 
     batch_locked = False
 
@@ -90,10 +102,12 @@ class NestedPoint(EnvBase):
         self.observation_spec = Composite(agent=agent)
         self.state_spec = self.observation_spec.clone()
         self.action_spec = Composite(agent=Composite(push=Categorical(4)))
-        self.reward_spec = Unbounded((1,))
+        self.reward_spec = Composite(agent=Composite(r=Unbounded((1,))))
 
     def _nest(self, flat: TensorDictBase) -> TensorDictBase:
         agent = {"x": flat.pop("position"), "v": flat.pop("velocity")}
+        if "reward" in flat.keys():
+            agent["r"] = flat.pop("reward")
         return flat.set("agent", TensorDict(agent, batch_size=flat.batch_size))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -111,6 +125,34 @@ class NestedPoint(EnvBase):
 def chain_with_options(*, one_hot: bool = False, trajectory_keys: Any = None) -> EnvBase:
     options = OptionTransform(one_of_two(), 2, 3, one_hot=one_hot, trajectory_keys=trajectory_keys)
     return TransformedEnv(ChainEnv(length=9), options)
+
+
+def nested_options(*, trajectory_keys: Any = None) -> EnvBase:
+    options = OptionTransform(
+        TensorDictModule(same, [("agent", "z")], [("agent", "push")]),
+        4,
+        3,
+        option_key=("agent", "option"),
+        skill_key=("agent", "z"),
+        duration_key=("agent", "k"),
+        trajectory_keys=trajectory_keys,
+    )
+    return TransformedEnv(NestedPoint(), options)
+
+
+def nested_skills() -> EnvBase:
+    skill = SkillTransform(3, skill_key=("agent", "z"), skill_step_key=("agent", "k"))
+    return TransformedEnv(NestedPoint(), skill)
+
+
+def one_hot_skills() -> EnvBase:
+    return TransformedEnv(OneHotPoint(), SkillTransform(3))
+
+
+def options_on_one_hot_actions(*, trajectory_keys: Any = None) -> EnvBase:
+    worker = TensorDictModule(as_one_hot, ["skill"], ["action"])
+    options = OptionTransform(worker, 2, 3, trajectory_keys=trajectory_keys)
+    return TransformedEnv(OneHotChain(9), options)
 
 
 def skilled_points() -> EnvBase:
@@ -141,13 +183,27 @@ def one_of_two() -> TensorDictModule:
     return TensorDictModule(same, ["skill"], ["action"])
 
 
+def nested_objective() -> SkillDiscriminatorLoss:
+    objective = discriminator_objective(("agent", "x"))
+    objective.set_keys(skill=("agent", "z"))
+    return objective
+
+
+def nested_transitions() -> TensorDict:
+    flat = transitions()
+    agent = {"z": flat["skill"], "x": flat["position"]}
+    after = {"x": flat["next", "position"], "r": flat["next", "reward"]}
+    following = TensorDict(agent=TensorDict(after, batch_size=[N]), batch_size=[N])
+    return TensorDict(agent=TensorDict(agent, batch_size=[N]), next=following, batch_size=[N])
+
+
 def learned_worker(key: Any = "velocity") -> SkillPolicy:
     torch.manual_seed(0)
     return SkillPolicy(SkillActor(2, Categorical(4), 3, in_keys=[key]), deterministic=True)
 
 
-def one_and_two_to_the_right(td: TensorDictBase) -> tuple[Tensor, Tensor]:
-    position = td.get("position")
+def one_and_two_to_the_right(td: TensorDictBase, key: Any = "position") -> tuple[Tensor, Tensor]:
+    position = td.get(key)
     away = torch.tensor([[1.0, 0.0], [2.0, 0.0]], device=position.device)
     return position.unsqueeze(1) + away, torch.full((len(td),), 2)
 
@@ -162,9 +218,9 @@ def metra_objective() -> METRAEncoderLoss:
     return METRAEncoderLoss(SkillEncoder(2, 3))
 
 
-def diayn_reward(**kwargs: Any) -> DIAYNReward:
+def diayn_reward(key: Any = "position", **kwargs: Any) -> DIAYNReward:
     torch.manual_seed(0)
-    return DIAYNReward(SkillDiscriminator(2, 3, in_keys=["position"]), 3, **kwargs)
+    return DIAYNReward(SkillDiscriminator(2, 3, in_keys=[key]), 3, **kwargs)
 
 
 def transitions() -> TensorDict:
@@ -182,6 +238,11 @@ def transitions() -> TensorDict:
 
 def recorder() -> OptionRecorder:
     return OptionRecorder(["state", "skill", ("next", "state")])
+
+
+def nested_recorder() -> OptionRecorder:
+    keys = [("agent", "x"), ("agent", "z"), ("next", "agent", "x")]
+    return OptionRecorder(keys, skill_key=("agent", "z"))
 
 
 def options_and_recorder() -> Transform:
@@ -206,6 +267,11 @@ class Case:
     parallel: bool = False
 
 
+NESTED_REWARD_DATA: dict[str, Any] = {
+    "data": nested_transitions(),
+    "data_writes": [("next", "agent", "r")],
+    "changes": [("agent", "r")],
+}
 REWARD_DATA: dict[str, Any] = {
     "data": transitions(),
     "data_writes": [("next", "reward")],
@@ -266,6 +332,12 @@ CASES = {
         {"writes": ["displacement", "origin"]},
         parallel=True,
     ),
+    "displacement_on_one_hot_actions": Case(
+        None,
+        functools.partial(DisplacementTransform, skill_step_key=None),
+        OneHotPoint,
+        {"writes": ["displacement", "origin"]},
+    ),
     "displacement_since_the_skill_began": Case(
         None,
         DisplacementTransform,
@@ -316,6 +388,32 @@ CASES = {
         skilled_for_good,
         {**REWARD_DATA},
     ),
+    "skill_reward_nested": Case(
+        None,
+        lambda: SkillReward(nested_objective(), reward_key=("agent", "r")),
+        nested_skills,
+        NESTED_REWARD_DATA,
+    ),
+    "diayn_reward_nested": Case(
+        None,
+        lambda: diayn_reward(
+            ("agent", "x"), skill_key=("agent", "z"), reward_key=("agent", "r")
+        ),
+        nested_skills,
+        NESTED_REWARD_DATA,
+    ),
+    "skill_reward_on_one_hot_actions": Case(
+        None,
+        lambda: SkillReward(discriminator_objective()),
+        one_hot_skills,
+        {**REWARD_DATA},
+    ),
+    "diayn_reward_on_one_hot_actions": Case(
+        None,
+        diayn_reward,
+        one_hot_skills,
+        {**REWARD_DATA},
+    ),
     "option": Case(
         OptionTransform,
         lambda: OptionTransform(one_of_two(), 2, 3),
@@ -348,7 +446,7 @@ CASES = {
         NestedPoint,
         {
             "writes": [("agent", "k")],
-            "changes": ["reward"],
+            "changes": [("agent", "r")],
             "inverse_writes": [("agent", "push"), ("agent", "z")],
         },
     ),
@@ -377,6 +475,36 @@ CASES = {
         # It takes entries away: see the tests below. Around workers it needs the options there.
         skip=["env", "trans_serial"],
     ),
+    "recorder_nested": Case(
+        None,
+        nested_recorder,
+        functools.partial(nested_options, trajectory_keys=nested_recorder().trajectory_keys),
+        {
+            "changes": [
+                ("trajectory", "agent", "x"),
+                ("trajectory", "next", "agent", "x"),
+                ("trajectory", "mask"),
+            ],
+            "inside_workers": False,
+        },
+        skip=["env", "trans_serial"],
+    ),
+    "recorder_on_one_hot_actions": Case(
+        None,
+        recorder,
+        functools.partial(
+            options_on_one_hot_actions, trajectory_keys=recorder().trajectory_keys
+        ),
+        {
+            "changes": [
+                ("trajectory", "state"),
+                ("trajectory", "next", "state"),
+                ("trajectory", "mask"),
+            ],
+            "inside_workers": False,
+        },
+        skip=["env", "trans_serial"],
+    ),
     "options_and_recorder": Case(
         None,
         options_and_recorder,
@@ -403,6 +531,12 @@ CASES = {
         {"writes": ["stalled_steps"]},
         parallel=True,
     ),
+    "stall_on_one_hot_actions": Case(
+        None,
+        functools.partial(StallTransform, "state", 0.5),
+        OneHotChain,
+        {"writes": ["stalled_steps"]},
+    ),
     "stall_nested": Case(
         None,
         functools.partial(StallTransform, ("agent", "x"), 0.1, ("agent", "stalled")),
@@ -420,22 +554,34 @@ CASES = {
         },
         parallel=True,
     ),
+    "subgoal_on_one_hot_actions": Case(
+        None,
+        lambda: SubgoalTransform(one_and_two_to_the_right, max_goals=4),
+        OneHotPoint,
+        {
+            "writes": [*SUBGOAL_KEYS, "num_divergences"],
+            "writes_next": ["task_reward"],
+            "changes": ["reward"],
+        },
+    ),
     "subgoal_nested": Case(
         None,
         lambda: SubgoalTransform(
-            one_and_two_to_the_right,
+            functools.partial(one_and_two_to_the_right, key=("agent", "x")),
             max_goals=4,
+            position_key=("agent", "x"),
+            reward_key=("agent", "r"),
             goals_key=("agent", "goals"),
             plan_key=("agent", "plan"),
             task_reward_key=("agent", "task_reward"),
             relative=False,
         ),
-        PointMassEnv,
+        NestedPoint,
         {
             "writes": [("agent", "goals"), ("agent", "plan"), "plan_length", "goal_index",
                        "num_plans", "num_goals_met", "num_divergences"],
             "writes_next": [("agent", "task_reward")],
-            "changes": ["reward"],
+            "changes": [("agent", "r")],
         },
     ),
 }  # fmt: skip
@@ -469,11 +615,34 @@ def test_no_transform_that_is_exported_is_left_out() -> None:
     assert transforms == {case.covers for case in CASES.values()} - {None}
 
 
+def kinds(case: Case) -> set[str]:
+    """Which kinds of action and of keys a case has."""
+    env = on_env(case)
+    base: EnvBase = env
+    while isinstance(base, TransformedEnv):  # of an option's worker, whose actions are inside
+        base = base.base_env
+    leaves = [leaf for one in (env, base) for leaf in one.full_action_spec.values(True, True)]
+    one_hot = any(isinstance(leaf, OneHot) for leaf in leaves)
+    keys = [key for spec in (env.observation_spec, env.full_reward_spec) for key in spec.keys(True)]
+    nested = any(isinstance(key, tuple) for key in keys)
+    return {"one-hot" if one_hot else "categorical", "nested" if nested else "flat"}
+
+
+def test_every_transform_is_tried_with_all_kinds_of_actions_and_of_keys() -> None:
+    found: dict[str, set[str]] = {}
+    for case in CASES.values():
+        made = case.make()
+        if not isinstance(made, Compose):
+            found.setdefault(type(made).__name__, set()).update(kinds(case))
+    every = {"categorical", "one-hot", "flat", "nested"}
+    assert {name: every - kinds for name, kinds in found.items() if every - kinds} == {}
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_specs_are_on_the_device_of_the_env(name: str) -> None:
     """With an env on the meta device a tensor that was made elsewhere would be seen."""
     case = CASES[name]
-    if "option" in name or name in ("recorder", "skill_mask", "skill_mask_one_hot_nested"):
+    if "option" in name or name.startswith(("recorder", "skill_mask")):
         pytest.skip("an OptionTransform runs its worker on real data when it is attached")
     env = TransformedEnv(case.env().to("meta"), case.make(), auto_unwrap=True)
     for spec in (env.full_observation_spec, env.full_state_spec, env.full_reward_spec):
