@@ -323,6 +323,12 @@ def _prefetch(typing_context, record):
     return types.none(record), codegen
 
 
+if not COMPILED:
+
+    def _prefetch(record):
+        """Nothing: plain Python gives no hints."""
+
+
 @numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _prefetch_node(nodes, edges, b, n):
     """Ask for the memory of a node and of its edges; a middle edge is on one of their lines."""
