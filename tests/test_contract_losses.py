@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical, OneHot
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
 from torchrl.objectives import DiscreteSACLoss, LossModule, SACLoss
 from torchrl.objectives.utils import ValueEstimators
 
@@ -108,10 +108,11 @@ def continuous() -> TensorDict:
     return transitions(torch.linspace(-0.8, 0.8, 2 * N).reshape(N, 2))
 
 
-def segments() -> TensorDict:
+def segments(*, one_hot_action: bool = False) -> TensorDict:
     """Segments ``[2, 3]`` in which episodes end: one terminated, one truncated."""
-    td = discrete()
+    td = one_hot() if one_hot_action else discrete()
     td["next", "done"] = (torch.arange(N)[:, None] % 4) == 0
+    td["action_log_prob"] = torch.full((N,), -1.4)  # what V-trace reads
     return td.reshape(2, 3)
 
 
@@ -162,9 +163,7 @@ def renamed_metra(name: Callable, reduction: str) -> METRAEncoderLoss:
     return objective
 
 
-def actor_and_critic(
-    name: Callable, *, spec: Any = None, encoded: bool = False
-) -> tuple[nn.Module, nn.Module]:
+def actor_and_critic(name: Callable, *, spec: Any = None) -> tuple[nn.Module, nn.Module]:
     keys: dict[str, Any] = {"in_keys": [name("velocity")], "skill_key": name("skill")}
     spec = Categorical(A) if spec is None else spec
     if spec is SPEC:
@@ -182,7 +181,9 @@ def actor_and_critic(
         )
     else:
         actor = SkillActor(2, spec, Z, action_key=name("action"), **keys, **SIZES)
-        critic = SkillCritic(2, A, Z, action_value_key=name("action_value"), **keys, **SIZES)
+        critic = SkillCritic(
+            2, int(spec.space.n), Z, action_value_key=name("action_value"), **keys, **SIZES
+        )
     return actor, critic
 
 
@@ -205,11 +206,14 @@ def continuous_diayn(name: Callable, **kwargs: Any) -> ContinuousDIAYNLoss:
     )
 
 
-def discrete_sac(name: Callable, *, reduction: str = "mean", **kwargs: Any) -> DiscreteSkillSACLoss:
+def discrete_sac(
+    name: Callable, *, reduction: str = "mean", spec: Any = None, **kwargs: Any
+) -> DiscreteSkillSACLoss:
+    spec = Categorical(A) if spec is None else spec
     objective = renamed_metra(name, reduction)
-    networks = actor_and_critic(name)
+    networks = actor_and_critic(name, spec=spec)
     return DiscreteSkillSACLoss(
-        *networks, objective, action_space=Categorical(A), fixed_alpha=False, **kwargs
+        *networks, objective, action_space=spec, fixed_alpha=False, **kwargs
     )
 
 
@@ -219,13 +223,15 @@ def continuous_sac(name: Callable, *, reduction: str = "mean", **kwargs: Any) ->
     return SkillSACLoss(*networks, objective, fixed_alpha=False, **kwargs)
 
 
-def a3c(name: Callable, **kwargs: Any) -> A3CLoss:
+def a3c(
+    name: Callable, *, distribution: Any = torch.distributions.Categorical, **kwargs: Any
+) -> A3CLoss:
     logits = TensorDictModule(nn.Linear(2, A), [name("velocity")], ["logits"])
     actor = ProbabilisticActor(
         logits,
         in_keys=["logits"],
         out_keys=[name("action")],
-        distribution_class=torch.distributions.Categorical,
+        distribution_class=distribution,
     )
     critic = ValueOperator(
         nn.Linear(2, 1), in_keys=[name("velocity")], out_keys=[name("state_value")]
@@ -317,23 +323,20 @@ METRA_GRADIENTS = {
 }
 SAC: dict[str, Any] = {"targets": ["qvalue_network"], "value_estimators": SAC_ESTIMATORS}
 
+A3C_GRADIENTS = {
+    "loss_objective": ["actor_network_params"],
+    "loss_entropy": ["actor_network_params"],
+    "loss_critic": ["critic_network_params"],
+}
+A3C_ESTIMATORS = (NStepReturn, *ValueEstimators)
+
 CASES = {
-    "a3c": Case(
-        a3c,
-        segments,
-        {
-            "loss_objective": ["actor_network_params"],
-            "loss_entropy": ["actor_network_params"],
-            "loss_critic": ["critic_network_params"],
-        },
-        value_estimators=(
-            NStepReturn,
-            ValueEstimators.TD0,
-            ValueEstimators.TD1,
-            ValueEstimators.TDLambda,
-            ValueEstimators.GAE,
-        ),
-        covers=[A3CLoss],
+    "a3c": Case(a3c, segments, A3C_GRADIENTS, value_estimators=A3C_ESTIMATORS, covers=[A3CLoss]),
+    "a3c_one_hot": Case(
+        functools.partial(a3c, distribution=OneHotCategorical),
+        functools.partial(segments, one_hot_action=True),
+        A3C_GRADIENTS,
+        value_estimators=A3C_ESTIMATORS,
     ),
     "diayn": Case(diayn, discrete, DIAYN_GRADIENTS, **SAC, covers=[DIAYNLoss]),
     "diayn_one_hot": Case(
@@ -344,6 +347,9 @@ CASES = {
     ),
     "discrete_sac": Case(
         discrete_sac, discrete, METRA_GRADIENTS, **SAC, covers=[DiscreteSkillSACLoss]
+    ),
+    "discrete_sac_one_hot": Case(
+        functools.partial(discrete_sac, spec=OneHot(A)), one_hot, METRA_GRADIENTS, **SAC
     ),
     "continuous_sac": Case(
         continuous_sac, continuous, METRA_GRADIENTS, **SAC, covers=[SkillSACLoss]
@@ -455,7 +461,50 @@ def test_no_loss_that_is_exported_is_left_out() -> None:
     assert losses - {SkillObjective} == covered
 
 
-@pytest.mark.parametrize("name", ["diayn", "discrete_sac", "continuous_diayn", "continuous_sac"])
+VMAPPED = ["diayn", "discrete_sac", "continuous_diayn", "continuous_sac"]
+
+
+def test_no_choice_of_a_loss_is_left_out() -> None:
+    """Neither target networks, nor value estimators, nor vmap."""
+    vmapped = set()
+    for name, case in CASES.items():
+        loss = case.make(lambda key: key)
+        targets = [
+            key.removeprefix("target_").removesuffix("_params")
+            for key in dir(loss)
+            if key.startswith("target_") and key.endswith("_params")
+        ]
+        held = [t for t in targets if getattr(loss, f"target_{t}_params", None) is not None]
+        assert sorted(case.targets) == held, name
+        for kind in set(ValueEstimators) - set(case.value_estimators):
+            with pytest.raises(NotImplementedError):
+                case.make(lambda key: key).make_value_estimator(kind)
+        if hasattr(loss, "deactivate_vmap"):
+            vmapped.update(case.covers)
+    assert vmapped == {cls for name in VMAPPED for cls in CASES[name].covers}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt:FutureWarning")
+@pytest.mark.parametrize("name", VMAPPED)
+def test_without_vmap_a_loss_compiles_into_one_graph_too(name: str) -> None:
+    case = CASES[name]
+    make = functools.partial(case.make, deactivate_vmap=True)
+    check_loss(make, case.data(), gradients=case.gradients, checks=["compile"])
+
+
+@pytest.mark.parametrize("make", [diayn, discrete_sac])
+def test_where_there_is_one_action_a_loss_is_the_same_in_both_encodings(make: Callable) -> None:
+    losses = []
+    for spec, data in ((Categorical(1), discrete()), (OneHot(1), one_hot())):
+        action = data["action"][..., :1] * 0 + 1 if isinstance(spec, OneHot) else data["action"] * 0
+        torch.manual_seed(0)
+        losses.append(make(lambda key: key, spec=spec)(data.set("action", action)))
+    for key in losses[0].keys():
+        torch.testing.assert_close(losses[0][key], losses[1][key])
+
+
+@pytest.mark.parametrize("name", VMAPPED)
 def test_with_and_without_vmap_the_losses_are_the_same(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
