@@ -21,6 +21,10 @@ LOGGERS = ("csv", "tensorboard", "wandb")
 class DemoConfig:
     """What ``hmcts demo`` does; every value can be given as ``key=value`` on the command line.
 
+    Raises:
+        ValueError: if a number is out of its range, ``train_base_steps`` is no multiple of 64 or
+            the logger is unknown.
+
     Example:
         >>> DemoConfig(seed=3).train_base_steps
         40000

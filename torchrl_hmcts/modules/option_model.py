@@ -155,6 +155,7 @@ class OptionModel(TensorDictModuleBase):
         self.register_buffer("output_scale", torch.ones(self.num_deltas + 2))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the predicted outcome of each row's option under ``"next"``."""
         predicted = self.predict(tensordict)
         after = tensordict.get("next", None)
         return tensordict.set("next", predicted if after is None else after.update(predicted))

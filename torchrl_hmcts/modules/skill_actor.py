@@ -149,6 +149,16 @@ class SkillPolicy(TensorDictModuleBase):
         generator (torch.Generator, optional): source of the samples. Default ``None``: torch's
             global one.
 
+    Returns:
+        From ``forward(tensordict)``: the same, with the action of each row: int64 ``[*B]``
+        (one-hot: ``[*B, A]``; continuous: ``[*B, D]``).
+
+    Raises:
+        TypeError: if ``actor`` is none of the two.
+
+    Reference:
+        This project's.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -187,6 +197,7 @@ class SkillPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action of each row's skill."""
         outputs = self.network.forward(*[tensordict.get(key) for key in self.in_keys])
         action = self._choose(outputs, self.deterministic, self.generator)
         return tensordict.set(self.action_key, action)

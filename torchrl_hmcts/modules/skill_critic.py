@@ -34,6 +34,10 @@ class SkillCritic(SkillNetwork):
         network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
             :class:`SkillMLP`; e.g. :class:`ConcatSkillMLP` for a skill that is concatenated.
 
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; heads: Bartley, 2023,
+        chapter 4.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -85,6 +89,10 @@ class SkillActionCritic(SkillNetwork):
         activation (callable): builds the activations. Default ``torch.nn.ReLU``.
         network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
             :class:`SkillMLP`.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; heads: Bartley, 2023,
+        chapter 4.
 
     Examples:
         >>> import torch

@@ -101,6 +101,7 @@ class SkillDynamics(TensorDictModuleBase):
         self.min_std = float(min_std)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes mean and standard deviation of the change under every skill, ``[*B, Z, D]``."""
         loc = self.network.all_skills(*[tensordict.get(key) for key in self.in_keys])
         scale = (self.min_std + self.log_std.exp()).expand_as(loc)
         tensordict.set(self.out_keys[0], loc)

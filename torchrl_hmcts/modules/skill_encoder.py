@@ -80,6 +80,9 @@ class SpectralLinear(nn.Linear):
         out_features (int): size of the output.
         bias (bool): whether there is a bias. Default ``True``.
 
+    Returns:
+        From ``forward(x)``: ``[*B, out_features]`` for x ``[*B, in_features]``.
+
     Reference:
         Miyato et al., "Spectral Normalization for Generative Adversarial Networks", 2018, arXiv
         1802.05957.

@@ -78,6 +78,7 @@ class SkillMLP(nn.Module):
         self.heads = nn.Linear(hidden[-1], num_skills * out_features)
 
     def forward(self, *inputs: Tensor) -> Tensor:
+        """Returns the outputs of each element's own skill, ``[*B, O]``; see the class."""
         return self.run(own_weights(self.trunk, self.heads), *inputs)
 
     def run(self, weights: Sequence[Tensor], *inputs: Tensor) -> Tensor:
@@ -105,6 +106,7 @@ class SkillMLP(nn.Module):
         return can_stack(self.trunk)
 
     def extra_repr(self) -> str:
+        """Returns the sizes that ``print`` shows."""
         return f"num_skills={self.num_skills}, out_features={self.out_features}"
 
 
@@ -167,6 +169,7 @@ class ConcatSkillMLP(nn.Module):
         self.last = nn.Linear((width, *hidden)[-1], out_features)
 
     def forward(self, *inputs: Tensor) -> Tensor:
+        """Returns the outputs of each element's own skill, ``[*B, O]``; see the class."""
         return self.run(own_weights(self.trunk, self.last), *inputs)
 
     def run(self, weights: Sequence[Tensor], *inputs: Tensor) -> Tensor:
@@ -197,6 +200,7 @@ class ConcatSkillMLP(nn.Module):
         return can_stack(self.trunk)
 
     def extra_repr(self) -> str:
+        """Returns the sizes that ``print`` shows."""
         return f"num_skills={self.num_skills}, out_features={self.out_features}"
 
 
@@ -296,6 +300,9 @@ class SkillNetwork(TensorDictModuleBase):
         in_keys (sequence of NestedKey): entries to read.
         out_key (NestedKey): entry to write.
 
+    Reference:
+        This project's; the interface is that of ``tensordict.nn.TensorDictModule``.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -319,6 +326,7 @@ class SkillNetwork(TensorDictModuleBase):
         self.network = network
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the network's output under ``out_key``, of the shape the network gives."""
         inputs = [tensordict.get(key) for key in self.in_keys]
         return tensordict.set(self.out_key, self.network(*inputs))
 

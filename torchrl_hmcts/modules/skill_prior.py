@@ -68,9 +68,11 @@ class SkillPrior(nn.Module, ABC):
         return torch.special.entr(self.probs()).sum()
 
     def forward(self) -> Tensor:
+        """Returns the probabilities of the skills, ``[Z]``."""
         return self.probs()
 
     def extra_repr(self) -> str:
+        """Returns the number of skills that ``print`` shows."""
         return f"num_skills={self.num_skills}"
 
 
@@ -84,6 +86,10 @@ class FixedSkillPrior(SkillPrior):
 
     Raises:
         ValueError: if the weights are no distribution over the skills.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, section 3: a fixed
+        prior of the highest entropy.
 
     Examples:
         >>> from torchrl_hmcts.modules import FixedSkillPrior
@@ -133,6 +139,9 @@ class GrowingSkillPrior(SkillPrior):
 
     Raises:
         ValueError: if more skills are to be switched on than there is room for, or none.
+
+    Reference:
+        This project's.
 
     Examples:
         >>> from torchrl_hmcts.modules import GrowingSkillPrior
@@ -185,6 +194,7 @@ class GrowingSkillPrior(SkillPrior):
         return active.to(torch.get_default_dtype()) / active.sum()
 
     def extra_repr(self) -> str:
+        """Returns the number of skills, and of those in use, that ``print`` shows."""
         return f"num_skills={self.num_skills}, num_active={int(self.num_active)}"
 
 

@@ -40,6 +40,10 @@ class StallTermination:
         ValueError: if ``num_steps`` is below 1; when an ``OptionTransform`` is attached to an env
             that writes no such count.
 
+    Reference:
+        This project's; options end in states, as in Sutton, Precup and Singh, "Between MDPs and
+        semi-MDPs", 1999.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -90,6 +94,10 @@ class AnyTermination:
 
     Raises:
         ValueError: if there is no condition, or one cannot be called.
+
+    Reference:
+        This project's; options end in states, as in Sutton, Precup and Singh, "Between MDPs and
+        semi-MDPs", 1999.
 
     Examples:
         >>> import torch

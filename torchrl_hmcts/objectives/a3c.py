@@ -285,6 +285,7 @@ class A3CLoss(A2CLoss):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """The entries that ``forward`` reads."""
         keys = self.tensor_keys
         actions = keys.action if isinstance(keys.action, list) else [keys.action]
         read = [*self.actor_network.in_keys, *self.critic_network.in_keys]

@@ -139,6 +139,7 @@ class OptionTerminationLoss(PriorityWeights, LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """The entries that ``forward`` reads."""
         if self._in_keys is None:
             self._set_in_keys()
         return self._in_keys
@@ -309,6 +310,7 @@ class IntraOptionQLoss(PriorityWeights, LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """The entries that ``forward`` reads."""
         if self._in_keys is None:
             self._set_in_keys()
         return self._in_keys

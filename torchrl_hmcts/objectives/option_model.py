@@ -159,6 +159,7 @@ class OptionModelLoss(PriorityWeights, LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """The entries that ``forward`` reads."""
         if self._in_keys is None:
             self._set_in_keys()
         return self._in_keys

@@ -142,6 +142,7 @@ class ExpertIterationLoss(PriorityWeights, LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """The entries that ``forward`` reads."""
         if self._in_keys is None:
             self._set_in_keys()
         return self._in_keys

@@ -48,6 +48,9 @@ class SkillObjective(PriorityWeights, LossModule):
     Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``priority_weight``
     (default ``"priority_weight"``).
 
+    Reference:
+        This project's: the common form of DIAYN, DADS, METRA and LSD.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -139,6 +142,7 @@ class SkillObjective(PriorityWeights, LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """The entries that ``forward`` reads."""
         if self._in_keys is None:
             self._set_in_keys()
         return self._in_keys

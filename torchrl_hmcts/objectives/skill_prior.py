@@ -135,6 +135,7 @@ class SkillPriorLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """The entries that ``forward`` reads."""
         if self._in_keys is None:
             keys = self.tensor_keys
             self._in_keys = [unravel_key(keys.skill), unravel_key(("next", keys.reward))]

@@ -21,21 +21,51 @@ Array = np.ndarray | Tensor
 
 
 class Root(NamedTuple):
-    """The states to search from."""
+    """The states to search from.
 
-    prior: Array  # [B, A] float32, probabilities of options
-    value: Array  # [B] float32
-    embedding: Array  # [B, ...] what the transition function needs of a state, any dtype
+    Attributes:
+        prior (Array): ``[B, A]`` float32, probabilities of options.
+        value (Array): ``[B]`` float32.
+        embedding (Array): ``[B, ...]`` what the transition function needs of a state, any dtype.
+
+    Example:
+        >>> import numpy as np
+        >>> prior, value = np.full((1, 2), 0.5, np.float32), np.zeros(1, np.float32)
+        >>> root = Root(prior, value, embedding=np.array([[3.0]]))
+        >>> root.prior.shape, root.embedding.shape
+        ((1, 2), (1, 1))
+    """
+
+    prior: Array
+    value: Array
+    embedding: Array
 
 
 class Transition(NamedTuple):
-    """What options did: the answer of a transition function."""
+    """What options did: the answer of a transition function.
 
-    reward: Array  # [m] float32, R
-    discount: Array  # [m] float32, D: gamma ** duration, 0 for a terminal state
-    prior: Array  # [m, A] float32, probabilities of options in the next state
-    value: Array  # [m] float32, of the next state
-    embedding: Array  # [m, ...] of the next state, shape and dtype of the roots'
+    Attributes:
+        reward (Array): ``[m]`` float32, R.
+        discount (Array): ``[m]`` float32, D: gamma ** duration, 0 for a terminal state.
+        prior (Array): ``[m, A]`` float32, probabilities of options in the next state.
+        value (Array): ``[m]`` float32, of the next state.
+        embedding (Array): ``[m, ...]`` of the next state, shape and dtype of the roots'.
+
+    Example:
+        >>> import numpy as np
+        >>> def double(embedding, option):  # every option doubles the state and earns 1
+        ...     one = np.ones(len(option), np.float32)
+        ...     prior = np.full((len(option), 2), 0.5, np.float32)
+        ...     return Transition(one, 0.9 * one, prior, 0 * one, 2 * embedding)
+        >>> double(np.array([[3.0]]), np.array([1])).embedding
+        array([[6.]])
+    """
+
+    reward: Array
+    discount: Array
+    prior: Array
+    value: Array
+    embedding: Array
 
 
 TransitionFunction = Callable[[Any, Any], Transition]

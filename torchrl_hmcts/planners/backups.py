@@ -26,6 +26,9 @@ class MaxBackup:
 
     .. math:: V(s) = \max_o\; R(s,o) + D(s,o)\,V(s')
 
+    Reference:
+        Coulom, "Efficient selectivity and backup operators in Monte-Carlo tree search", 2006.
+
     Example:
         >>> MaxBackup()
         MaxBackup()

@@ -29,6 +29,9 @@ class SearchBudget:
     Raises:
         ValueError: if a limit is zero or negative.
 
+    Reference:
+        This project's.
+
     Example:
         >>> SearchBudget(simulations=100, until_plan=False).simulations
         100

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 class BestPlan:
     """The first option of the plan with the highest return; without a plan, the most visited one.
 
+    Reference:
+        This project's.
+
     Example:
         >>> BestPlan()
         BestPlan()
@@ -34,6 +37,10 @@ class BestPlan:
 @dataclass(frozen=True)
 class MostVisited:
     """The option of the root with the most visits (ties: the higher value, then the lower index).
+
+    Reference:
+        Chaslot et al., "Progressive strategies for Monte-Carlo tree search", 2008: the robust
+        child.
 
     Example:
         >>> MostVisited()
@@ -54,6 +61,9 @@ class HighestValue:
     Args:
         random_ties: draw among options of equal value, as there are many where rewards are rare,
             instead of taking the one of lower index. Default ``False``.
+
+    Reference:
+        Chaslot et al., "Progressive strategies for Monte-Carlo tree search", 2008: the max child.
 
     Example:
         >>> HighestValue(random_ties=True)

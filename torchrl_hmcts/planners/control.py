@@ -128,6 +128,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         self._shape: torch.Size | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the next option of each row's plan, after planning where one is due."""
         shape = tensordict.batch_size
         is_init, done, stepped = (tensordict.get(k, None) for k in ("is_init", "done", "_step"))
         kept = {key: tensordict.get(key, None) for key in self._plan_keys}

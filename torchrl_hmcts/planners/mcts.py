@@ -53,6 +53,23 @@ class SearchProgress:
     """What a progress display is told after every wave.
 
     ``search`` is the search as it stands; ``extract_plans(search)`` gives the best plans so far.
+
+    Attributes:
+        num_roots (int): roots of the search.
+        num_active (int): roots whose search still goes on.
+        num_found (int): roots with a plan.
+        expansions (int): nodes expanded so far, of all roots.
+        base_steps (int): base steps simulated so far, of all roots.
+        seconds (float): since the search began.
+        search (Search): the search as it stands, of B roots.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env, told = ChainEnv(length=4), []
+        >>> _ = MCTSPlanner(env, progress=told.append).plan(env.reset())
+        >>> told[-1].num_found, told[-1].num_roots
+        (1, 1)
     """
 
     num_roots: int

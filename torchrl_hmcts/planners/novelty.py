@@ -19,6 +19,24 @@ class NoveltyTest(Protocol):
     """What a planner asks of a novelty test; write your own with these members.
 
     A method ``statistics() -> dict`` is optional: its counts join those of the search.
+
+    Example:
+        >>> import numpy as np
+        >>> class Always:  # finds everything new
+        ...     in_keys = []
+        ...     def start(self, num_roots): ...
+        ...     def restart(self, root): ...
+        ...     def features(self, tensordict):
+        ...         return np.zeros((len(tensordict), 0), np.float32)
+        ...     def accept(self, roots, features, base_steps):
+        ...         return np.ones(len(roots), bool)
+        ...     def relax(self, root):
+        ...         return False
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=4)
+        >>> MCTSPlanner(env, novelty=Always()).plan(env.reset()).options.tolist()
+        [1, 1, 1]
     """
 
     in_keys: list[NestedKey]
@@ -136,6 +154,7 @@ class RadiusNovelty:
         self.start(0)
 
     def start(self, num_roots: int) -> None:
+        """Forgets everything; ``num_roots`` searches begin."""
         self._num_roots = num_roots
         self._known: np.ndarray | None = None  # [B] of novelty_kernels.RADIUS_ROOT
         self._relaxed = np.zeros(num_roots, np.int64)
@@ -169,6 +188,7 @@ class RadiusNovelty:
         return self.radius * self.relaxation**self._relaxed
 
     def features(self, tensordict: TensorDictBase) -> np.ndarray:
+        """Returns the features of states, ``[m, F]``."""
         parts = []
         for key, scale in zip(self.in_keys, self.scale, strict=True):
             part = tensordict.get(key).to(torch.float32)
@@ -178,12 +198,14 @@ class RadiusNovelty:
         return joined.cpu().contiguous().numpy()
 
     def restart(self, root: int) -> None:
+        """Forgets the states of one root."""
         self._relaxed[root] = 0
         if self._known is not None:
             self._known[root] = 0
             self._known["radius"][root] = self.radius
 
     def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        """Returns which new states are novel, bool ``[m]``, and remembers those."""
         features = np.ascontiguousarray(features, np.float32)
         if self._known is None:
             self._make_room(features.shape[1])
@@ -203,6 +225,7 @@ class RadiusNovelty:
         return accepted
 
     def relax(self, root: int) -> bool:
+        """Is less strict for one root from now on; False if that is impossible."""
         if self._relaxed[root] >= self.max_relaxations:
             return False
         self._relaxed[root] += 1
@@ -274,12 +297,14 @@ class WidthNovelty:
         self.start(0)
 
     def start(self, num_roots: int) -> None:
+        """Forgets everything; ``num_roots`` searches begin."""
         self._limits = np.ones(num_roots, np.int64)
         self._used: np.ndarray | None = None
         self.num_tested = 0
         self._tally = np.zeros(1, np.int64)
 
     def features(self, tensordict: TensorDictBase) -> np.ndarray:
+        """Returns the features of states, ``[m, F]``."""
         parts = []
         for key in self.in_keys:
             part = tensordict.get(key)
@@ -294,6 +319,7 @@ class WidthNovelty:
         return joined.cpu().contiguous().numpy()
 
     def restart(self, root: int) -> None:
+        """Forgets the states of one root."""
         self._limits[root] = 1
         if self._used is not None:
             self._used[root] = 0
@@ -328,6 +354,7 @@ class WidthNovelty:
         self._values, self._owners, self._counts = values, owners, counts
 
     def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        """Returns which new states are novel, bool ``[m]``, and remembers those."""
         if features.dtype != np.uint8:
             features = features.astype(np.int64, copy=False)
         features = np.ascontiguousarray(features)
@@ -353,6 +380,7 @@ class WidthNovelty:
         return accepted
 
     def relax(self, root: int) -> bool:
+        """Is less strict for one root from now on; False if that is impossible."""
         if self._limits[root] > self.max_relaxations:
             return False
         self._limits[root] += 1

@@ -10,11 +10,20 @@ import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
+from torchrl_hmcts.planners.docstrings import KeepsDocstring
 from torchrl_hmcts.planners.search import Search
 
 
-class Plan(TensorClass):
+class Plan(TensorClass, metaclass=KeepsDocstring):
     """The best plan of each root: options that earn a reward when carried out one after the other.
+
+    Attributes:
+        options (Tensor): ``[*B, L]`` int64, -1 behind a plan's end.
+        lengths (Tensor): ``[*B]`` int64, 0 where no plan was found.
+        found (Tensor): ``[*B]`` bool.
+        returns (Tensor): ``[*B]`` float32, discounted return of the plan, 0 without one.
+        durations (Tensor): ``[*B]`` int64, base steps of the plan in the simulator.
+        states (TensorDictBase): ``[*B, L + 1]`` states between the options, the last one repeated.
 
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner
@@ -25,16 +34,31 @@ class Plan(TensorClass):
         ([1, 1, 1], True, 0.81)
     """
 
-    options: Tensor  # [*B, L] int64, -1 behind a plan's end
-    lengths: Tensor  # [*B] int64, 0 where no plan was found
-    found: Tensor  # [*B] bool
-    returns: Tensor  # [*B] float32, discounted return of the plan, 0 without one
-    durations: Tensor  # [*B] int64, base steps of the plan in the simulator
-    states: TensorDictBase  # [*B, L + 1] states between the options, the last one repeated
+    options: Tensor
+    lengths: Tensor
+    found: Tensor
+    returns: Tensor
+    durations: Tensor
+    states: TensorDictBase
 
 
 def extract_plans(search: Search) -> Plan:
-    """Read the best plan of each root out of a search, batch ``[B]``."""
+    """Read the best plan of each root out of a search, batch ``[B]``.
+
+    Args:
+        search (Search): a search that has ended, of B roots.
+
+    Returns:
+        The plans, batch ``[B]``; ``found`` is False where no option earned a reward.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=4)
+        >>> search = MCTSPlanner(env).search(env.reset())
+        >>> extract_plans(search).options
+        tensor([[1, 1, 1]])
+    """
     tree, best = search.tree, search.best_node
     paths = [
         np.array(tree.path(b, node) if node >= 0 else [0], np.int64)

@@ -127,6 +127,14 @@ class Search:
         exhausted: what a descent does with an option behind which nothing is left to simulate:
             ``"skip"`` it, or ``"revisit"`` it and back its known value up once more.
         capacity: nodes per root to make room for at first.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=4)
+        >>> search = MCTSPlanner(env).search(env.reset())
+        >>> search.tree.options(root=0, node=search.best_node[0])
+        [1, 1, 1]
     """
 
     def __init__(

@@ -49,6 +49,9 @@ class TorchRLScore:
         TypeError: if ``score_module`` is no TensorDictModule.
         ValueError: if it reads an entry that a search does not have.
 
+    Reference:
+        The scores of ``torchrl.modules.mcts``, which name their own papers.
+
     Example:
         >>> from torchrl.modules.mcts.scores import PUCTScore
         >>> from torchrl_hmcts.planners import MCTSPlanner, TorchRLScore

@@ -17,22 +17,44 @@ from typing import Literal
 from tensordict import TensorClass
 from torch import Tensor
 
+from torchrl_hmcts.planners.docstrings import KeepsDocstring
 
-class NodeStatistics(TensorClass):
+
+class NodeStatistics(TensorClass, metaclass=KeepsDocstring):
     """What a tree policy may look at: the nodes where descents of a wave stand, ``[d]``.
 
     Visits include the options that are being simulated in the same wave. The value of an option
     that was never tried is 0; ``allowed`` says which ones may be chosen.
+
+    Attributes:
+        node_visits (Tensor): ``[d]`` float32, visits n of the node, its own evaluation included.
+        node_values (Tensor): ``[d]`` float32, value V of the node.
+        depths (Tensor): ``[d]`` int64, options from the root.
+        option_visits (Tensor): ``[d, A]`` float32, n_j.
+        option_values (Tensor): ``[d, A]`` float32, Q_j = R_j + D_j V_j.
+        option_squares (Tensor): ``[d, A]`` float32, sum of the squared returns that Q_j is the mean
+            of.
+        priors (Tensor): ``[d, A]`` float32, P(s, a).
+        allowed (Tensor): ``[d, A]`` bool.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> def least_visited(statistics):
+        ...     return -statistics.option_visits  # [d, A] scores, of which the highest wins
+        >>> env = ChainEnv(length=4)
+        >>> MCTSPlanner(env, tree_policy=least_visited).plan(env.reset()).options.tolist()
+        [1, 1, 1]
     """
 
-    node_visits: Tensor  # [d] float32, visits n of the node, its own evaluation included
-    node_values: Tensor  # [d] float32, value V of the node
-    depths: Tensor  # [d] int64, options from the root
-    option_visits: Tensor  # [d, A] float32, n_j
-    option_values: Tensor  # [d, A] float32, Q_j = R_j + D_j V_j
-    option_squares: Tensor  # [d, A] float32, sum of the squared returns that Q_j is the mean of
-    priors: Tensor  # [d, A] float32, P(s, a)
-    allowed: Tensor  # [d, A] bool
+    node_visits: Tensor
+    node_values: Tensor
+    depths: Tensor
+    option_visits: Tensor
+    option_values: Tensor
+    option_squares: Tensor
+    priors: Tensor
+    allowed: Tensor
 
 
 ScoreFunction = Callable[[NodeStatistics], Tensor]

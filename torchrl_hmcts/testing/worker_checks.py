@@ -165,6 +165,7 @@ def check_termination(
 
     Raises:
         ContractError: if it cannot.
+        ValueError: if ``tensordict`` holds no elements, or more than one batch dimension.
 
     Examples:
         >>> import torch

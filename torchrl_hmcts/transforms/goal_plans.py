@@ -21,6 +21,16 @@ class PlansGoals(Protocol):
 
     An attribute ``in_keys`` is optional: the entries the manager reads. With it only those are
     handed over.
+
+    Example:
+        >>> import torch
+        >>> class ToTheRight:
+        ...     def plan_goals(self, tensordict):
+        ...         goals = tensordict["position"].unsqueeze(1) + torch.tensor([1.0, 0.0])
+        ...         return goals, torch.ones(len(tensordict), dtype=torch.int64)
+        >>> from torchrl_hmcts.transforms import PlansGoals
+        >>> isinstance(ToTheRight(), PlansGoals)
+        True
     """
 
     def plan_goals(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:

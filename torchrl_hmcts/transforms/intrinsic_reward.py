@@ -41,6 +41,10 @@ class SkillReward(Transform):
     Raises:
         TypeError: if the objective is no :class:`SkillObjective`.
 
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, for replacing the
+        reward; the reward itself is its objective's.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -149,6 +153,9 @@ class DIAYNReward(SkillReward):
 
     Returns:
         The transitions with ``("next", reward_key)`` set to ``r`` ``[*B, 1]``, detached.
+
+    Raises:
+        ValueError: if the discriminator tells another number of skills apart.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, equation 3.

@@ -375,16 +375,19 @@ class OptionTransform(Transform):
         return observation_spec
 
     def set_container(self, container: Transform | EnvBase) -> None:
+        """Takes its place in an env, and checks there that worker and env fit."""
         self._fit = None
         super().set_container(container)
         if self.parent is not None:  # None in a Compose that has no env yet
             self._fitted()
 
     def reset_parent(self) -> None:
+        """Forgets the env it was part of."""
         self._fit = None
         super().reset_parent()
 
     def empty_cache(self) -> None:
+        """Forgets what it knows of the env, e.g. after a transform was put in front."""
         self._fit = None  # e.g. a transform was put in front, and the parent is another
         super().empty_cache()
 

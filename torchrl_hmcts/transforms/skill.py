@@ -204,9 +204,11 @@ class SkillTransform(Transform):
             )
 
     def get_extra_state(self) -> dict[str, Tensor]:
+        """Returns the state of its own generator, if it has one, for the state dict."""
         return {} if self.generator is None else {"generator": self.generator.get_state()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Sets its own generator to a saved state."""
         if "generator" in state:
             if self.generator is None:
                 self.generator = torch.Generator()

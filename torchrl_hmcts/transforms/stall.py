@@ -37,6 +37,9 @@ class StallTransform(Transform):
         KeyError: when the specs are made, if the env has no ``in_key``; when stepping, if it is
             missing from the tensordict.
 
+    Reference:
+        This project's.
+
     Examples:
         >>> import torch
         >>> from tensordict.nn import TensorDictModule

@@ -66,7 +66,15 @@ class SubgoalTransform(Transform):
             met. Default 64.
         relative (bool): show goals relative to the position (default), so that what the worker
             learns in one place holds in all, or as they are.
-        goals_key (NestedKey): Default ``"goals"``.
+        goals_key (NestedKey): the next K goals, ``[*B, K D]``. Default ``"goals"``.
+        plan_key (NestedKey): the whole plan, ``[*B, G, D]``. Default ``"plan"``.
+        plan_length_key (NestedKey): goals of the plan, int64 ``[*B, 1]``. Default
+            ``"plan_length"``.
+        goal_index_key (NestedKey): index of the current goal, int64 ``[*B, 1]``. Default
+            ``"goal_index"``.
+        num_plans_key, num_goals_met_key, num_divergences_key (NestedKey): counts of the episode,
+            int64 ``[*B, 1]``. Defaults ``"num_plans"``, ``"num_goals_met"`` and
+            ``"num_divergences"``.
         reward_key (NestedKey): the env's reward, which becomes the worker's. Default ``"reward"``.
         task_reward_key (NestedKey): where the env's reward goes. Default ``"task_reward"``.
 

@@ -28,6 +28,16 @@ class ComponentConfig(ConfigBase):
     ``_component_`` names its class, whose keywords are the other fields, with the same defaults.
     With ``_partial_=True`` what is built is a function of the keywords that are still missing:
     objects such as envs and networks are better handed over so than through Hydra, which copies.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class UCTConfig(ComponentConfig):
+        ...     c: float = 1.0
+        ...     _component_: str = "torchrl_hmcts.planners.UCT"
+        >>> instantiate(UCTConfig(c=0.5))
+        UCT(c=0.5)
     """
 
     _target_: str = _TARGET
@@ -39,14 +49,26 @@ class ComponentConfig(ConfigBase):
 
 @dataclass
 class LossComponentConfig(LossConfig):
-    """A :class:`ComponentConfig` that TorchRL's configs take as a loss."""
+    """A :class:`ComponentConfig` that TorchRL's configs take as a loss.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.configs import SkillPriorLossConfig
+        >>> isinstance(SkillPriorLossConfig(), LossComponentConfig)
+        True
+    """
 
     _target_: str = _TARGET
 
 
 @dataclass
 class TransformComponentConfig(TransformConfig):
-    """A :class:`ComponentConfig` that TorchRL's configs take as a transform."""
+    """A :class:`ComponentConfig` that TorchRL's configs take as a transform.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.configs import SkillTransformConfig
+        >>> isinstance(SkillTransformConfig(num_skills=4), TransformComponentConfig)
+        True
+    """
 
     _target_: str = _TARGET
     _partial_: bool = False
@@ -54,7 +76,13 @@ class TransformComponentConfig(TransformConfig):
 
 @dataclass
 class EnvComponentConfig(EnvConfig):
-    """A :class:`ComponentConfig` that TorchRL's configs take as an env."""
+    """A :class:`ComponentConfig` that TorchRL's configs take as an env.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.configs import WaterworldMazeEnvConfig
+        >>> isinstance(WaterworldMazeEnvConfig(), EnvComponentConfig)
+        True
+    """
 
     _target_: str = _TARGET
 

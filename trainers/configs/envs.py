@@ -13,7 +13,13 @@ from torchrl_hmcts.trainers.configs.base import EnvComponentConfig
 
 @dataclass
 class WaterworldMazeEnvConfig(EnvComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.envs.WaterworldMazeEnv`."""
+    """Keys of :class:`~torchrl_hmcts.envs.WaterworldMazeEnv`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(WaterworldMazeEnvConfig(batch_size=[8])).batch_size
+        torch.Size([8])
+    """
 
     mazes: Any = None
     """Bool [M, H, W], True = wall, equal numbers of walls."""
@@ -32,7 +38,13 @@ class WaterworldMazeEnvConfig(EnvComponentConfig):
 
 @dataclass
 class GridworldMazeEnvConfig(EnvComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.envs.GridworldMazeEnv`."""
+    """Keys of :class:`~torchrl_hmcts.envs.GridworldMazeEnv`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(GridworldMazeEnvConfig()).batch_size
+        torch.Size([])
+    """
 
     mazes: Any = None
     """Bool [M, H, W], True = wall, equal numbers of walls."""
@@ -49,7 +61,13 @@ class GridworldMazeEnvConfig(EnvComponentConfig):
 
 @dataclass
 class LabMazeEnvConfig(EnvComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.envs.LabMazeEnv`."""
+    """Keys of :class:`~torchrl_hmcts.envs.LabMazeEnv`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(LabMazeEnvConfig()).batch_size
+        torch.Size([])
+    """
 
     mazes: Any = None
     """Each a sequence of rows of equal length, the north first: * wall, P spawn, G goal, A
@@ -101,7 +119,12 @@ class LabMazeEnvConfig(EnvComponentConfig):
 
 @dataclass
 class AtariRAMEnvConfig(EnvComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.envs.AtariRAMEnv`."""
+    """Keys of :class:`~torchrl_hmcts.envs.AtariRAMEnv`.
+
+    Example:
+        >>> AtariRAMEnvConfig(game="Pong").game
+        'Pong'
+    """
 
     game: str = MISSING
     """E.g. "Breakout" or "SpaceInvaders"."""

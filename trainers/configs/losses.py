@@ -12,7 +12,19 @@ from torchrl_hmcts.trainers.configs.base import LossComponentConfig
 
 @dataclass
 class DIAYNLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.DIAYNLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.DIAYNLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator
+        >>> actor = SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"])
+        >>> critic = SkillCritic(2, 4, num_skills=3, in_keys=["velocity"])
+        >>> instantiate(DIAYNLossConfig(action_space="categorical", _partial_=True))(
+        ...     actor_network=actor, qvalue_network=critic,
+        ...     discriminator=SkillDiscriminator(2, num_skills=3)).out_keys[0]
+        'loss_actor'
+    """
 
     actor_network: Any = MISSING
     """The policy pi(a | s, z), e.g. a SkillActor."""
@@ -59,7 +71,20 @@ class DIAYNLossConfig(LossComponentConfig):
 
 @dataclass
 class ContinuousDIAYNLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.ContinuousDIAYNLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.ContinuousDIAYNLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_hmcts.modules import GaussianSkillActor, SkillActionCritic
+        >>> from torchrl_hmcts.modules import SkillDiscriminator
+        >>> actor = GaussianSkillActor(2, Bounded(-1, 1, [2]), 3, in_keys=["velocity"])
+        >>> critic = SkillActionCritic(2, 2, 3, in_keys=["velocity"])
+        >>> instantiate(ContinuousDIAYNLossConfig(_partial_=True))(
+        ...     actor_network=actor, qvalue_network=critic,
+        ...     discriminator=SkillDiscriminator(2, num_skills=3)).out_keys[0]
+        'loss_actor'
+    """
 
     actor_network: Any = MISSING
     """The policy pi(a | s, z), e.g. a GaussianSkillActor."""
@@ -78,7 +103,21 @@ class ContinuousDIAYNLossConfig(LossComponentConfig):
 
 @dataclass
 class DiscreteSkillSACLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator
+        >>> actor = SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"])
+        >>> critic = SkillCritic(2, 4, num_skills=3, in_keys=["velocity"])
+        >>> from torchrl_hmcts.objectives import SkillDiscriminatorLoss
+        >>> objective = SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=3))
+        >>> instantiate(DiscreteSkillSACLossConfig(action_space="categorical", _partial_=True))(
+        ...     actor_network=actor, qvalue_network=critic,
+        ...     objective=objective).objective.num_skills
+        3
+    """
 
     actor_network: Any = MISSING
     """The policy pi(a | s, z), e.g. a SkillActor."""
@@ -121,7 +160,22 @@ class DiscreteSkillSACLossConfig(LossComponentConfig):
 
 @dataclass
 class SkillSACLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.SkillSACLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.SkillSACLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_hmcts.modules import GaussianSkillActor, SkillActionCritic
+        >>> from torchrl_hmcts.modules import SkillDiscriminator
+        >>> actor = GaussianSkillActor(2, Bounded(-1, 1, [2]), 3, in_keys=["velocity"])
+        >>> critic = SkillActionCritic(2, 2, 3, in_keys=["velocity"])
+        >>> from torchrl_hmcts.objectives import SkillDiscriminatorLoss
+        >>> objective = SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=3))
+        >>> instantiate(SkillSACLossConfig(_partial_=True))(
+        ...     actor_network=actor, qvalue_network=critic,
+        ...     objective=objective).objective.num_skills
+        3
+    """
 
     actor_network: Any = MISSING
     """The policy pi(a | s, z), e.g. a GaussianSkillActor."""
@@ -161,7 +215,12 @@ class SkillSACLossConfig(LossComponentConfig):
 
 @dataclass
 class A3CLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.A3CLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.A3CLoss`.
+
+    Example:
+        >>> A3CLossConfig(gamma=0.95).gamma
+        0.95
+    """
 
     actor_network: Any = MISSING
     """The policy."""
@@ -182,7 +241,12 @@ class A3CLossConfig(LossComponentConfig):
 
 @dataclass
 class ExpertIterationLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.ExpertIterationLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.ExpertIterationLoss`.
+
+    Example:
+        >>> ExpertIterationLossConfig(reduction="sum").reduction
+        'sum'
+    """
 
     network: Any = MISSING
     """Reads its in_keys and writes logits [*B, A] and state_value [*B, 1], the prior and the value
@@ -198,7 +262,12 @@ class ExpertIterationLossConfig(LossComponentConfig):
 
 @dataclass
 class OptionModelLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.OptionModelLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.OptionModelLoss`.
+
+    Example:
+        >>> OptionModelLossConfig(reduction="sum").reduction
+        'sum'
+    """
 
     model: Any = MISSING
     """What is trained; it stays a sub-module as it is."""
@@ -223,7 +292,15 @@ class OptionModelLossConfig(LossComponentConfig):
 
 @dataclass
 class IntraOptionQLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.IntraOptionQLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.IntraOptionQLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import SkillCritic
+        >>> critic = SkillCritic(2, 4, num_skills=3, in_keys=["velocity"])
+        >>> instantiate(IntraOptionQLossConfig(_partial_=True))(qvalue_network=critic).out_keys
+        ['loss_qvalue', 'td_error']
+    """
 
     qvalue_network: Any = MISSING
     """Writes action_value [*B, A]."""
@@ -242,7 +319,15 @@ class IntraOptionQLossConfig(LossComponentConfig):
 
 @dataclass
 class OptionTerminationLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.OptionTerminationLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.OptionTerminationLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import TerminationNetwork
+        >>> instantiate(OptionTerminationLossConfig(_partial_=True))(
+        ...     termination_network=TerminationNetwork(2, 3, in_keys=["velocity"])).out_keys
+        ['loss_termination', 'termination_probability', 'option_advantage']
+    """
 
     termination_network: Any = MISSING
     """Writes termination_logits [*B, 1] from entries of the next state and the option skill, e.g. a
@@ -260,7 +345,14 @@ class OptionTerminationLossConfig(LossComponentConfig):
 
 @dataclass
 class SkillPriorLossConfig(LossComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.SkillPriorLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.SkillPriorLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import LearnedSkillPrior
+        >>> instantiate(SkillPriorLossConfig(_partial_=True))(prior=LearnedSkillPrior(3)).out_keys
+        ['loss_skill_prior', 'skill_prior_entropy', 'num_effective_skills']
+    """
 
     prior: Any = MISSING
     """The prior to train, e.g. a LearnedSkillPrior."""

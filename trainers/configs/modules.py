@@ -12,7 +12,16 @@ from torchrl_hmcts.trainers.configs.base import ComponentConfig
 
 @dataclass
 class SkillActorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.SkillActor`."""
+    """Keys of :class:`~torchrl_hmcts.modules.SkillActor`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.data import Categorical
+        >>> instantiate(SkillActorConfig(
+        ...     in_features=2, num_skills=3, in_keys=["velocity"], _partial_=True))(
+        ...     action_spec=Categorical(4)).num_skills
+        3
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys."""
@@ -38,7 +47,16 @@ class SkillActorConfig(ComponentConfig):
 
 @dataclass
 class GaussianSkillActorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.GaussianSkillActor`."""
+    """Keys of :class:`~torchrl_hmcts.modules.GaussianSkillActor`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.data import Bounded
+        >>> instantiate(GaussianSkillActorConfig(
+        ...     in_features=2, num_skills=3, in_keys=["velocity"], _partial_=True))(
+        ...     action_spec=Bounded(-1, 1, [2])).num_skills
+        3
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys."""
@@ -64,7 +82,14 @@ class GaussianSkillActorConfig(ComponentConfig):
 
 @dataclass
 class SkillCriticConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.SkillCritic`."""
+    """Keys of :class:`~torchrl_hmcts.modules.SkillCritic`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SkillCriticConfig(
+        ...     in_features=2, num_actions=4, num_skills=3, in_keys=["velocity"])).out_keys
+        ['action_value']
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys."""
@@ -89,7 +114,14 @@ class SkillCriticConfig(ComponentConfig):
 
 @dataclass
 class SkillActionCriticConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.SkillActionCritic`."""
+    """Keys of :class:`~torchrl_hmcts.modules.SkillActionCritic`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SkillActionCriticConfig(
+        ...     in_features=2, action_features=2, num_skills=3, in_keys=["velocity"])).in_keys
+        ['velocity', 'action', 'skill']
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys, without the action."""
@@ -116,7 +148,13 @@ class SkillActionCriticConfig(ComponentConfig):
 
 @dataclass
 class SkillDiscriminatorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.SkillDiscriminator`."""
+    """Keys of :class:`~torchrl_hmcts.modules.SkillDiscriminator`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SkillDiscriminatorConfig(in_features=2, num_skills=3)).out_keys
+        ['skill_logits']
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys."""
@@ -135,7 +173,13 @@ class SkillDiscriminatorConfig(ComponentConfig):
 
 @dataclass
 class SkillEncoderConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.SkillEncoder`."""
+    """Keys of :class:`~torchrl_hmcts.modules.SkillEncoder`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SkillEncoderConfig(in_features=2, num_skills=3)).out_keys
+        ['representation']
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys."""
@@ -156,7 +200,14 @@ class SkillEncoderConfig(ComponentConfig):
 
 @dataclass
 class SkillDynamicsConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.SkillDynamics`."""
+    """Keys of :class:`~torchrl_hmcts.modules.SkillDynamics`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SkillDynamicsConfig(
+        ...     in_features=2, target_features=2, num_skills=3)).out_keys
+        ['skill_loc', 'skill_scale']
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys."""
@@ -190,7 +241,17 @@ class SkillDynamicsConfig(ComponentConfig):
 
 @dataclass
 class SkillPolicyConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.SkillPolicy`."""
+    """Keys of :class:`~torchrl_hmcts.modules.SkillPolicy`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.modules import SkillActor
+        >>> actor = SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"])
+        >>> instantiate(SkillPolicyConfig(deterministic=True, _partial_=True))(
+        ...     actor=actor).deterministic
+        True
+    """
 
     actor: Any = MISSING
     """The actor whose parameters are used; later updates are seen."""
@@ -203,7 +264,13 @@ class SkillPolicyConfig(ComponentConfig):
 
 @dataclass
 class FixedSkillPriorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.FixedSkillPrior`."""
+    """Keys of :class:`~torchrl_hmcts.modules.FixedSkillPrior`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(FixedSkillPriorConfig(num_skills=4)).probs()
+        tensor([0.2500, 0.2500, 0.2500, 0.2500])
+    """
 
     num_skills: int = MISSING
     """Number of skills Z."""
@@ -214,7 +281,13 @@ class FixedSkillPriorConfig(ComponentConfig):
 
 @dataclass
 class LearnedSkillPriorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.LearnedSkillPrior`."""
+    """Keys of :class:`~torchrl_hmcts.modules.LearnedSkillPrior`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(LearnedSkillPriorConfig(num_skills=4)).num_skills
+        4
+    """
 
     num_skills: int = MISSING
     """Number of skills Z."""
@@ -225,7 +298,13 @@ class LearnedSkillPriorConfig(ComponentConfig):
 
 @dataclass
 class GrowingSkillPriorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.GrowingSkillPrior`."""
+    """Keys of :class:`~torchrl_hmcts.modules.GrowingSkillPrior`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(GrowingSkillPriorConfig(num_skills=4)).probs()
+        tensor([0.5000, 0.5000, 0.0000, 0.0000])
+    """
 
     num_skills: int = MISSING
     """Number of skills there is room for, Z."""
@@ -236,7 +315,14 @@ class GrowingSkillPriorConfig(ComponentConfig):
 
 @dataclass
 class TerminationNetworkConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.TerminationNetwork`."""
+    """Keys of :class:`~torchrl_hmcts.modules.TerminationNetwork`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(TerminationNetworkConfig(
+        ...     in_features=2, num_options=3, in_keys=["velocity"])).out_keys
+        ['termination_logits']
+    """
 
     in_features: int = MISSING
     """Summed sizes of the entries in_keys."""
@@ -259,7 +345,15 @@ class TerminationNetworkConfig(ComponentConfig):
 
 @dataclass
 class LearnedTerminationConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.LearnedTermination`."""
+    """Keys of :class:`~torchrl_hmcts.modules.LearnedTermination`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import TerminationNetwork
+        >>> instantiate(LearnedTerminationConfig(_partial_=True))(
+        ...     network=TerminationNetwork(2, 3, in_keys=["velocity"])).in_keys
+        ['velocity', 'skill', 'duration']
+    """
 
     network: Any = MISSING
     """Writes logits [*B, 1], e.g. a TerminationNetwork, or a TensorDictSequential of what computes
@@ -280,7 +374,13 @@ class LearnedTerminationConfig(ComponentConfig):
 
 @dataclass
 class StallTerminationConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.modules.StallTermination`."""
+    """Keys of :class:`~torchrl_hmcts.modules.StallTermination`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(StallTerminationConfig(num_steps=3))
+        StallTermination(3)
+    """
 
     num_steps: int = MISSING
     """Base steps N in a row without a change, at least 1."""

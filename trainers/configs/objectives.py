@@ -12,7 +12,15 @@ from torchrl_hmcts.trainers.configs.base import ComponentConfig
 
 @dataclass
 class SkillDiscriminatorLossConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.SkillDiscriminatorLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.SkillDiscriminatorLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import SkillDiscriminator
+        >>> instantiate(SkillDiscriminatorLossConfig(_partial_=True))(
+        ...     discriminator=SkillDiscriminator(2, num_skills=3)).out_keys
+        ['loss_discriminator', 'discriminator_accuracy']
+    """
 
     discriminator: Any = MISSING
     """Reads its in_keys and writes skill_logits [*B, Z], e.g. a SkillDiscriminator."""
@@ -27,7 +35,15 @@ class SkillDiscriminatorLossConfig(ComponentConfig):
 
 @dataclass
 class SkillDynamicsLossConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.SkillDynamicsLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.SkillDynamicsLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import SkillDynamics
+        >>> instantiate(SkillDynamicsLossConfig(_partial_=True))(
+        ...     dynamics=SkillDynamics(2, 2, num_skills=3)).in_keys
+        ['skill', 'position', ('next', 'position')]
+    """
 
     dynamics: Any = MISSING
     """Reads its in_keys of a state and writes skill_loc and skill_scale, both [*B, Z, D]: mean and
@@ -44,7 +60,15 @@ class SkillDynamicsLossConfig(ComponentConfig):
 
 @dataclass
 class METRAEncoderLossConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.METRAEncoderLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.METRAEncoderLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import SkillEncoder
+        >>> instantiate(METRAEncoderLossConfig(_partial_=True))(
+        ...     encoder=SkillEncoder(2, num_skills=3)).out_keys
+        ['loss_encoder', 'loss_dual', 'latent_distance', 'dual']
+    """
 
     encoder: Any = MISSING
     """Reads its in_keys and writes representation [*B, Z], e.g. a SkillEncoder."""
@@ -63,7 +87,15 @@ class METRAEncoderLossConfig(ComponentConfig):
 
 @dataclass
 class LSDEncoderLossConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.objectives.LSDEncoderLoss`."""
+    """Keys of :class:`~torchrl_hmcts.objectives.LSDEncoderLoss`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import SkillEncoder, SpectralLinear
+        >>> encoder = SkillEncoder(2, num_skills=3, linear=SpectralLinear)
+        >>> instantiate(LSDEncoderLossConfig(_partial_=True))(encoder=encoder).out_keys
+        ['loss_encoder', 'latent_distance']
+    """
 
     encoder: Any = MISSING
     """Reads its in_keys and writes representation [*B, Z]; 1-Lipschitz, e.g."""

@@ -12,7 +12,14 @@ from torchrl_hmcts.trainers.configs.base import ComponentConfig
 
 @dataclass
 class MCTSPlannerConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.MCTSPlanner`."""
+    """Keys of :class:`~torchrl_hmcts.planners.MCTSPlanner`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> instantiate(MCTSPlannerConfig(gamma=0.9, _partial_=True))(env=ChainEnv()).gamma
+        0.9
+    """
 
     env: Any = MISSING
     """The macro environment as simulator: any env under an OptionTransform, or any env with a
@@ -69,7 +76,13 @@ class MCTSPlannerConfig(ComponentConfig):
 
 @dataclass
 class UCTConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.UCT`."""
+    """Keys of :class:`~torchrl_hmcts.planners.UCT`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(UCTConfig(c=0.5))
+        UCT(c=0.5)
+    """
 
     c: float = 1.0
     """Exploration constant, in units of the return."""
@@ -78,7 +91,13 @@ class UCTConfig(ComponentConfig):
 
 @dataclass
 class PUCTConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.PUCT`."""
+    """Keys of :class:`~torchrl_hmcts.planners.PUCT`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(PUCTConfig(c=2.0))
+        PUCT(c=2.0, unvisited_value=0.0, normalize=None, c_base=None)
+    """
 
     c: float = 1.25
     """Exploration constant, in units of Q."""
@@ -95,7 +114,13 @@ class PUCTConfig(ComponentConfig):
 
 @dataclass
 class GumbelConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.Gumbel`."""
+    """Keys of :class:`~torchrl_hmcts.planners.Gumbel`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(GumbelConfig(max_considered=4))
+        Gumbel(max_considered=4, c_visit=50.0, c_scale=0.1, scale=1.0)
+    """
 
     max_considered: int = 16
     """Options considered at the root."""
@@ -110,7 +135,13 @@ class GumbelConfig(ComponentConfig):
 
 @dataclass
 class RadiusNoveltyConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.RadiusNovelty`."""
+    """Keys of :class:`~torchrl_hmcts.planners.RadiusNovelty`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(RadiusNoveltyConfig(key="position", radius=0.6)).radius
+        0.6
+    """
 
     key: Any = MISSING
     """Entry or entries of the simulator's state or observation, [*B, f]."""
@@ -131,7 +162,13 @@ class RadiusNoveltyConfig(ComponentConfig):
 
 @dataclass
 class WidthNoveltyConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.WidthNovelty`."""
+    """Keys of :class:`~torchrl_hmcts.planners.WidthNovelty`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(WidthNoveltyConfig(key="position")).in_keys
+        ['position']
+    """
 
     key: Any = MISSING
     """Entry or entries of the simulator's state or observation, [*B, f], of an integer type or
@@ -143,35 +180,65 @@ class WidthNoveltyConfig(ComponentConfig):
 
 @dataclass
 class MeanBackupConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.MeanBackup`."""
+    """Keys of :class:`~torchrl_hmcts.planners.MeanBackup`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(MeanBackupConfig())
+        MeanBackup()
+    """
 
     _component_: str = "torchrl_hmcts.planners.MeanBackup"
 
 
 @dataclass
 class MaxBackupConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.MaxBackup`."""
+    """Keys of :class:`~torchrl_hmcts.planners.MaxBackup`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(MaxBackupConfig())
+        MaxBackup()
+    """
 
     _component_: str = "torchrl_hmcts.planners.MaxBackup"
 
 
 @dataclass
 class BestPlanConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.BestPlan`."""
+    """Keys of :class:`~torchrl_hmcts.planners.BestPlan`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(BestPlanConfig())
+        BestPlan()
+    """
 
     _component_: str = "torchrl_hmcts.planners.BestPlan"
 
 
 @dataclass
 class MostVisitedConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.MostVisited`."""
+    """Keys of :class:`~torchrl_hmcts.planners.MostVisited`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(MostVisitedConfig())
+        MostVisited()
+    """
 
     _component_: str = "torchrl_hmcts.planners.MostVisited"
 
 
 @dataclass
 class HighestValueConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.HighestValue`."""
+    """Keys of :class:`~torchrl_hmcts.planners.HighestValue`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(HighestValueConfig())
+        HighestValue(random_ties=False)
+    """
 
     random_ties: bool = False
     """Draw among options of equal value, as there are many where rewards are rare, instead of
@@ -181,7 +248,13 @@ class HighestValueConfig(ComponentConfig):
 
 @dataclass
 class SampledVisitsConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.SampledVisits`."""
+    """Keys of :class:`~torchrl_hmcts.planners.SampledVisits`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SampledVisitsConfig(temperature=0.5))
+        SampledVisits(temperature=0.5)
+    """
 
     temperature: float = 1.0
     """Temperature: 0 is the most visited option, 1 draws in proportion to the visits."""
@@ -190,7 +263,13 @@ class SampledVisitsConfig(ComponentConfig):
 
 @dataclass
 class SearchBudgetConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.SearchBudget`."""
+    """Keys of :class:`~torchrl_hmcts.planners.SearchBudget`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SearchBudgetConfig(simulations=64)).simulations
+        64
+    """
 
     expansions: int | None = None
     """Nodes whose options are simulated (with expand="one": options simulated)."""
@@ -211,7 +290,13 @@ class SearchBudgetConfig(ComponentConfig):
 
 @dataclass
 class DirichletNoiseConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.DirichletNoise`."""
+    """Keys of :class:`~torchrl_hmcts.planners.DirichletNoise`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(DirichletNoiseConfig()).fraction
+        0.25
+    """
 
     alpha: float = 0.3
     """Of the Dirichlet distribution, about 10 over the number of options."""
@@ -222,7 +307,13 @@ class DirichletNoiseConfig(ComponentConfig):
 
 @dataclass
 class ProgressiveWideningConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.ProgressiveWidening`."""
+    """Keys of :class:`~torchrl_hmcts.planners.ProgressiveWidening`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(ProgressiveWideningConfig())
+        ProgressiveWidening(k=1.0, alpha=0.5)
+    """
 
     k: float = 1.0
     """Outcomes of an option at its first visit."""
@@ -233,7 +324,13 @@ class ProgressiveWideningConfig(ComponentConfig):
 
 @dataclass
 class TranspositionsConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.Transpositions`."""
+    """Keys of :class:`~torchrl_hmcts.planners.Transpositions`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(TranspositionsConfig(key="position"))
+        Transpositions(['position'])
+    """
 
     key: Any = MISSING
     """Entry or entries that make up the state, e.g. "player_tile"."""
@@ -242,7 +339,16 @@ class TranspositionsConfig(ComponentConfig):
 
 @dataclass
 class ValueEvaluatorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.ValueEvaluator`."""
+    """Keys of :class:`~torchrl_hmcts.planners.ValueEvaluator`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> value = TensorDictModule(torch.nn.Linear(2, 1), ["position"], ["state_value"])
+        >>> instantiate(ValueEvaluatorConfig(_partial_=True))(module=value).in_keys
+        ['position']
+    """
 
     module: Any = MISSING
     """A TensorDictModule whose inputs are entries of the macro environment."""
@@ -253,7 +359,13 @@ class ValueEvaluatorConfig(ComponentConfig):
 
 @dataclass
 class RolloutEvaluatorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.RolloutEvaluator`."""
+    """Keys of :class:`~torchrl_hmcts.planners.RolloutEvaluator`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(RolloutEvaluatorConfig())
+        RolloutEvaluator(policy=None, max_options=10, num_rollouts=1, bootstrap=None)
+    """
 
     policy: Any = None
     """Policy(td) -> probabilities [m, A] of the options, e.g."""
@@ -269,7 +381,15 @@ class RolloutEvaluatorConfig(ComponentConfig):
 
 @dataclass
 class MixedEvaluatorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.MixedEvaluator`."""
+    """Keys of :class:`~torchrl_hmcts.planners.MixedEvaluator`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.planners import RolloutEvaluator
+        >>> instantiate(MixedEvaluatorConfig(weight=0.25, _partial_=True))(
+        ...     first=RolloutEvaluator(8), second=RolloutEvaluator(2)).weight
+        0.25
+    """
 
     first: Any = MISSING
     """First evaluator."""
@@ -282,7 +402,16 @@ class MixedEvaluatorConfig(ComponentConfig):
 
 @dataclass
 class ModulePriorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.ModulePrior`."""
+    """Keys of :class:`~torchrl_hmcts.planners.ModulePrior`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> policy = TensorDictModule(torch.nn.Linear(2, 4), ["position"], ["logits"])
+        >>> instantiate(ModulePriorConfig(_partial_=True))(module=policy).in_keys
+        ['position']
+    """
 
     module: Any = MISSING
     """A TensorDictModule that writes probabilities or logits [m, A]."""
@@ -295,7 +424,17 @@ class ModulePriorConfig(ComponentConfig):
 
 @dataclass
 class PolicyValueEvaluatorConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.PolicyValueEvaluator`."""
+    """Keys of :class:`~torchrl_hmcts.planners.PolicyValueEvaluator`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> both = TensorDictModule(
+        ...     lambda x: (x, x.sum(-1, keepdim=True)), ["position"], ["logits", "state_value"])
+        >>> instantiate(PolicyValueEvaluatorConfig(_partial_=True))(module=both).in_keys
+        ['position']
+    """
 
     module: Any = MISSING
     """Network that writes logits and value of a state."""
@@ -313,7 +452,14 @@ class PolicyValueEvaluatorConfig(ComponentConfig):
 
 @dataclass
 class TorchRLScoreConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.TorchRLScore`."""
+    """Keys of :class:`~torchrl_hmcts.planners.TorchRLScore`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl.modules.mcts import PUCTScore
+        >>> instantiate(TorchRLScoreConfig(_partial_=True))(score_module=PUCTScore(c=1.25))
+        TorchRLScore(PUCTScore)
+    """
 
     score_module: Any = MISSING
     """One of torchrl.modules.mcts, or any module that writes its scores."""
@@ -322,7 +468,16 @@ class TorchRLScoreConfig(ComponentConfig):
 
 @dataclass
 class HierarchicalPolicyConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.HierarchicalPolicy`."""
+    """Keys of :class:`~torchrl_hmcts.planners.HierarchicalPolicy`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> instantiate(HierarchicalPolicyConfig(_partial_=True))(
+        ...     planner=MCTSPlanner(ChainEnv())).out_keys
+        ['action', 'plan', 'plan_length', 'plan_step', 'num_plans']
+    """
 
     planner: Any = MISSING
     """The manager."""
@@ -341,7 +496,16 @@ class HierarchicalPolicyConfig(ComponentConfig):
 
 @dataclass
 class ModelBasedControlConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.ModelBasedControl`."""
+    """Keys of :class:`~torchrl_hmcts.planners.ModelBasedControl`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> instantiate(ModelBasedControlConfig(_partial_=True))(
+        ...     planner=MCTSPlanner(ChainEnv())).out_keys
+        ['action', 'plan', 'plan_length', 'plan_step', 'num_plans']
+    """
 
     planner: Any = MISSING
     """Over the model, a macro env that can be set to any state."""
@@ -359,7 +523,12 @@ class ModelBasedControlConfig(ComponentConfig):
 
 @dataclass
 class GoalPlannerConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.GoalPlanner`."""
+    """Keys of :class:`~torchrl_hmcts.planners.GoalPlanner`.
+
+    Example:
+        >>> GoalPlannerConfig(goal_key="place").goal_key
+        'place'
+    """
 
     planner: Any = MISSING
     """The manager, over the macro environment."""
@@ -375,7 +544,13 @@ class GoalPlannerConfig(ComponentConfig):
 
 @dataclass
 class TreeRolloutConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.planners.TreeRollout`."""
+    """Keys of :class:`~torchrl_hmcts.planners.TreeRollout`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(TreeRolloutConfig())
+        TreeRollout(max_options=10)
+    """
 
     max_options: int = 10
     """Options of a rollout at most."""

@@ -12,7 +12,12 @@ from torchrl_hmcts.trainers.configs.base import ComponentConfig
 
 @dataclass
 class A3CTrainerConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.trainers.A3CTrainer`."""
+    """Keys of :class:`~torchrl_hmcts.trainers.A3CTrainer`.
+
+    Example:
+        >>> A3CTrainerConfig(total_frames=1_000).total_frames
+        1000
+    """
 
     make_env: Any = MISSING
     """make_env() -> EnvBase of any batch shape, [] or [*B] for copies that each learner plays at
@@ -71,7 +76,12 @@ class A3CTrainerConfig(ComponentConfig):
 
 @dataclass
 class DIAYNTrainerConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.trainers.DIAYNTrainer`."""
+    """Keys of :class:`~torchrl_hmcts.trainers.DIAYNTrainer`.
+
+    Example:
+        >>> DIAYNTrainerConfig(seed=3).seed
+        3
+    """
 
     env: Any = MISSING
     """Env under SkillTransform and whatever the objective reads (e.g."""
@@ -119,7 +129,12 @@ class DIAYNTrainerConfig(ComponentConfig):
 
 @dataclass
 class HMCTSTrainerConfig(ComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.trainers.HMCTSTrainer`."""
+    """Keys of :class:`~torchrl_hmcts.trainers.HMCTSTrainer`.
+
+    Example:
+        >>> HMCTSTrainerConfig(seed=3).seed
+        3
+    """
 
     make_env: Any = MISSING
     """Returns a fresh base env in which plans are carried out, stateless (batch_locked=False), e.g.

@@ -12,7 +12,16 @@ from torchrl_hmcts.trainers.configs.base import TransformComponentConfig
 
 @dataclass
 class OptionTransformConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.OptionTransform`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.OptionTransform`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from tensordict.nn import TensorDictModule
+        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+        >>> instantiate(OptionTransformConfig(num_options=4, max_steps=20, _partial_=True))(
+        ...     worker=worker).max_steps
+        20
+    """
 
     worker: Any = MISSING
     """Reads observation or state entries and skill_key, writes the env's action."""
@@ -42,7 +51,13 @@ class OptionTransformConfig(TransformComponentConfig):
 
 @dataclass
 class SkillTransformConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.SkillTransform`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.SkillTransform`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(SkillTransformConfig(num_skills=4)).num_skills
+        4
+    """
 
     num_skills: int = MISSING
     """Number of skills Z."""
@@ -61,7 +76,15 @@ class SkillTransformConfig(TransformComponentConfig):
 
 @dataclass
 class SubgoalTransformConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.SubgoalTransform`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.SubgoalTransform`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> import torch
+        >>> instantiate(SubgoalTransformConfig(num_goals=2, _partial_=True))(
+        ...     planner=lambda td: (td["position"].unsqueeze(1) + 1, torch.ones(len(td)))).num_goals
+        2
+    """
 
     planner: Any = MISSING
     """The manager. planner(td [m]) -> (goals [m, L, D], lengths [m]), or an object with a method
@@ -109,7 +132,13 @@ class SubgoalTransformConfig(TransformComponentConfig):
 
 @dataclass
 class DisplacementTransformConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.DisplacementTransform`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.DisplacementTransform`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(DisplacementTransformConfig()).out_keys
+        ['displacement', 'origin']
+    """
 
     in_key: Any = "position"
     """Entry [*B, D] to measure."""
@@ -124,7 +153,16 @@ class DisplacementTransformConfig(TransformComponentConfig):
 
 @dataclass
 class SkillRewardConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.SkillReward`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.SkillReward`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import SkillDiscriminator
+        >>> from torchrl_hmcts.objectives import SkillDiscriminatorLoss
+        >>> objective = SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=3))
+        >>> instantiate(SkillRewardConfig(_partial_=True))(objective=objective).intrinsic_coeff
+        1.0
+    """
 
     objective: Any = MISSING
     """Gives the reward, e.g. loss.objective of a DiscreteSkillSACLoss."""
@@ -139,7 +177,15 @@ class SkillRewardConfig(TransformComponentConfig):
 
 @dataclass
 class DIAYNRewardConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.DIAYNReward`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.DIAYNReward`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import SkillDiscriminator
+        >>> instantiate(DIAYNRewardConfig(num_skills=3, _partial_=True))(
+        ...     discriminator=SkillDiscriminator(2, num_skills=3)).reward_key
+        'reward'
+    """
 
     discriminator: Any = MISSING
     """Writes the logits [*B, Z] of q(z | s') from its in_keys, which are read from the "next" part
@@ -163,7 +209,15 @@ class DIAYNRewardConfig(TransformComponentConfig):
 
 @dataclass
 class SkillMaskTransformConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.SkillMaskTransform`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.SkillMaskTransform`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> from torchrl_hmcts.modules import FixedSkillPrior
+        >>> instantiate(SkillMaskTransformConfig(_partial_=True))(
+        ...     prior=FixedSkillPrior(3)).out_keys
+        ['action_mask']
+    """
 
     prior: Any = MISSING
     """Over the skills, one per option, Z."""
@@ -174,7 +228,13 @@ class SkillMaskTransformConfig(TransformComponentConfig):
 
 @dataclass
 class StallTransformConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.StallTransform`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.StallTransform`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(StallTransformConfig()).out_keys
+        ['stalled_steps']
+    """
 
     in_key: Any = "position"
     """Entry [*B, ...] that should move."""
@@ -188,7 +248,13 @@ class StallTransformConfig(TransformComponentConfig):
 
 @dataclass
 class OptionRecorderConfig(TransformComponentConfig):
-    """Keys of :class:`~torchrl_hmcts.transforms.OptionRecorder`."""
+    """Keys of :class:`~torchrl_hmcts.transforms.OptionRecorder`.
+
+    Example:
+        >>> from hydra.utils import instantiate
+        >>> instantiate(OptionRecorderConfig(keys=["velocity", "action"])).position_key
+        'position'
+    """
 
     keys: Any = MISSING
     """Entries of a base transition to store, e.g. the in_keys of the loss: "velocity", "action",

@@ -144,8 +144,17 @@ def find_experiment(name: str) -> Experiment:
     Args:
         name: one of ``EXPERIMENTS``.
 
+    Returns:
+        Where its configuration, its run and its evaluation are.
+
     Raises:
         ValueError: if there is none of that name; the nearest are named.
+
+    Example:
+        >>> find_experiment("labmaz")
+        Traceback (most recent call last):
+        ...
+        ValueError: Unknown experiment 'labmaz'. Did you mean: labmaze...
     """
     if name not in EXPERIMENTS:
         near = difflib.get_close_matches(name, EXPERIMENTS, n=3, cutoff=0.4) or EXPERIMENTS

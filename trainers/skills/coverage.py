@@ -114,6 +114,7 @@ class StateCoverage(TrainerHookBase):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Goes on from what :meth:`state_dict` returned."""
         total, recent = (state_dict[name].numpy(force=True) for name in ("total", "recent"))
         self._size = total.shape[1]
         self._total = set(_as_bytes(total))

@@ -345,6 +345,7 @@ class GrowSkills(TrainerHookBase):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Goes on from what :meth:`state_dict` returned."""
         self.prior.load_state_dict(state_dict["prior"])
         self.finished = bool(state_dict["finished"])
         self._changed_at = int(state_dict["changed_at"])

@@ -27,6 +27,9 @@ class MazeView(TensorDictModuleBase):
     within the tile (2, from -1 to 1), the velocity (2) and the walls of the surrounding
     ``(2 reach + 1) ** 2`` tiles (1 is solid, as is all outside).
 
+    Raises:
+        ValueError: if ``reach`` is negative.
+
     Example:
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
         >>> env = WaterworldMazeEnv()
@@ -53,6 +56,7 @@ class MazeView(TensorDictModuleBase):
     _offsets: Tensor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the view of each row, ``[*B, F]``."""
         position = tensordict.get("position")
         tile = position.long()
         _, height, width = self._shape

@@ -38,6 +38,9 @@ _EPISODE_STEPS = 200  # base steps in a maze before the next one
 class TerminationConfig:
     """How a termination is learned.
 
+    Raises:
+        ValueError: if a number is below 1, or ``every`` is above ``option_steps``.
+
     Example:
         >>> TerminationConfig(seed=1).base_steps
         20000

@@ -21,8 +21,18 @@ from torchrl_hmcts.trainers.waterworld.agents import play_mazes
 class GoalTrack:
     """One episode to draw: where the player was, and the plans it was given.
 
-    ``positions`` is float ``[L + 1, 2]``; ``plans`` maps the base step at which a plan was made to
-    its goals, float ``[G, 2]``; ``goal_index`` (int ``[L + 1]``) is the goal that was current.
+    Attributes:
+        positions (array): float ``[L + 1, 2]``, before and after each base step, in tiles.
+        plans (dict): goals of each plan, float ``[G, 2]``, by the base step at which it was made.
+        goal_index (array): int ``[L + 1]``, which goal of its plan was current.
+        solved (bool): whether the target was reached.
+
+    Example:
+        >>> import numpy as np
+        >>> plans = {0: np.array([[1.5, 0.5], [2.5, 0.5]])}
+        >>> track = GoalTrack(np.zeros((9, 2)), plans, np.zeros(9, int), solved=False)
+        >>> track.plan_at(8)[0].tolist()
+        [1.5, 0.5]
     """
 
     positions: np.ndarray
@@ -45,11 +55,22 @@ class GoalTrack:
 
 @dataclass
 class GoalEpisodes:
-    """One entry per start, ``[M]``.
+    """Episodes of an agent that follows goals, one entry per start, ``[M]``.
 
-    ``solved`` (bool), ``base_steps``, ``num_plans``, ``num_goals_met``, ``num_divergences``,
-    ``shortest`` (goals of the first plan: tiles to the target; int64), ``returns`` (sum of the
-    worker's rewards) and, where recorded, ``tracks``.
+    Attributes:
+        solved (array): bool, whether the target was reached.
+        base_steps (array): int64, how long the episode was.
+        num_plans, num_goals_met, num_divergences (array): int64, counts of the episode.
+        shortest (array): int64, goals of the first plan: tiles to the target.
+        returns (array): float, sum of the worker's rewards.
+        tracks (list): what was recorded to draw, if anything.
+
+    Example:
+        >>> import numpy as np
+        >>> ones = np.ones(3, dtype=np.int64)
+        >>> episodes = GoalEpisodes(ones > 0, 50 * ones, *[ones] * 3, 5 * ones, ones)
+        >>> episodes.summary()["episodes"]
+        3
     """
 
     solved: np.ndarray

@@ -78,6 +78,7 @@ class ScriptedExpert(TensorDictModuleBase):
         self.out_keys = [self.action_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action of each row, towards its goals."""
         goals = tensordict.get(self.goals_key).unflatten(-1, (-1, 2))  # [*B, K, 2]
         if not self.relative:
             goals = goals - tensordict.get(self.position_key).unsqueeze(-2)
