@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from torchrl_hmcts.arguments import name_all_arguments
-from torchrl_hmcts.envs.atari_goals import ByteGoal, FollowGoals, JoinedWorkers
+from torchrl_hmcts.envs.atari_goals import (
+    ByteGoal,
+    FollowGoals,
+    JoinedWorkers,
+    OccasionalAction,
+)
 from torchrl_hmcts.envs.atari_pool import AtariOptionPool
 from torchrl_hmcts.envs.atari_ram import AtariRAMEnv
 from torchrl_hmcts.envs.atari_workers import OptionWorker, RepeatActions, SharedMLP
@@ -39,6 +44,7 @@ __all__ = [
     "JoinedWorkers",
     "LAB_ACTIONS",
     "LabMazeEnv",
+    "OccasionalAction",
     "OptionWorker",
     "RepeatActions",
     "SharedMLP",

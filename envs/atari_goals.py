@@ -97,6 +97,48 @@ class FollowGoals:
         return self.goals[option].action(ram)
 
 
+class OccasionalAction:
+    """Another worker's options, with one action taken now and then whatever the option.
+
+    Games wait for FIRE, e.g. to serve; a learned worker that has forgotten it waits for ever.
+
+    Args:
+        worker (OptionWorker): whose options they are.
+        action (int): index of the action.
+        probability (float): how often it is taken. Default 0.05.
+
+    Raises:
+        ValueError: if the probability is not from 0 to 1.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_hmcts.envs import OccasionalAction, RepeatActions
+        >>> worker = OccasionalAction(RepeatActions([3]), action=1, probability=0.5)
+        >>> draws = np.random.default_rng(0)
+        >>> [worker.act(np.zeros(128, np.uint8), 0, draws) for _ in range(6)]
+        [3, 1, 1, 1, 3, 3]
+    """
+
+    def __init__(self, worker: OptionWorker, action: int, probability: float = 0.05) -> None:
+        if not 0.0 <= probability <= 1.0:
+            raise ValueError(
+                f"OccasionalAction needs a probability from 0 to 1; got {probability}."
+            )
+        self.worker, self.action, self.probability = worker, int(action), float(probability)
+        self.num_options = worker.num_options
+
+    def act(self, ram: np.ndarray, option: int, generator: np.random.Generator) -> int:
+        """Return the action, or what the worker does."""
+        if generator.random() < self.probability:
+            return self.action
+        return self.worker.act(ram, option, generator)
+
+    def ends(self, ram: np.ndarray, option: int, steps: int) -> bool:
+        """Return whether the worker ends the option; never, if it cannot."""
+        ends: Any = getattr(self.worker, "ends", None)
+        return False if ends is None else bool(ends(ram, option, steps))
+
+
 class JoinedWorkers:
     """The options of several workers, one after the other.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -195,6 +195,9 @@ class AtariOptionPool(EnvBase):
             self._slots = self._processes.slots
         else:
             self._slots = np.zeros(NUM_SLOTS, slot_type(width, run))
+        self.on_step: Callable[[TensorDictBase, TensorDictBase], object] | None = None
+        """Called with what was stepped and what came of it, e.g. to keep what a search simulates
+        (with ``record=True`` the steps inside the options, too)."""
         self._set_specs(width)
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
 
@@ -339,6 +342,8 @@ class AtariOptionPool(EnvBase):
         ends = {**flags, "done": flags["terminated"] | flags["truncated"], "reward": reward}
         for key, value in ends.items():
             result.set(key, torch.from_numpy(value).reshape(*shape, 1))
+        if self.on_step is not None:
+            self.on_step(tensordict, result)
         return result
 
     def _run_slots(self, count: int) -> None:

@@ -139,6 +139,40 @@ class SharedMLP:
                 heads, ``[Z * A, H]`` and ``[Z * A]``: the parameters of a ``SkillMLP``.
         """
         given = [p.detach().to("cpu", torch.float32) for p in parameters]
+        self._check_shapes(given)
+        parts = []
+        for weight, bias in zip(given[:-2:2], given[1:-2:2], strict=True):
+            parts += [weight.t().reshape(-1), bias]
+        heads = given[-2].view(self.num_options, self.num_actions, -1)
+        for weight, bias in zip(heads, given[-1].view(self.num_options, -1), strict=True):
+            parts += [weight.t().reshape(-1), bias]
+        self.weights.copy_(torch.cat(parts))
+
+    @torch.no_grad()
+    def store(self, parameters: Iterable[Tensor]) -> None:
+        """Write the weights into a network, the inverse of :meth:`load`.
+
+        Args:
+            parameters: of a ``SkillMLP`` of the same sizes, overwritten.
+
+        Raises:
+            ValueError: if their shapes are others.
+        """
+        given = list(parameters)
+        self._check_shapes(given)
+        layers, at = [], 0
+        for n, m in zip(self.sizes[:-1], self.sizes[1:], strict=True):
+            layers += [self.weights[at : at + n * m].view(n, m).t(), self.weights[at + n * m :][:m]]
+            at += n * m + m
+        heads = self.weights[at:].view(self.num_options, -1)
+        split = self.sizes[-1] * self.num_actions
+        weight = heads[:, :split].reshape(self.num_options, self.sizes[-1], self.num_actions)
+        layers.append(weight.transpose(1, 2).reshape(-1, self.sizes[-1]))
+        layers.append(heads[:, split:].reshape(-1))
+        for parameter, value in zip(given, layers, strict=True):
+            parameter.copy_(value)
+
+    def _check_shapes(self, given: Sequence[Tensor]) -> None:
         pairs = list(zip(self.sizes[:-1], self.sizes[1:], strict=True))
         pairs.append((self.sizes[-1], self.num_options * self.num_actions))
         wanted = [shape for n, m in pairs for shape in ((m, n), (m,))]
@@ -148,13 +182,6 @@ class SharedMLP:
                 f"{[tuple(p.shape) for p in given]}. Build the network with the same widths, "
                 f"options and actions."
             )
-        parts = []
-        for weight, bias in zip(given[:-2:2], given[1:-2:2], strict=True):
-            parts += [weight.t().reshape(-1), bias]
-        heads = given[-2].view(self.num_options, self.num_actions, -1)
-        for weight, bias in zip(heads, given[-1].view(self.num_options, -1), strict=True):
-            parts += [weight.t().reshape(-1), bias]
-        self.weights.copy_(torch.cat(parts))
 
     def act(self, ram: np.ndarray, option: int, generator: np.random.Generator) -> int:
         """Return an action drawn from the option's policy, or the most probable one."""

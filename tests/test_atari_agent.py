@@ -18,18 +18,12 @@ from torchrl_hmcts.envs import (  # noqa: E402
     FollowGoals,
     JoinedWorkers,
     RepeatActions,
-    SharedMLP,
 )
 from torchrl_hmcts.trainers import (  # noqa: E402
     AtariAgent,
     AtariSearch,
-    DIAYNSource,
-    DistilledSource,
     GoalFinder,
     GoalSearch,
-    Options,
-    RepeatSource,
-    load_options,
 )
 from torchrl_hmcts.trainers.experiments.atari import AtariRun, run_atari  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig  # noqa: E402
@@ -88,27 +82,6 @@ def test_joined_workers_number_their_options_one_after_the_other() -> None:
     assert [joined.ends(None, z, 2) for z in range(3)] == [False, False, True]
     with pytest.raises(ValueError, match="at least one worker; got none"):
         JoinedWorkers([])
-
-
-@pytest.mark.parametrize("kind", ["repeat", "goals", "network", "joined"])
-def test_options_are_built_again_from_what_was_saved(kind) -> None:
-    from torchrl_hmcts.trainers.atari.sources import _plain
-
-    network = SharedMLP(2, 4, hidden=(8,), deterministic=True)
-    network.weights.normal_(generator=torch.Generator().manual_seed(0))
-    workers = {"repeat": [RepeatActions([3, 1])], "goals": [TRACKERS], "network": [network]}
-    workers["joined"] = [w for part in list(workers.values()) for w in part]
-    saved = {"parts": [_plain(w) for w in workers[kind]]}
-    worker = load_options(saved)
-    before = workers[kind][0] if len(workers[kind]) == 1 else JoinedWorkers(workers[kind])
-    assert worker.num_options == before.num_options
-    ram = np.arange(128, dtype=np.uint8)[::-1].copy()
-    for option in range(worker.num_options):
-        drawn = [w.act(ram, option, np.random.default_rng(1)) for w in (worker, before)]
-        if kind in ("repeat", "goals"):
-            assert drawn[0] == drawn[1]
-    with pytest.raises(ValueError, match="kind 'magic' are not known"):
-        load_options({"parts": [{"kind": "magic"}]})
 
 
 def test_the_goals_of_breakout_are_found_without_being_told() -> None:
@@ -193,35 +166,6 @@ def test_trackers_under_a_small_search_keep_the_ball_in_play() -> None:
     assert player.state["lives"].item() == 5 if "lives" in player.state.keys() else True
 
 
-# ------------------------------------------------------------------------------------ sources
-
-
-def test_repeated_actions_are_an_option_each() -> None:
-    options = RepeatSource().find("Breakout", make_pool, seed=0, log=print)
-    assert options.names == ["NOOP", "FIRE", "RIGHT", "LEFT"]
-    assert options.worker.num_options == 4
-
-
-@pytest.mark.parametrize("discriminator", ["state", "displacement"])
-def test_skills_learned_on_the_ram_become_options(discriminator) -> None:
-    source = DIAYNSource(
-        2, 128, skill_steps=8, num_envs=2, hidden=(16,), discriminator=discriminator
-    )
-    options = source.find("Breakout", make_pool, seed=0, log=lambda text: None)
-    assert options.worker.num_options == 2
-    assert options.num_frames == 4 * 128
-    again = load_options(options.saved)
-    assert again.weights.equal(options.worker.weights)
-    assert options.worker.weights.abs().sum() > 0
-    td = make_pool(options.worker, 3).reset().set("option", torch.tensor(1))
-    assert make_pool(options.worker, 3).step(td)["next", "duration"].item() == 3
-
-
-def test_an_unknown_discriminator_is_refused() -> None:
-    with pytest.raises(ValueError, match="'state', 'displacement' or 'controllable'; got 'ram'"):
-        DIAYNSource(discriminator="ram")
-
-
 # ------------------------------------------------------------------------------------ experiment
 
 
@@ -238,10 +182,11 @@ def test_a_short_run_of_two_processes_leaves_its_figures(tmp_path) -> None:
         assert (tmp_path / name).stat().st_size > 100
 
 
-def test_a_run_in_pieces_is_the_run_in_one(tmp_path) -> None:
+@pytest.mark.parametrize("guide", ["none", "prior_value"])
+def test_a_run_in_pieces_is_the_run_in_one(tmp_path, guide) -> None:
     config = AtariConfig(
         frames=9_000, max_episode_frames=1_200, source="repeat", option_steps=10, ratio=3.0,
-        num_processes=0, replant_every=5, seed=4, out=str(tmp_path),
+        num_processes=0, replant_every=5, seed=4, out=str(tmp_path), guide=guide,
     )  # fmt: skip
 
     def nothing() -> None:
@@ -299,21 +244,3 @@ def test_a_config_that_cannot_be_is_refused(wrong, message) -> None:
 def test_an_agent_starts_by_itself() -> None:
     assert agent().play(1).decisions == 1
     assert isinstance(agent().pool.reset(TensorDict(batch_size=[1])), TensorDict)
-
-
-def test_a_network_learns_the_goals_that_rules_carry_out() -> None:
-    class Given:
-        def find(self, game, make_pool, *, seed, log):
-            saved = {"parts": []}
-            return Options(TRACKERS_WITHOUT_FIRE, ["left", "below", "right"], 7, {}, saved)
-
-    source = DistilledSource(Given(), samples=900, epochs=30, hidden=(32,), batch_size=32, lr=3e-3)
-    options = source.find("Breakout", make_pool, seed=0, log=lambda text: None)
-    assert options.names == ["left", "below", "right"]
-    assert options.num_frames > 7
-    assert options.report["distilled_agreement"] > 0.8  # of 4 actions
-    again = load_options(options.saved)
-    again.deterministic = options.worker.deterministic = True
-    ram = np.zeros(128, np.uint8)
-    ram[72], ram[99] = 60, 180
-    assert again.act(ram, 1, None) == options.worker.act(ram, 1, None)

@@ -258,6 +258,8 @@ GOOD: dict[str, Good] = {
     ),
     **everything(
         trainers,
+        SearchGuide={"num_options": 3, "hidden": (4,), "buffer_size": 8},
+        OptionGoals={"goals": [0, 2]},
         AtariSearch={},
         GoalSearch={},
         DemoConfig={},
@@ -316,18 +318,23 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(["NoveltyTest", "PlansGoals", "OptionWorker"], "a protocol"),
     **dict.fromkeys(["SkillObjective", "SkillPrior"], "a base class"),
     **dict.fromkeys(["AtariOptionPool", "AtariRAMEnv", "DeepMindLabEnv"], "starts processes"),
-    **dict.fromkeys(["ByteGoal", "FollowGoals", "JoinedWorkers"], "belongs to an Atari game"),
+    **dict.fromkeys(
+        ["ByteGoal", "FollowGoals", "JoinedWorkers", "OccasionalAction"], "belongs to an Atari game"
+    ),
     **dict.fromkeys(
         [
             "AtariAgent",
             "GoalFinder",
+            "ActionSetSource",
             "ActionSource",
             "RepeatSource",
             "GoalSource",
             "DIAYNSource",
             "DistilledSource",
+            "FineTunedSource",
+            "RetrainedSource",
         ],
-        "plays an Atari game: test_atari_agent.py",
+        "plays an Atari game: test_atari_agent.py, test_atari_sources.py",
     ),
     **dict.fromkeys(
         ["AtariProgress", "Candidate", "Options", "Controllability"], "a record of results"

@@ -23,15 +23,19 @@ if TYPE_CHECKING:
         GoalFinder,
         GoalSearch,
     )
+    from torchrl_hmcts.trainers.atari.guide import SearchGuide
+    from torchrl_hmcts.trainers.atari.learned_sources import DIAYNSource, DistilledSource
+    from torchrl_hmcts.trainers.atari.options import Options, WorkerSource, load_options
     from torchrl_hmcts.trainers.atari.sources import (
+        ActionSetSource,
         ActionSource,
-        DIAYNSource,
-        DistilledSource,
         GoalSource,
-        Options,
         RepeatSource,
-        WorkerSource,
-        load_options,
+    )
+    from torchrl_hmcts.trainers.atari.trained_sources import (
+        FineTunedSource,
+        OptionGoals,
+        RetrainedSource,
     )
     from torchrl_hmcts.trainers.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.config import DemoConfig
@@ -72,6 +76,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "A3CTrainer",
+    "ActionSetSource",
     "ActionSource",
     "AtariAgent",
     "AtariProgress",
@@ -86,6 +91,10 @@ __all__ = [
     "ExpertIterationTrainer",
     "GeneratorStates",
     "GoalEpisodes",
+    "FineTunedSource",
+    "OptionGoals",
+    "RetrainedSource",
+    "SearchGuide",
     "GoalFinder",
     "GoalSearch",
     "GoalSource",
@@ -129,20 +138,25 @@ __all__ = [
 # Imported when asked for: the command line answers --help without loading torch.
 _MODULES = {
     "A3CTrainer": "a3c",
+    "ActionSetSource": "atari.sources",
     "ActionSource": "atari.sources",
     "AtariAgent": "atari.agent",
     "AtariProgress": "atari.agent",
     "AtariSearch": "atari.agent",
     "Candidate": "atari.goals",
     "Controllability": "skills.controllability",
-    "DIAYNSource": "atari.sources",
+    "DIAYNSource": "atari.learned_sources",
     "DIAYNTrainer": "diayn",
     "DemoConfig": "config",
-    "DistilledSource": "atari.sources",
+    "DistilledSource": "atari.learned_sources",
     "DurableRotation": "checkpoints",
     "ExpertIterationTrainer": "expert_iteration",
     "GeneratorStates": "resume",
     "GoalEpisodes": "waterworld.goal_episodes",
+    "FineTunedSource": "atari.trained_sources",
+    "OptionGoals": "atari.trained_sources",
+    "RetrainedSource": "atari.trained_sources",
+    "SearchGuide": "atari.guide",
     "GoalFinder": "atari.goals",
     "GoalSearch": "atari.goals",
     "GoalSource": "atari.sources",
@@ -153,7 +167,7 @@ _MODULES = {
     "LearnerError": "asynchronous.learner_processes",
     "MazeNetwork": "waterworld.networks",
     "MazeView": "skills.hindsight",
-    "Options": "atari.sources",
+    "Options": "atari.options",
     "RepeatSource": "atari.sources",
     "ResumableTrainer": "resume",
     "RunningEpisodes": "resume",
@@ -166,10 +180,10 @@ _MODULES = {
     "TerminationConfig": "skills.termination",
     "TerminationResult": "skills.termination",
     "TilePlanner": "waterworld.goal_planning",
-    "WorkerSource": "atari.sources",
+    "WorkerSource": "atari.options",
     "collect_option_steps": "skills.termination",
     "learn_termination": "skills.termination",
-    "load_options": "atari.sources",
+    "load_options": "atari.options",
     "make_goal_env": "waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
     "make_skill_optimizer": "diayn",

@@ -26,6 +26,7 @@ from torchrl_hmcts.planners import (
     TreeRollout,
     WidthNovelty,
 )
+from torchrl_hmcts.trainers.atari.guide import SearchGuide
 
 
 @name_arguments
@@ -77,8 +78,10 @@ class AtariSearch:
         """Simulated base steps of a decision."""
         return max(1, round(self.ratio * option_steps))
 
-    def planner(self, pool: AtariOptionPool, seed: int) -> MCTSPlanner:
-        """Build the planner over a pool's options."""
+    def planner(
+        self, pool: AtariOptionPool, seed: int, guide: SearchGuide | None = None
+    ) -> MCTSPlanner:
+        """Build the planner over a pool's options, which a network may guide."""
         rollout = TreeRollout(self.rollout_options) if self.rollout_options else None
         puct = self.tree_policy == "puct"
         return MCTSPlanner(
@@ -87,6 +90,8 @@ class AtariSearch:
             backup=MaxBackup() if puct else MeanBackup(),
             expand="one",
             rollout=rollout,
+            option_prior=None if guide is None else guide.prior,
+            leaf_evaluator=None if guide is None else guide.value,
             leaves_per_wave=self.leaves_per_wave,
             novelty=WidthNovelty("ram") if self.width_novelty else None,
             final_choice=HighestValue(random_ties=True),
@@ -137,6 +142,7 @@ class AtariAgent:
         pool (AtariOptionPool): simulator of the options.
         search (AtariSearch): how to search.
         play_in (AtariOptionPool, optional): where to play. Default: in ``pool``.
+        guide (SearchGuide, optional): learns from the searches and guides those after them.
         replant_every (int): decisions between trees planted anew. Default 100.
         seed (int): of the searches.
 
@@ -163,6 +169,7 @@ class AtariAgent:
         search: AtariSearch | None = None,
         *,
         play_in: AtariOptionPool | None = None,
+        guide: SearchGuide | None = None,
         replant_every: int = 100,
         seed: int = 0,
     ) -> None:
@@ -175,7 +182,10 @@ class AtariAgent:
             )
         self.pool, self.real = pool, pool if play_in is None else play_in
         self.settings = AtariSearch() if search is None else search
-        self.planner = self.settings.planner(pool, seed)
+        self.guide = guide
+        self.planner = self.settings.planner(pool, seed, guide)
+        if guide is not None and "ram" not in self.planner.simulator.kept_keys:
+            self.planner.simulator.keep(["ram"])
         self.replant_every = replant_every
         self.seed = seed
         self.greatest_reward = 0.0
@@ -239,6 +249,8 @@ class AtariAgent:
         progress.options[int(option)] += 1
         progress.done = bool(after["done"].any())
         self._learn_scale(search)
+        if self.guide is not None:
+            self.guide.learn(search, self.greatest_reward)
         self.state = after.select("emulator_state", "ram", "observation", strict=False)
         if not progress.done and self.real is self.pool and self.settings.reuse:
             self.planner.advance(search, option, self.state, seed=seed)
@@ -261,10 +273,13 @@ class AtariAgent:
             },
             "greatest_reward": self.greatest_reward,
             "state": None if self.state is None else self.state["emulator_state"].clone(),
+            "guide": None if self.guide is None else self.guide.state_dict(),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from where :meth:`state_dict` was called."""
+        if self.guide is not None and state_dict.get("guide") is not None:
+            self.guide.load_state_dict(state_dict["guide"])
         self.progress = AtariProgress(**state_dict["progress"])
         self.greatest_reward = float(state_dict["greatest_reward"])
         rows, self.state, self._search = state_dict["state"], None, None

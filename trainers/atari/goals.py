@@ -304,12 +304,15 @@ class GoalFinder:
         option_steps: int | None = None,
         real_steps: int | None = None,
         ratio: float | None = None,
+        seed: int | None = None,
     ) -> float:
         """Return the score of a planner's short episode with some options.
 
         Args:
             options: the set to try.
             option_steps, real_steps, ratio: instead of those of the settings.
+            seed: of the start and of the search. Default: the start that ``make_pool`` gives, and
+                the finder's own seed.
         """
         settings = self.settings
         worker = JoinedWorkers([c.worker for c in options])
@@ -317,7 +320,9 @@ class GoalFinder:
             worker, settings.option_steps if option_steps is None else option_steps
         )
         search = _with_ratio(self.search, settings.trial_ratio if ratio is None else ratio)
-        agent = AtariAgent(pool, search, seed=self.seed)
+        if seed is not None:
+            pool.set_seed(seed)
+        agent = AtariAgent(pool, search, seed=self.seed if seed is None else seed)
         steps = settings.trial_steps if real_steps is None else real_steps
         progress = agent.play(max_steps=steps)
         self._spent(pool)

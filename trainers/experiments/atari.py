@@ -18,16 +18,16 @@ from torchrl_hmcts.envs import AtariOptionPool, OptionWorker
 from torchrl_hmcts.envs.atari_emulator import find_game
 from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariProgress, AtariSearch
 from torchrl_hmcts.trainers.atari.goals import GoalSearch
+from torchrl_hmcts.trainers.atari.guide import SearchGuide
+from torchrl_hmcts.trainers.atari.learned_sources import DIAYNSource, DistilledSource
+from torchrl_hmcts.trainers.atari.options import Options, WorkerSource, load_options
 from torchrl_hmcts.trainers.atari.sources import (
+    ActionSetSource,
     ActionSource,
-    DIAYNSource,
-    DistilledSource,
     GoalSource,
-    Options,
     RepeatSource,
-    WorkerSource,
-    load_options,
 )
+from torchrl_hmcts.trainers.atari.trained_sources import FineTunedSource, RetrainedSource
 from torchrl_hmcts.trainers.atari.tuning import Tuned, tune_search
 from torchrl_hmcts.trainers.checkpoints import write_json, write_text
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
@@ -139,14 +139,14 @@ class AtariRun:
         record: bool = False,
         seed: int | None = None,
     ) -> AtariOptionPool:
-        """Make a pool of the game's emulators; to play in if sticky or recorded, else to plan."""
+        """Make a pool of the game's emulators; to play in if sticky, else to plan."""
         config = self.config
         processes = None if config.num_processes < 0 else config.num_processes
         return AtariOptionPool(
             config.game,
             worker,
             max_steps=max_steps,
-            num_processes=0 if sticky or record else processes,
+            num_processes=0 if sticky else processes,
             record=record,
             gamma=config.gamma,
             repeat_action_probability=0.25 if sticky else 0.0,
@@ -256,13 +256,26 @@ class AtariRun:
         if config.source == "repeat":
             return RepeatSource()
         settings = GoalSearch(trial_steps=config.trial_steps, trial_ratio=config.trial_ratio)
+        if config.source == "action_sets":
+            return ActionSetSource(settings, self.search())
         if config.source == "actions":
             return ActionSource(settings, self.search())
-        if config.source.startswith("goals"):
+        family, _, kind = config.source.partition("_")
+        if family == "goals":
             goals = GoalSource(settings, self.search())
-            return DistilledSource(goals) if config.source == "goals_network" else goals
-        kind = config.source.partition("_")[2] or "state"
-        return DIAYNSource(config.num_skills, config.skill_base_steps, discriminator=kind)
+            if not kind:
+                return goals
+            network = DistilledSource(goals)
+            if kind == "network":
+                return network
+            if kind == "fine_tuned":
+                return FineTunedSource(network, config.skill_base_steps)
+            return RetrainedSource(network, round_steps=config.trial_steps)
+        skills, steps = config.num_skills, config.skill_base_steps
+        if kind == "retrained":
+            diayn = DIAYNSource(skills, steps)
+            return RetrainedSource(diayn, round_steps=config.trial_steps, intrinsic_weight=0.1)
+        return DIAYNSource(skills, steps, discriminator=kind or "state")
 
     def search(self) -> AtariSearch:
         """How the agent searches."""
@@ -288,10 +301,19 @@ class AtariRun:
             pool,
             self.search(),
             play_in=real,
+            guide=self._guide(),
             replant_every=config.replant_every,
             seed=config.seed,
         )
         return self.agent
+
+    def _guide(self) -> SearchGuide | None:
+        assert self.options is not None
+        if self.config.guide == "none":
+            return None
+        values = self.config.guide == "prior_value"
+        num_options = self.options.worker.num_options
+        return SearchGuide(num_options, values=values, seed=self.config.seed)
 
     def close(self) -> None:
         """Stop the processes."""

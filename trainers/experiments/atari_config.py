@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 from torchrl_hmcts.arguments import name_arguments
 
+GUIDES = ("none", "prior", "prior_value")
 PROTOCOLS = ("deterministic", "sticky")
 SOURCES = (
-    "goals", "goals_network", "actions", "repeat", "diayn", "diayn_displacement",
-    "diayn_controllable",
+    "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions", "action_sets",
+    "repeat", "diayn", "diayn_displacement", "diayn_controllable", "diayn_retrained",
 )  # fmt: skip
 
 
@@ -37,9 +38,12 @@ class AtariConfig:
     stick with probability 0.25, and the planner is given no random generator)."""
     source: str = "goals"
     """Where options come from: "goals" (found by a probe and trials), "goals_network" (the
-    same, carried out by one network that learned them), "repeat" (one for each action), "actions"
-    (some of these, chosen by trials), "diayn" (the source's worker), "diayn_displacement",
-    "diayn_controllable"."""
+    same, carried out by one network that learned them), "goals_fine_tuned" (that network, trained
+    further by SAC on its goals and the game), "goals_retrained" (the same on what searches
+    simulated, Algorithm 3), "repeat" (one for each action), "actions"
+    (some of these, chosen by trials), "action_sets" (all of these, those that fire or those that do
+    not, chosen by trials), "diayn" (the source's worker), "diayn_displacement",
+    "diayn_controllable" (with other discriminators), "diayn_retrained" (Algorithm 3)."""
     frames: int = 40_000_000
     """Emulated frames in all, the source's 10 million base steps; the last episode is finished."""
     max_episode_frames: int = 108_000
@@ -63,6 +67,9 @@ class AtariConfig:
     """Options of the rollouts that stay in the tree."""
     tree_policy: str = "puct"
     """"puct" (max backup, values scaled to [0, 1]) or "uct" (mean backup), e.g. to compare with."""
+    guide: str = "none"
+    """Whether a network learns from the searches and guides those after them: "none", "prior" or
+    "prior_value"."""
     c: float = 2.0
     """Weight of exploration; for UCT in units of the greatest reward seen."""
     gamma: float = 0.99
@@ -91,6 +98,7 @@ class AtariConfig:
             ("source", self.source, SOURCES),
             ("tune_with", self.tune_with, ("grid", "optuna")),
             ("tree_policy", self.tree_policy, ("puct", "uct")),
+            ("guide", self.guide, GUIDES),
         ):
             if value not in choices:
                 raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
