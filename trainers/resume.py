@@ -79,6 +79,7 @@ class RunningEpisodes:
         return bool(env._supports_set_state or not env.batch_locked)
 
     def state_dict(self) -> dict[str, Any]:
+        """Returns the episodes as they stand: their entries, and what the collector counts."""
         carrier = self.collector._carrier
         state: dict[str, Any] = {
             "batch_size": list(carrier.batch_size),
@@ -89,6 +90,7 @@ class RunningEpisodes:
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Lets the collector go on with the episodes that :meth:`state_dict` returned."""
         if not self.complete:
             raise ValueError(
                 f"{type(self.collector.env).__name__} keeps state of its own, so its episodes "
@@ -148,9 +150,11 @@ class GeneratorStates:
         )
 
     def state_dict(self) -> dict[str, Any]:
+        """Returns the state of every generator, by the path to it."""
         return {path: _get_state(generator) for path, generator in self.generators().items()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Sets the generators to the states that :meth:`state_dict` returned."""
         generators = self.generators()
         missing = sorted(set(state_dict).difference(generators))
         if missing:
@@ -214,6 +218,26 @@ class ResumableTrainer(Trainer):
         ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
             ``save_trainer_file``.
         OSError: if ``save_dir`` cannot be written to.
+
+    Example:
+        >>> import torch
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.modules import QValueActor
+        >>> from torchrl.objectives import DQNLoss
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.trainers import ResumableTrainer
+        >>> env = ChainEnv(length=4)
+        >>> q = QValueActor(torch.nn.Embedding(4, 2), in_keys=["state"], spec=env.action_spec)
+        >>> loss = DQNLoss(q, action_space="categorical", delay_value=False)
+        >>> collector = Collector(
+        ...     env, q, frames_per_batch=8, auto_register_policy_transforms=True)
+        >>> trainer = ResumableTrainer(
+        ...     save_dir="run/checkpoints", collector=collector, total_frames=16, frame_skip=1,
+        ...     optim_steps_per_batch=1, loss_module=loss, progress_bar=False,
+        ...     optimizer=torch.optim.Adam(loss.parameters()))
+        >>> trainer.train()
+        >>> trainer.collected_frames
+        16
     """
 
     def __init__(
