@@ -26,6 +26,9 @@ class ByteGoal:
         raising, lowering, staying: index of the action that raises c, lowers it, leaves it.
         dead_zone: :math:`\delta`, within which nothing is to be done.
 
+    Reference:
+        This project's; goals of a worker as in chapter 3 of the dissertation.
+
     Example:
         >>> import numpy as np
         >>> goal = ByteGoal(controlled=72, target=99, offset=-12, raising=2, lowering=3)
@@ -63,6 +66,9 @@ class FollowGoals:
     Raises:
         ValueError: if there is no goal, a byte is none of the RAM, or the probability is out of
             range.
+
+    Reference:
+        This project's; goals of a worker as in chapter 3 of the dissertation.
 
     Example:
         >>> from torchrl_hmcts.envs import ByteGoal, FollowGoals
@@ -110,6 +116,9 @@ class OccasionalAction:
     Raises:
         ValueError: if the probability is not from 0 to 1.
 
+    Reference:
+        This project's.
+
     Example:
         >>> import numpy as np
         >>> from torchrl_hmcts.envs import OccasionalAction, RepeatActions
@@ -147,6 +156,9 @@ class JoinedWorkers:
 
     Raises:
         ValueError: if there is no worker.
+
+    Reference:
+        This project's.
 
     Example:
         >>> from torchrl_hmcts.envs import JoinedWorkers, RepeatActions

@@ -23,7 +23,18 @@ from torch import Tensor
 
 
 class OptionWorker(Protocol):
-    """What a pool needs of a worker; it may have ``ends(ram, option, steps) -> bool`` too."""
+    """What a pool needs of a worker; it may have ``ends(ram, option, steps) -> bool`` too.
+
+    Example:
+        >>> class LeftOrRight:
+        ...     num_options = 2
+        ...     def act(self, ram, option, generator):
+        ...         return (3, 2)[option]
+        >>> from torchrl_hmcts.envs import AtariOptionPool
+        >>> pool = AtariOptionPool("Breakout", LeftOrRight(), max_steps=4, num_processes=0)
+        >>> pool.num_options
+        2
+    """
 
     num_options: int
 
@@ -38,6 +49,12 @@ class RepeatActions:
     Args:
         actions (int or sequence of int): the index of each option's action; a number means all
             actions below it.
+
+    Raises:
+        ValueError: if there is no action.
+
+    Reference:
+        Braylan et al., "Frame skip is a powerful parameter for learning to play Atari", 2015.
 
     Example:
         >>> from torchrl_hmcts.envs import RepeatActions

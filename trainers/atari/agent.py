@@ -46,6 +46,9 @@ class AtariSearch:
         life_loss_penalty: what a lost life costs in planning; None for the greatest reward of an
             option seen so far.
 
+    Raises:
+        ValueError: if a number is out of range or the tree policy is unknown.
+
     Example:
         >>> AtariSearch(ratio=10).budget(option_steps=20)
         200
@@ -110,6 +113,10 @@ class AtariProgress:
         decisions: options carried out.
         done: the episode is over.
         options: how often each option was carried out.
+
+    Example:
+        >>> AtariProgress(score=3.0, options=[0, 2]).decisions
+        0
     """
 
     score: float = 0.0

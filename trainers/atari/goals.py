@@ -60,6 +60,13 @@ class GoalSearch:
         trial_steps: real base steps of a planner's trial.
         trial_ratio: simulated base steps per real one in a trial.
         option_steps: base steps of an option in a trial.
+
+    Raises:
+        ValueError: if a number is out of range.
+
+    Example:
+        >>> GoalSearch(offsets=(-6, 0, 6)).shortlist
+        6
     """
 
     probe_states: int = 250

@@ -47,6 +47,17 @@ class DIAYNSource:
             since the option began, ``"controllable"`` by how its controllable bytes did.
         num_envs: emulators that play at a time.
         hidden: widths of the shared layers.
+
+    Raises:
+        ValueError: if the discriminator is unknown.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; dissertation, ch. 5.
+
+    Example:
+        >>> from torchrl_hmcts.trainers import DIAYNSource
+        >>> DIAYNSource(num_skills=5, discriminator="displacement").skill_steps
+        40
     """
 
     num_skills: int = 3
@@ -207,6 +218,11 @@ class DistilledSource:
     Reference:
         Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction to
         no-regret online learning", 2011, arXiv 1011.0686.
+
+    Example:
+        >>> from torchrl_hmcts.trainers import DistilledSource, GoalSource
+        >>> DistilledSource(GoalSource(), samples=5_000).hidden
+        (128, 128, 128)
     """
 
     source: WorkerSource

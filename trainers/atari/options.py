@@ -50,6 +50,11 @@ class Options:
         report: what was found on the way, as plain data.
         saved: from which :func:`load_options` builds the worker again: plain data and tensors.
         training: what a learned worker was trained with, for who trains it further; not saved.
+
+    Example:
+        >>> from torchrl_hmcts.envs import RepeatActions
+        >>> Options(RepeatActions(2), ["NOOP", "FIRE"], num_frames=0).report
+        {}
     """
 
     worker: OptionWorker
@@ -61,7 +66,17 @@ class Options:
 
 
 class WorkerSource(Protocol):
-    """What gives a game its options: ``find(game, make_pool, seed=..., log=...)``."""
+    """What gives a game its options: ``find(game, make_pool, seed=..., log=...)``.
+
+    Example:
+        >>> from torchrl_hmcts.envs import RepeatActions
+        >>> from torchrl_hmcts.trainers import DistilledSource, Options
+        >>> class LeftAndRight:
+        ...     def find(self, game, make_pool, *, seed, log):
+        ...         return Options(RepeatActions([2, 3]), ["right", "left"], num_frames=0)
+        >>> DistilledSource(LeftAndRight()).samples
+        20000
+    """
 
     def find(
         self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]

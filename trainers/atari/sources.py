@@ -143,6 +143,17 @@ class GoalSource:
     Attributes:
         settings: how much to try.
         search: the planner of the trials.
+
+    Example:
+        >>> from torchrl_hmcts.envs import AtariOptionPool
+        >>> from torchrl_hmcts.trainers import GoalSearch, GoalSource
+        >>> def make_pool(worker, max_steps):
+        ...     return AtariOptionPool("Breakout", worker, max_steps=max_steps, num_processes=0)
+        >>> small = GoalSearch(probe_states=8, max_goals=4, screen_steps=5, shortlist=2,
+        ...                    min_options=1, options=1, trial_steps=10, trial_ratio=1.0)
+        >>> found = GoalSource(small).find("Breakout", make_pool, seed=0, log=lambda text: None)
+        >>> found.worker.num_options
+        1
     """
 
     settings: GoalSearch = field(default_factory=GoalSearch)
