@@ -23,8 +23,9 @@ def test_every_key_of_an_experiment_has_a_default_and_a_sentence(experiment: Exp
     assert callable(experiment.function)
 
 
-def test_the_list_names_every_experiment(capsys) -> None:
-    assert main(["list"]) == 0
+@pytest.mark.parametrize("words", [["list"], ["list", "experiments"]])
+def test_the_list_names_every_experiment(capsys, words: list[str]) -> None:
+    assert main(words) == 0
     printed = capsys.readouterr().out
     assert all(f"  {name} " in printed for name in EXPERIMENTS)
 

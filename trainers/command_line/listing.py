@@ -16,7 +16,7 @@ def show(words: Sequence[str]) -> int:
         return refuse("list", f"one name at most; got {' '.join(words)!r}.")
     name = words[0] if words else ""
     try:
-        if not name:
+        if name in ("", "experiments"):
             print("experiments (their keys: hmcts list NAME):")
             print(summaries())
             print("\nfigures of the dissertation: hmcts list figures")

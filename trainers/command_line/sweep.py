@@ -24,7 +24,10 @@ def sweep(words: Sequence[str]) -> int:
     try:
         own, rest = split_words(words, _OWN)
         if "experiment" not in own:
-            raise ValueError(f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))}.")
+            raise ValueError(
+                f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))} "
+                "(all: hmcts list)."
+            )
         experiment = find_experiment(own["experiment"])
         space, fixed = parse_space(experiment.config_class, rest, [*_OWN, "log_level"])
         folder = own.get("out", f"runs/sweep_{experiment.name}")

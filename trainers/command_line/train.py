@@ -32,8 +32,8 @@ def train(words: Sequence[str]) -> int:
             return _go_on(resumed[0], rest, own.get("log_level", "info"), line)
         if "experiment" not in own:
             raise ValueError(
-                f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))}, or which run to "
-                "go on with, resume=DIR."
+                f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))} "
+                "(all: hmcts list), or which run to go on with, resume=DIR."
             )
         if resumed:
             raise ValueError(

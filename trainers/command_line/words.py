@@ -10,8 +10,8 @@ from torchrl_hmcts.trainers.config import unknown_key
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 LOG_LEVEL_HELP = (
-    "log_level=debug|info|warning|error: how much is said (default info; from warning on, no "
-    "progress either)."
+    "log_level=debug|info|warning|error: how much is said (default info; with warning\n"
+    "  and error no progress is shown either)."
 )
 
 
