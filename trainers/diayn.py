@@ -23,6 +23,7 @@ from torchrl.trainers import (
 from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, DiscreteSkillSACLoss, SkillObjective
+from torchrl_hmcts.trainers.restarting_collector import CollectorError
 from torchrl_hmcts.trainers.resume import ResumableTrainer
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
 from torchrl_hmcts.trainers.skills.curves import Curves, log_curves
@@ -228,6 +229,18 @@ class DIAYNTrainer(ResumableTrainer):
         coverage.register(self)
         if progress is not None:
             _ProgressHook(self, progress).register(self)
+
+    def train(self) -> None:
+        """Train.
+
+        Raises:
+            CollectorError: if processes that collect died again and again; it names the last
+                checkpoint.
+        """
+        try:
+            super().train()
+        except CollectorError as error:
+            raise CollectorError(f"{error} {self.last_good_checkpoint()}") from error
 
     @property
     def history(self) -> dict[str, list[float]]:

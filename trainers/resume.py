@@ -314,14 +314,17 @@ class ResumableTrainer(Trainer):
                 raise self.not_finite(name, losses.get(name).detach().sum())
         return losses
 
-    def not_finite(self, name: str, value: Any) -> FloatingPointError:
-        """Returns the error of a figure that is not finite, which names the last checkpoint."""
+    def last_good_checkpoint(self) -> str:
+        """Returns a sentence that says how to go on after an error."""
         rotation = self.checkpoint_rotation
         saved = None if rotation is None else rotation.latest()
         if saved is None:
-            again = "There is no checkpoint: pass save_dir to have some."
-        else:
-            again = f"The last good checkpoint is {str(saved)!r}: trainer.load() goes on from it."
+            return "There is no checkpoint: pass save_dir to have some."
+        return f"The last good checkpoint is {str(saved)!r}: trainer.load() goes on from it."
+
+    def not_finite(self, name: str, value: Any) -> FloatingPointError:
+        """Returns the error of a figure that is not finite, which names the last checkpoint."""
+        again = self.last_good_checkpoint()
         return FloatingPointError(
             f"{name} is {float(value)} in update {self._optim_count}, after "
             f"{self.collected_frames} base steps. The update was not applied. {again} Look for "

@@ -38,6 +38,8 @@ def run_experiment(
     except ModuleNotFoundError as error:
         return missing(error)
     except RuntimeError as error:
+        if type(error).__name__ == "CollectorError":
+            return fail(name, f"{error} Or {_going_on(name, config)}")
         if type(error).__name__ != "CheckpointError":  # torchrl's; not worth its import here
             raise
         return fail(name, error)
