@@ -1,14 +1,20 @@
 """The same seed gives the same figures: search and training, with one torch thread and with two.
 
-Elsewhere: train 2 n = train n, load in a new process, train n, for DIAYN (test_trainer_resume.py),
-Algorithm 3 (test_hmcts_trainer.py) and expert iteration (test_expert_iteration.py); the demo's
-figures (test_demo.py); A3C's learner (test_a3c_trainer.py).
+Train 2 n = train n, load in a new process, train n: here for Atari (``python
+tests/test_determinism.py FOLDER`` is the new process); elsewhere for DIAYN
+(test_trainer_resume.py), Algorithm 3 (test_hmcts_trainer.py) and expert iteration
+(test_expert_iteration.py). The demo's figures: test_demo.py; A3C's learner: test_a3c_trainer.py.
+The demo and the experiments set one thread themselves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -111,6 +117,47 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
     return [n for n in a if np.asarray(a[n]).tobytes() != np.asarray(b[n]).tobytes()]
 
 
+HAS_ATARI = importlib.util.find_spec("ale_py") is not None
+needs_atari = pytest.mark.skipif(not HAS_ATARI, reason="the games come with ale-py")
+
+
+def make_atari_run(frames: int, **settings: Any) -> Any:
+    """Skills learned on the RAM, and a search over them; without processes of its own."""
+    from torchrl_hmcts.trainers.experiments.atari import AtariRun
+    from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
+
+    tiny = {"source": "diayn", "num_skills": 2, "skill_base_steps": 320, "option_steps": 10}
+    tiny.update(ratio=3.0, max_episode_frames=1_200, replant_every=5, num_processes=0, seed=4)
+    return AtariRun(AtariConfig(frames=frames, **{**tiny, **settings}))
+
+
+def play_atari(run: Any, stop_after: int = 0) -> dict[str, Any]:
+    """Plays to the end, or to a checkpoint; returns its state but for the times."""
+    saved: list[dict[str, Any]] = []
+
+    def save() -> None:
+        saved.append(run.state_dict())
+        if len(saved) == stop_after:
+            raise KeyboardInterrupt
+
+    if stop_after:
+        with pytest.raises(KeyboardInterrupt):
+            run.play(save, lambda: None)
+    else:
+        run.play(save, lambda: None)
+    run.close()
+    return {key: value for key, value in saved[-1].items() if key != "seconds"}
+
+
+def flat(state: Any, path: str = "") -> dict[str, Any]:
+    """The leaves of nested dicts and lists by their paths."""
+    if isinstance(state, Mapping):
+        return {k: v for key in state for k, v in flat(state[key], f"{path}.{key}").items()}
+    if isinstance(state, (list, tuple)):
+        return {k: v for i, x in enumerate(state) for k, v in flat(x, f"{path}.{i}").items()}
+    return {path: np.asarray(state) if not isinstance(state, (str, type(None))) else str(state)}
+
+
 @pytest.mark.parametrize("run", [train_diayn, train_hmcts, search_options])
 def test_one_thread_and_two_give_the_same_bits(
     run: Callable[[], dict[str, Any]], threads: Callable[[int], None]
@@ -142,3 +189,30 @@ def test_a_search_is_a_function_of_its_seed(parts: dict[str, Any]) -> None:
     one = search_maze(**parts)
     torch.rand(7)
     assert same(one, search_maze(**parts)) == []
+
+
+ATARI_FRAMES = 14_000  # two episodes or three
+
+
+@needs_atari
+def test_an_atari_run_stopped_and_loaded_in_a_new_process_is_the_run_that_never_stopped(
+    tmp_path: Path,
+) -> None:
+    whole = play_atari(make_atari_run(ATARI_FRAMES))
+    half = play_atari(make_atari_run(ATARI_FRAMES), stop_after=5)
+    assert len(half["scores"]) < len(whole["scores"])
+    torch.save({**half, "seconds": 0.0}, tmp_path / "half.pt")
+    subprocess.run([sys.executable, __file__, str(tmp_path)], check=True, timeout=300)
+    resumed = torch.load(tmp_path / "resumed.pt", weights_only=True)
+    assert same(flat(resumed), flat(whole)) == []
+
+
+def go_on_with_atari(folder: Path) -> None:
+    run = make_atari_run(ATARI_FRAMES)
+    run.load_state_dict(torch.load(folder / "half.pt", weights_only=True))
+    torch.save(play_atari(run), folder / "resumed.pt")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    go_on_with_atari(Path(sys.argv[1]))
