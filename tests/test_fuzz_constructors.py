@@ -343,7 +343,7 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(["ContinuousDIAYNLoss"], "SkillSACLoss with a discriminator"),
     **dict.fromkeys(["NStepReturn"], "the arguments of TorchRL's ValueEstimatorBase"),
     **dict.fromkeys(["OptionModelEnv", "TorchRLGymnasiumEnv"], "reads another env's specs first"),
-    **dict.fromkeys(["LearnerError"], "an exception"),
+    **dict.fromkeys(["CollectorError", "LearnerError"], "an exception"),
     **dict.fromkeys(["DurableRotation"], "takes a folder: test_fault_checkpoints.py"),
     **dict.fromkeys(["ResumableTrainer"], "the base of the trainers, which are fuzzed"),
     **dict.fromkeys(

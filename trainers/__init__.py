@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         make_guided_planner,
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
+    from torchrl_hmcts.trainers.restarting_collector import CollectorError
     from torchrl_hmcts.trainers.resume import GeneratorStates, ResumableTrainer, RunningEpisodes
     from torchrl_hmcts.trainers.skills.controllability import (
         Controllability,
@@ -82,6 +83,7 @@ __all__ = [
     "AtariProgress",
     "AtariSearch",
     "Candidate",
+    "CollectorError",
     "Controllability",
     "DIAYNSource",
     "DIAYNTrainer",
@@ -144,6 +146,7 @@ _MODULES = {
     "AtariProgress": "atari.agent",
     "AtariSearch": "atari.agent",
     "Candidate": "atari.goals",
+    "CollectorError": "restarting_collector",
     "Controllability": "skills.controllability",
     "DIAYNSource": "atari.learned_sources",
     "DIAYNTrainer": "diayn",

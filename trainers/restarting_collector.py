@@ -14,7 +14,7 @@ class CollectorError(RuntimeError):
     """Processes that collect died again and again.
 
     Examples:
-        >>> from torchrl_hmcts.trainers.restarting_collector import CollectorError
+        >>> from torchrl_hmcts.trainers import CollectorError
         >>> issubclass(CollectorError, RuntimeError)
         True
     """
