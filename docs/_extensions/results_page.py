@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from results_atari import atari as atari_section
 from results_atari import best
+from results_reliability import RELIABILITY
 from results_tables import ATARI, SECTIONS, Section, table
 
 if TYPE_CHECKING:  # the tests read this module where Sphinx is not installed
@@ -99,7 +100,7 @@ def page(results: Path = RESULTS, curves: dict[str, str] | None = None) -> str:
     """
     listed = commands((results / "README.md").read_text())
     parts, shown = [_HEAD, beside_the_source(results)], set()
-    for heading, sections in {**SECTIONS, **_ATARI}.items():
+    for heading, sections in {**SECTIONS, **_ATARI, "Reliability": RELIABILITY}.items():
         present = [section for section in sections if (results / section.data).exists()]
         if not present:
             continue
