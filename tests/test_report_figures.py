@@ -111,6 +111,13 @@ def test_losses_of_chapter_4_come_from_runs(tmp_path, capsys) -> None:
     assert main(["report", "figure=4.7", *folders, f"out={tmp_path}"]) == 1  # no such curve
 
 
+@pytest.mark.parametrize("name", ["4.6", "4.7", "4.8", "4.9"])
+def test_losses_of_chapter_4_come_from_measured_results(tmp_path, capsys, name: str) -> None:
+    assert main(["report", f"figure={name}", f"out={tmp_path}"]) == 0
+    assert "1 seed(s) of docs/results" in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / f"figure_{name}.png").stat().st_size > 5_000
+
+
 def test_scores_of_a_game_are_drawn_from_runs_and_from_results(tmp_path, capsys) -> None:
     runs = [write_atari(tmp_path / f"r{s}", "Breakout", s) for s in (0, 1)]
     assert main(["report", "figure=5.2", *runs, f"out={tmp_path}/a"]) == 0

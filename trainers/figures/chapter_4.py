@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, load_config
+from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, load_config, read_curves
 from torchrl_hmcts.trainers.figures.curve_panels import common_steps
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
 from torchrl_hmcts.trainers.figures.lab_figures import (
@@ -69,10 +69,15 @@ def draw_skills(sources: Sources, path: Path, name: str) -> str:
 def draw_loss(sources: Sources, path: Path, name: str) -> str:
     """Draw a loss of the worker while it learns: mean, least and largest over the seeds."""
     figure = find_figure(name)
-    runs = [run for run in _alike(sources) if figure.argument in run.curves]
+    runs = [run.curves for run in _alike(sources) if figure.argument in run.curves]
+    measured = sources.result("lab/curves.csv")
+    where = "given runs"
+    if not sources.of("labmaze") and measured is not None:
+        runs = [found for found in [read_curves(measured.parent)] if figure.argument in found]
+        where = "docs/results"
     if not runs:
         raise figure.how_to_get_data("there is no run of labmaze with its curves.")
-    curves = [run.curves[figure.argument] for run in runs]
+    curves = [run[figure.argument] for run in runs]
     steps, values = common_steps(curves)
     width = max(1, len(steps) // 40)
 
@@ -98,8 +103,8 @@ def draw_loss(sources: Sources, path: Path, name: str) -> str:
     shown.savefig(path, dpi=_DPI)
     band = ", band from the least to the largest" if len(runs) > 1 else ""
     return (
-        f"{figure.shows[0].upper()}{figure.shows[1:]}, {len(runs)} seed(s): moving average{band}; "
-        "pale: as it is logged."
+        f"{figure.shows[0].upper()}{figure.shows[1:]}, {len(runs)} seed(s) of {where}: moving "
+        f"average{band}; pale: as it is logged."
     )
 
 

@@ -119,7 +119,7 @@ def _loss(number: int, curve: str, name: str) -> SourceFigure:
         f"4.{number}",
         f"training loss of the worker's {name} (DIAYN)",
         ".chapter_4:draw_loss",
-        "runs of labmaze",
+        "docs/results/lab/curves.csv (seed 0), or runs of labmaze",
         (_LAB_RUNS, f"hmcts report figure=4.{number} runs/labmaze_*"),
         argument=curve,
     )
