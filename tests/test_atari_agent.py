@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -25,7 +26,11 @@ from torchrl_hmcts.trainers import (  # noqa: E402
     GoalFinder,
     GoalSearch,
 )
-from torchrl_hmcts.trainers.experiments.atari import AtariRun, run_atari  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari import (  # noqa: E402
+    AtariRun,
+    evaluate_atari,
+    run_atari,
+)
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig  # noqa: E402
 
 TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)], fire=1)
@@ -223,6 +228,28 @@ def test_a_run_in_pieces_is_the_run_in_one(tmp_path, guide) -> None:
     other = AtariRun(AtariConfig(**{**config.__dict__, "ratio": 4.0}))
     with pytest.raises(ValueError, match="other settings: ratio=4.0 instead of 3.0"):
         other.load_state_dict(saved[-1])
+
+
+@pytest.mark.parametrize("guide", ["none", "prior"])
+def test_a_run_is_evaluated_with_what_it_found_and_learned(tmp_path, monkeypatch, guide) -> None:
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.atari.draw", lambda run, out: {})
+    config = AtariConfig(
+        frames=1_000, max_episode_frames=400, source="repeat", option_steps=10, ratio=1.0,
+        rollout_options=0, num_processes=0, replant_every=5, seed=4, out=str(tmp_path), guide=guide,
+    )  # fmt: skip
+    metrics = run_atari(config)
+    again = evaluate_atari(config)["test"]
+    first = metrics["episodes"][0]
+    if guide == "none":  # a guide knows more now than it did then
+        assert again == {**first, "frames": again["frames"]}
+    assert again["real_frames"] == first["real_frames"] <= 400
+    assert again["real_frames"] < again["frames"] < metrics["frames"] + 400
+    other = dataclasses.replace(config, protocol="sticky", seed=5)
+    assert evaluate_atari(other)["test"]["real_frames"] <= 400
+    with pytest.raises(ValueError, match="out=nowhere is no run"):
+        evaluate_atari(dataclasses.replace(config, out="nowhere"))
+    with pytest.raises(ValueError, match="is a run of Breakout, not of Pong"):
+        evaluate_atari(dataclasses.replace(config, game="Pong"))
 
 
 @pytest.mark.parametrize(

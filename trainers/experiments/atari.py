@@ -104,6 +104,38 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     return metrics
 
 
+def evaluate_atari(config: AtariConfig) -> dict[str, Any]:
+    """Play one episode more with the options, their length and the guide of a run.
+
+    Args:
+        config: of the run, whose folder is ``out``; changed keys (``seed``, ``ratio``,
+            ``protocol``, ``max_episode_frames``, ...) change the episode. With the run's own seed
+            and settings it is the run's first episode again, unless a guide has learned since.
+
+    Returns:
+        The episode (``"test"``): ``score``, ``real_frames``, ``decisions``, and the ``frames``
+        emulated for it.
+
+    Raises:
+        ExperimentError: if there is no run of this game in the folder.
+
+    Reference:
+        Dissertation, chapter 5.
+    """
+    if config.toy:
+        config = dataclasses.replace(config, **TOY)
+    torch.set_num_threads(1)
+    run = AtariRun(dataclasses.replace(config, options_from="", frames=1))
+    run.take_over(Path(config.out), "out")
+    before = run.num_frames
+    try:
+        run.play(lambda: None, lambda: None)
+        row = run.scores[-1]
+    finally:
+        run.close()
+    return {"checkpoint": "run.pt", "test": {**row, "frames": int(row["frames"]) - before}}
+
+
 class AtariRun:
     """A run: options, how they are searched, and the episodes so far.
 
@@ -126,6 +158,7 @@ class AtariRun:
         self.agent: AtariAgent | None = None
         self._frames_before = 0  # of pools that are closed, and of earlier parts of the run
         self._resumed: dict[str, Any] | None = None
+        self._learned: dict[str, Any] | None = None  # what another run's guide knew
         self.seconds = 0.0
 
     # ---------------------------------------------------------------- pools
@@ -171,7 +204,7 @@ class AtariRun:
         config = self.config
         begin = time.perf_counter()
         if self.options is None and config.options_from:
-            self._take_over(Path(config.options_from))
+            self.take_over(Path(config.options_from), "options_from")
         if self.options is None:
             self.options = self._source().find(
                 config.game, self.make_pool, seed=config.seed, log=print
@@ -219,20 +252,32 @@ class AtariRun:
                 agent.begin()
             save()
 
-    def _take_over(self, folder: Path) -> None:
-        """Take options and their length from another run, and what it spent on them."""
+    def take_over(self, folder: Path, key: str) -> None:
+        """Take options, their length and what a guide has learned from another run.
+
+        What it spent on them counts.
+
+        Args:
+            folder: of the run.
+            key: of the configuration that names it, for errors.
+
+        Raises:
+            ExperimentError: if there is no run of this game.
+        """
         path = folder / "checkpoints" / "run.pt"
         if not path.is_file():
-            raise ExperimentError(f"options_from={folder} is no run of this experiment: no {path}.")
+            raise ExperimentError(f"{key}={folder} is no run of this experiment: no {path}.")
         other = torch.load(path, weights_only=True)
         if other["config"]["game"] != self.config.game:
             raise ExperimentError(
-                f"options_from={folder} is a run of {other['config']['game']}, not of "
+                f"{key}={folder} is a run of {other['config']['game']}, not of "
                 f"{self.config.game}, whose actions are others."
             )
         saved = other["options"]
         self.options = Options(load_options(saved["saved"]), **saved)
         self.tuned = Tuned(**other["tuned"])
+        if other["config"].get("guide", "none") == self.config.guide:
+            self._learned = other["agent"].get("guide")
         self._frames_before += self.options.num_frames + self.tuned.num_frames
 
     def _seed_episode(self, agent: AtariAgent) -> None:
@@ -313,7 +358,10 @@ class AtariRun:
             return None
         values = self.config.guide == "prior_value"
         num_options = self.options.worker.num_options
-        return SearchGuide(num_options, values=values, seed=self.config.seed)
+        guide = SearchGuide(num_options, values=values, seed=self.config.seed)
+        if self._learned is not None:
+            guide.load_state_dict(self._learned)
+        return guide
 
     def close(self) -> None:
         """Stop the processes."""

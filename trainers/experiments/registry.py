@@ -122,6 +122,7 @@ EXPERIMENTS = {
             "chapter 5: tree search over options on the RAM of an Atari game",
             ".atari_config:AtariConfig",
             ".atari:run_atari",
+            ".atari:evaluate_atari",
             objective="score_max",
         ),
     )
