@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_hmcts.trainers.experiments.run_folder import read_curves
-from torchrl_hmcts.trainers.figures.atari_results import TABLE_5_1, best_baseline
+from torchrl_hmcts.trainers.figures.atari_results import TABLE_5_1, best_baseline, best_source
 from torchrl_hmcts.trainers.figures.intervals import interquartile_mean
 
 # Human and random scores as in dqn_zoo's atari_data.py.
@@ -34,6 +34,7 @@ HUMAN = {
     "Pong": (14.6, -20.7),
 }
 UCT_SOURCE = "primitive actions, UCT"
+BEST = "the best of each game"
 KEPT = (
     "game", "protocol", "source", "seed", "score_max", "score_final", "score_mean", "episodes",
     "frames", "base_steps", "options", "option_steps", "c", "frames_finding_options",
@@ -92,6 +93,11 @@ def main() -> None:
     groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         groups[row["protocol"], row["source"]].append(row)
+    for protocol in sorted({row["protocol"] for row in rows}):
+        for game in TABLE_5_1:
+            ours = [r for r in rows if r["source"] != UCT_SOURCE and r["protocol"] == protocol]
+            found = best_source([row for row in ours if row["game"] == game])
+            groups[protocol, BEST].extend(found)
     summary = []
     print(
         "| protocol | options | game | seeds | best episode | last episode | frames, all kinds | "
