@@ -235,6 +235,13 @@ def test_the_loss_refuses_what_makes_no_sense(kwargs: dict, message: str) -> Non
         ExpertIterationLoss(two_heads(), **kwargs)
 
 
+@pytest.mark.parametrize("value_coeff", [0.0, 0.5])
+def test_the_value_counts_as_much_as_its_coefficient_says(value_coeff: float) -> None:
+    # Squared errors of 0.2 and 0.1: a mean of 0.025.
+    loss = ExpertIterationLoss(given(LOGITS, [0.8, 0.4]), value_coeff=value_coeff)
+    assert loss(examples())["loss_value"].item() == pytest.approx(value_coeff * 0.025)
+
+
 # --------------------------------------------------------------------------- one call for two heads
 
 

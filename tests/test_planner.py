@@ -330,6 +330,14 @@ def test_several_leaves_per_wave_need_fewer_simulator_calls() -> None:
     assert calls == {1: 7, 4: 3}
 
 
+def test_room_is_made_by_doubling_and_no_more() -> None:
+    tree = SearchTree(2, 3, capacity=4)
+    tree.reserve(4)
+    assert (tree.capacity, tree.nodes.shape, tree.edges.shape) == (4, (2, 4), (2, 4, 3))
+    tree.reserve(9)  # 4, 8, 16
+    assert (tree.capacity, tree.nodes.shape, tree.edges.shape) == (16, (2, 16), (2, 16, 3))
+
+
 @pytest.mark.parametrize("expand", ["one", "all"])
 def test_growing_by_doubling_loses_nothing(expand: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     env = ChainEnv(400)

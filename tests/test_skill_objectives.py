@@ -348,8 +348,9 @@ def test_a_prior_is_a_sequence_or_an_object_of_the_right_size() -> None:
         make_objective("diayn", prior=FixedSkillPrior(4))
     with pytest.raises(ValueError, match="median"):
         make_objective("metra", reduction="median")
-    with pytest.raises(ValueError, match=r"dual_init.*-1"):
-        make_objective("metra", dual_init=-1.0)
+    for dual_init in (-1.0, 0.0):
+        with pytest.raises(ValueError, match=rf"dual_init.*{dual_init}"):
+            make_objective("metra", dual_init=dual_init)
     with pytest.raises(ValueError, match="num_skills="):
         METRAEncoderLoss(SkillNetwork(torch.nn.Identity(), ["x"], "representation"))
     with pytest.raises(ValueError, match="5 skills.*3"):

@@ -26,7 +26,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
     Transpositions,
 )
-from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PRUNED, TERMINAL
+from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PRUNED, REWARDED, TERMINAL
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
 # A binary tree of depth 3: the children of s are 2 s + 1 and 2 s + 2 after 1 and 2 base steps, the
@@ -572,3 +572,33 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
             check_invariants(search, b, exhausted == "revisit")
         if td["done"].any():
             break
+
+
+# ---------------------------------------------------------------------- what is behind the nodes
+
+
+def test_what_was_dropped_is_not_counted() -> None:
+    env = TableEnv(BINARY_TREE, terminal=LEAVES)
+    planner = MCTSPlanner(env, budget=FOREVER)
+    search = planner.search(env.reset())
+    counts = search.statistics()
+    assert (counts["nodes"], counts["rewarded"]) == (15, 4)  # leaves 11 to 14 pay 1 to 4
+    # Below state 1 are 3 and 4, and their leaves 7 to 10, which pay -3 to 0.
+    assert planner.advance(search, torch.tensor([0]).reshape(()), at(env, 1)).item()
+    assert search.tree.num_nodes.tolist() == [7]
+    search.tree.nodes["flags"][0, 7:] |= REWARDED
+    counts = search.statistics()
+    assert (counts["nodes"], counts["rewarded"]) == (7, 0)
+
+
+def test_options_that_come_by_the_root_again_are_followed_through_it() -> None:
+    # 0 -> 1 -> 0 -> 1 by option 0: the second node of state 0 is the twin of the root.
+    table = {(0, 0): (1, 0.0, 1), (0, 1): (2, 0.0, 1), (1, 0): (0, 0.0, 1), (1, 1): (2, 1.0, 1)}
+    env = TableEnv(table, terminal=[2])
+    planner = MCTSPlanner(env, transpositions=Transpositions("state"), budget=FOREVER)
+    search = planner.search(env.reset())
+    below = int(search.tree.edges["child"][0, 0, 0])
+    again = int(search.tree.edges["child"][0, below, 0])
+    assert search.tree.nodes["twin"][0, again] == 0
+    assert planner.advance(search, torch.tensor([0, 0, 0]), at(env, 1)).item()
+    assert search.tree.nodes["visits"][0, 0] > 1  # it is the tree that was searched, not a new one

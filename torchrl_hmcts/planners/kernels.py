@@ -305,7 +305,12 @@ def _descend(nodes, edges, root, s, gumbel, b, n, revisit):
             n = _outcome(nodes, n)
 
 
-@numba.extending.intrinsic
+def _no_hint(intrinsic):
+    """In place of a hint for processors, which plain Python cannot give."""
+    return lambda record: None
+
+
+@(numba.extending.intrinsic if COMPILED else _no_hint)
 def _prefetch(typing_context, record):
     """Ask for the memory of a record; what it holds is needed soon."""
     from numba.core import types
@@ -321,12 +326,6 @@ def _prefetch(typing_context, record):
         return context.get_dummy_value()
 
     return types.none(record), codegen
-
-
-if not COMPILED:
-
-    def _prefetch(record):
-        """Nothing: plain Python gives no hints."""
 
 
 @numba.njit(forceinline=True, error_model="numpy", _nrt=False)
