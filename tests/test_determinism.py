@@ -127,7 +127,7 @@ def make_atari_run(frames: int, **settings: Any) -> Any:
     from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
 
     tiny = {"source": "diayn", "num_skills": 2, "skill_base_steps": 320, "option_steps": 10}
-    tiny.update(ratio=3.0, max_episode_frames=1_200, replant_every=5, num_processes=0, seed=4)
+    tiny.update(ratio=3.0, max_episode_frames=600, replant_every=5, num_processes=0, seed=4)
     return AtariRun(AtariConfig(frames=frames, **{**tiny, **settings}))
 
 
@@ -191,7 +191,7 @@ def test_a_search_is_a_function_of_its_seed(parts: dict[str, Any]) -> None:
     assert same(one, search_maze(**parts)) == []
 
 
-ATARI_FRAMES = 14_000  # two episodes or three
+ATARI_FRAMES = 7_000  # two episodes
 
 
 @needs_atari
@@ -199,7 +199,7 @@ def test_an_atari_run_stopped_and_loaded_in_a_new_process_is_the_run_that_never_
     tmp_path: Path,
 ) -> None:
     whole = play_atari(make_atari_run(ATARI_FRAMES))
-    half = play_atari(make_atari_run(ATARI_FRAMES), stop_after=5)
+    half = play_atari(make_atari_run(ATARI_FRAMES), stop_after=3)
     assert len(half["scores"]) < len(whole["scores"])
     torch.save({**half, "seconds": 0.0}, tmp_path / "half.pt")
     subprocess.run([sys.executable, __file__, str(tmp_path)], check=True, timeout=300)
