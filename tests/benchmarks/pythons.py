@@ -41,6 +41,7 @@ TESTS = (
     "test_contract_transforms.py",
     "test_contract_losses.py",
     "test_contract_envs.py",
+    "test_a3c_loss.py",
     "test_diayn_loss.py",
     "test_skill_objectives.py",
     "test_smdp_estimators.py",

@@ -110,7 +110,10 @@ class NStepReturn(TD1Estimator):
     """
 
     # The accepted keys stay TorchRL's own class: it looks names up in that class alone.
-    default_keys = partial(TD1Estimator._AcceptedKeys, steps_to_next_obs=("next", "duration"))
+    # A partial in a class will become a method: staticmethod keeps it a plain function.
+    default_keys = staticmethod(
+        partial(TD1Estimator._AcceptedKeys, steps_to_next_obs=("next", "duration"))
+    )
 
     @torch.no_grad()
     @dispatch
