@@ -310,6 +310,17 @@ def test_a_worker_is_retrained_on_what_searches_simulated(kind) -> None:
     assert torch.isfinite(weights(after)).all()
 
 
+def test_new_critics_learn_alone_before_a_worker_is_retrained() -> None:
+    before = distilled().find("Breakout", make_pool, seed=0, log=quiet)
+    waiting = RetrainedSource(
+        distilled(), AtariSearch(ratio=2), rounds=1, round_steps=5, option_steps=5, warm_up=1.0
+    )
+    after = waiting.find("Breakout", make_pool, seed=0, log=quiet)
+    torch.testing.assert_close(after.worker.worker.weights, before.worker.worker.weights)
+    with pytest.raises(ValueError, match="0 <= warm_up <= 1; got 2.0"):
+        RetrainedSource(distilled(), warm_up=2.0)
+
+
 # ------------------------------------------------------------------------------ guide
 
 

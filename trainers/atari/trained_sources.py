@@ -294,6 +294,8 @@ class RetrainedSource:
         round_steps: real base steps of a round.
         option_steps: base steps of an option.
         intrinsic_weight, game_weight: :math:`c_i`, :math:`c_e`.
+        warm_up: share of the first round's updates in which new critics learn alone; critics that
+            came with the network need none.
         updates_per_step: updates per base step that S has gained.
         lr: Adam's learning rate.
         buffer_size: transitions of S that are kept.
@@ -317,6 +319,7 @@ class RetrainedSource:
     option_steps: int = 10
     intrinsic_weight: float = 1.0
     game_weight: float = 1.0
+    warm_up: float = 0.75
     updates_per_step: float = 0.125
     lr: float = 3e-4
     buffer_size: int = 100_000
@@ -325,6 +328,8 @@ class RetrainedSource:
         for name in ("rounds", "round_steps", "option_steps", "buffer_size"):
             if getattr(self, name) < 1:
                 raise ValueError(f"RetrainedSource needs {name} >= 1; got {getattr(self, name)}.")
+        if not 0.0 <= self.warm_up <= 1.0:
+            raise ValueError(f"RetrainedSource needs 0 <= warm_up <= 1; got {self.warm_up}.")
         if not self.updates_per_step > 0.0:
             raise ValueError(
                 f"RetrainedSource needs updates_per_step > 0; got {self.updates_per_step}."
@@ -337,6 +342,7 @@ class RetrainedSource:
         found = self.source.find(game, make_pool, seed=seed, log=log)
         network = network_of(found.worker)
         training = found.training
+        warm_up = self.warm_up if training is None else 0.0
         if training is None:
             training = make_goal_training(found, game, seed, gamma=0.95, alpha_init=0.02)
         loss = training.loss
@@ -369,7 +375,10 @@ class RetrainedSource:
             buffer.extend(samples)
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(seed * 10_000 + number)
-                for _ in range(max(1, round(self.updates_per_step * len(samples)))):
+                updates = max(1, round(self.updates_per_step * len(samples)))
+                alone = round(warm_up * updates) if number == 0 else 0
+                for i in range(updates):
+                    _learning_rate(optimizer, "actor", 0.0 if i < alone else self.lr)
                     _update(loss, buffer.sample(), optimizer)
                     updater.step()
             network.load(_actor_parameters(loss))
@@ -447,6 +456,12 @@ def _update(
     total.backward()
     torch.nn.utils.clip_grad_norm_(loss.parameters(), 10.0)
     optimizer.step()
+
+
+def _learning_rate(optimizer: torch.optim.Optimizer, name: str, lr: float) -> None:
+    for group in optimizer.param_groups:
+        if group["name"] == name:
+            group["lr"] = lr
 
 
 def _actor_parameters(loss: DiscreteSkillSACLoss) -> list[Tensor]:
