@@ -151,6 +151,20 @@ def test_training_that_ends_so_names_its_last_checkpoint(tmp_path: Path) -> None
     assert again.collected_frames == TOTAL
 
 
+def test_the_command_line_says_how_to_go_on(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    from torchrl_hmcts.trainers.cli import main
+
+    def dies(config: Any) -> dict:
+        raise CollectorError("A process that collects died (Death).")
+
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.labmaze.run_labmaze", dies)
+    assert main(["train", "experiment=labmaze", f"out={tmp_path}"]) == 1
+    said = capsys.readouterr().err
+    assert "A process that collects died (Death). Or go on with: hmcts train" in said
+    assert f"out={tmp_path} resume=true" in said
+    assert json.loads((tmp_path / "run.json").read_text())["status"] == "failed"
+
+
 def make_trainer(folder: Path, make_collector: Any) -> DIAYNTrainer:
     env = make_training_env(copies=8)
     loss = DIAYNTrainer.make_loss(env, seed=0)
