@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
@@ -187,11 +188,13 @@ def test_an_env_of_a_learned_model_keeps_the_contract_of_a_macro_env() -> None:
 
 
 @pytest.fixture
-def engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The stand-in for DeepMind Lab's module, importable in other processes too."""
     source = Path(__file__).parent / "lab_stand_in.py"
     (tmp_path / "deepmind_lab.py").write_text(source.read_text())
     monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("deepmind_lab", None)  # other tests want it missing
 
 
 LAB = functools.partial(

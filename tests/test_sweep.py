@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy.pool import NullPool
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.config import DemoConfig
@@ -195,7 +196,8 @@ def test_a_folder_of_another_sweep_is_refused(tmp_path, capsys) -> None:
 def test_any_storage_of_optunas_will_do(tmp_path) -> None:
     url = f"sqlite:///{tmp_path}/trials.db"
     assert sweep(tmp_path, "x=[1,2]", "trials=2", f"storage={url}") == 0
-    study = optuna.load_study(study_name=f"parabola-{tmp_path.name}", storage=url)
+    storage = optuna.storages.RDBStorage(url, engine_kwargs={"poolclass": NullPool})
+    study = optuna.load_study(study_name=f"parabola-{tmp_path.name}", storage=storage)
     assert len(study.trials) == 2
     assert not (tmp_path / "journal.log").exists()
 

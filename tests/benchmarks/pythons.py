@@ -140,6 +140,7 @@ def run_tests(environment: Path, source: Path, folder: Path, tests: list[str]) -
     system = after.children_system - before.children_system
     return {
         **found,
+        "test_files": len(tests),
         "tests": count["tests"],
         "passed": count["tests"] - count["failures"] - count["errors"] - count["skipped"],
         "skipped": count["skipped"],

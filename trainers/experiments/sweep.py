@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.storages import BaseStorage, JournalStorage
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.pool import NullPool  # Optuna depends on it
 
 from torchrl_hmcts.trainers.experiments.loggers import observed
 from torchrl_hmcts.trainers.experiments.registry import Experiment
@@ -77,8 +78,10 @@ class Sweep:
         storage: str | BaseStorage
         if self.storage is None:
             storage = JournalStorage(JournalFileBackend(str(self.folder / "journal.log")))
-        else:
+        elif self.storage.startswith("redis"):
             storage = self.storage
+        else:  # no pool: its connections would stay open until they are collected
+            storage = RDBStorage(self.storage, engine_kwargs={"poolclass": NullPool})
         study = optuna.create_study(
             storage=storage,
             study_name=f"{self.experiment.name}-{self.folder.name}",
