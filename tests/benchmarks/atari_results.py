@@ -58,6 +58,9 @@ def read(folder: Path) -> dict[str, Any] | None:
     words = [f"{k}={v}" for k, v in sorted(config.items()) if k not in ("out", "resume")]
     row["command"] = "hmcts train experiment=atari " + " ".join(w for w in words if w[-1] != "=")
     row["versions"] = metrics["versions"]
+    guide = config.get("guide", "none")
+    if guide not in ("none", row["source"].rpartition("=")[2]):
+        row["source"] += f", guide={guide}"
     if row["settings"].get("tree_policy", "puct") == "uct":
         row["source"] = UCT_SOURCE
     curves = read_curves(folder)

@@ -379,10 +379,11 @@ class AtariRun:
         assert self.tuned is not None
         config = self.config
         scores = [row["score"] for row in self.scores]
+        guided = f"guide={config.guide}"
         return {
             "game": config.game,
             "protocol": config.protocol,
-            "source": config.source,
+            "source": config.source if config.guide == "none" else f"{config.source}, {guided}",
             "seed": config.seed,
             "score_max": max(scores),
             "score_final": scores[-1],
