@@ -354,8 +354,9 @@ class TestProcesses:
         )
         with pytest.raises(LearnerError, match="Learner 1 of 2 failed") as caught:
             trainer.train()
-        assert "in configure\n    raise RuntimeError" in str(caught.value)
-        assert "the maze is on fire" in str(caught.value)
+        # Some releases of cloudpickle hide a local function's file, and with it the line itself.
+        assert "in configure\n" in str(caught.value)
+        assert "RuntimeError: the maze is on fire" in str(caught.value)
         assert caught.value.learner == 1
         assert trainer.learners.running == []
         assert make_trainer().load(tmp_path).frames == trainer.frames
