@@ -3,6 +3,7 @@
     python tests/benchmarks/atari_results.py runs/* --out docs/results/atari
 
 Reads the folders that ``hmcts train experiment=atari`` has written, finished ones; runs nothing.
+What ``--out`` has already is kept, but for runs of the same game, protocol, source, seed and ratio.
 Protocols and sources of options are never mixed: a row is a game, a protocol and a source. The
 interquartile mean over games and seeds is given with a stratified bootstrap interval of 95 %
 (Agarwal et al. 2021).
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +22,12 @@ from typing import Any
 import numpy as np
 
 from torchrl_hmcts.trainers.experiments.run_folder import read_curves
-from torchrl_hmcts.trainers.figures.atari_results import TABLE_5_1, best_baseline, best_source
+from torchrl_hmcts.trainers.figures.atari_results import (
+    RUNNING,
+    TABLE_5_1,
+    best_baseline,
+    best_source,
+)
 from torchrl_hmcts.trainers.figures.intervals import interquartile_mean
 
 # Human and random scores as in dqn_zoo's atari_data.py.
@@ -65,11 +72,36 @@ def read(folder: Path) -> dict[str, Any] | None:
         row["source"] = UCT_SOURCE
     curves = read_curves(folder)
     row["curves"] = {
-        name: {"step": curves[name].steps, "value": curves[name].values}
-        for name in ("score", "score_max")
+        name: {"step": thin(curves[name].steps), "value": thin(curves[name].values)}
+        for name in ("score", "score_max", RUNNING)
         if name in curves
     }
     return row
+
+
+def thin(values: Sequence[float], most: int = 150) -> list[float]:
+    """At most so many of the values, evenly spread, the last among them."""
+    every = -(-len(values) // most)
+    return list(values[::-1][::every][::-1]) if every else []
+
+
+def dumps(content: Any) -> str:
+    """JSON with a line for each entry, and one for each list of numbers."""
+    text = json.dumps(content, indent=1)
+    return re.sub(r"\[[-+.,\deE\s]+\]", lambda m: " ".join(m[0].split()), text)
+
+
+def key_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What makes a run the same as another."""
+    return *(row[key] for key in ("game", "protocol", "source", "seed")), row["settings"]["ratio"]
+
+
+def add_known(rows: list[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
+    """The rows and those of an earlier call that they do not replace, in order."""
+    known = json.loads(path.read_text()) if path.is_file() else []
+    new = {key_of(row) for row in rows}
+    every = rows + [row for row in known if key_of(row) not in new]
+    return sorted(every, key=lambda row: tuple(map(str, key_of(row))))
 
 
 def bootstrap(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
@@ -89,17 +121,25 @@ def normalised(row: Mapping[str, Any], key: str) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--out", type=Path, help="folder")
     args = parser.parse_args()
     rows = [row for row in map(read, args.runs) if row is not None]
+    # What is compared with has a folder of its own: figures 5.1 to 5.7 show ours.
+    ours = [row for row in rows if row["source"] != UCT_SOURCE]
+    others = [row for row in rows if row["source"] == UCT_SOURCE]
+    if args.out is not None:
+        ours = add_known(ours, args.out / "runs.json")
+        others = add_known(others, args.out / "compared" / "uct.json")
+        rows = ours + others
     groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         groups[row["protocol"], row["source"]].append(row)
     for protocol in sorted({row["protocol"] for row in rows}):
         for game in TABLE_5_1:
-            ours = [r for r in rows if r["source"] != UCT_SOURCE and r["protocol"] == protocol]
-            found = best_source([row for row in ours if row["game"] == game])
+            found = best_source(
+                [row for row in ours if row["game"] == game and row["protocol"] == protocol]
+            )
             groups[protocol, BEST].extend(found)
     summary = []
     print(
@@ -138,9 +178,6 @@ def main() -> None:
     for line in summary:
         print(json.dumps(line))
     if args.out is not None:
-        # What is compared with has a folder of its own: figures 5.1 to 5.7 show ours.
-        ours = [row for row in rows if row["source"] != UCT_SOURCE]
-        others = [row for row in rows if row["source"] == UCT_SOURCE]
         command = "python tests/benchmarks/atari_results.py runs/* --out docs/results/atari"
         for path, content in (
             (args.out / "runs.json", ours),
@@ -148,7 +185,7 @@ def main() -> None:
             (args.out / "summary.json", {"command": command, "summary": summary}),
         ):
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(content, indent=1) + "\n")
+            path.write_text(dumps(content) + "\n")
 
 
 if __name__ == "__main__":

@@ -44,6 +44,7 @@ TOY: dict[str, Any] = {
     "skill_base_steps": 512,
 }
 FRAMES_PER_STEP = 4
+_FRAMES_PER_POINT = 1_000 * FRAMES_PER_STEP  # of the curves: the source's 1,000 samples
 _FREE = ("out", "resume", "frames", "options_from", "num_processes")  # may change on the way
 
 
@@ -237,12 +238,13 @@ class AtariRun:
             # To the next checkpoint, which is where the tree is planted anew.
             rest = config.replant_every - agent.progress.decisions % config.replant_every
             for _ in range(rest):
-                if agent.play(1).done:
+                done = agent.play(1).done
+                self._note_score(agent.progress)
+                if done:
                     break
                 tick()
             self.seconds += time.perf_counter() - begin
             progress = agent.progress
-            self.points.append((self.num_frames, progress.score))
             if progress.done:
                 self._end_episode(progress)
                 if self.num_frames >= config.frames:
@@ -285,6 +287,13 @@ class AtariRun:
         agent.seed = self.config.seed * 10_000 + len(self.scores)
         for pool in (agent.pool, agent.real):
             pool.set_seed(agent.seed + (7_654_321 if pool is not agent.pool else 0))
+
+    def _note_score(self, progress: AtariProgress) -> None:
+        """Note the running score at every 1,000th base step of all kinds, and where it ends."""
+        frames = self.num_frames
+        before = self.points[-1][0] if self.points else -1
+        if progress.done or frames // _FRAMES_PER_POINT > before // _FRAMES_PER_POINT:
+            self.points.append((frames, progress.score))
 
     def _end_episode(self, progress: AtariProgress) -> None:
         row = {

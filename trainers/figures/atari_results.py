@@ -4,7 +4,8 @@ Runs of the experiment ``atari`` have in ``metrics.json`` the entries ``game``, 
 (``"deterministic"`` or ``"sticky"``), ``seed``, ``score_max``, ``score_final`` and ``frames``, and
 in ``curves.csv`` the curves ``score`` and ``score_max`` against emulated steps. Files in
 ``docs/results/atari`` are lists of such summaries, with an entry ``curves`` for the figures:
-``{"score": {"step": [...], "value": [...]}, "score_max": {...}}``.
+``{"score": {"step": [...], "value": [...]}, "score_max": {...}}``, and RUNNING, the score of the
+episode being played at every 1,000th base step.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain,
 
 _DPI = 110
 _FEW = 30
+RUNNING = "score_of_the_running_episode"
+"""The curve of the running score."""
 _SECOND = {"deterministic": "#db2777", "sticky": "#65a30d"}
 _COLORS = {"deterministic": "#1d4ed8", "sticky": "#16a34a"}
 
@@ -175,7 +178,13 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
         raise figure.how_to_get_data(f"there is no run of {game} with its curves.")
     shown = Figure(figsize=(10.0, 4.2), layout="constrained")
     panels = shown.subplots(1, 2)
-    titles = {"score": "score of an episode", "score_max": "highest score so far"}
+    running = all(RUNNING in row["curves"] for rows in groups.values() for row in rows)
+    titles = {
+        RUNNING if running else "score": "score of the episode being played"
+        if running
+        else "score of an episode",
+        "score_max": "highest score so far",
+    }
     for axes, (entry, title) in zip(panels, titles.items(), strict=True):
         shown_before: list[str] = []
         for protocol, rows in groups.items():
