@@ -24,6 +24,7 @@ from torchrl_hmcts.trainers import (  # noqa: E402
     ActionSetSource,
     AtariAgent,
     AtariSearch,
+    BestSource,
     DIAYNSource,
     DistilledSource,
     FineTunedSource,
@@ -163,6 +164,38 @@ def test_sets_of_one_action_are_not_tried(monkeypatch) -> None:
     found = ActionSetSource().find("Breakout", make_pool, seed=0, log=quiet)
     assert list(found.report["action_sets"]) == ["all", "not firing"]  # FIRE alone fires
     assert found.names == ["NOOP", "FIRE", "RIGHT", "LEFT"]  # of equal sets the first
+
+
+def test_the_source_whose_options_score_best_in_trials_is_taken(monkeypatch) -> None:
+    asked = []
+
+    def try_worker(self, worker, *, seed) -> float:
+        asked.append((worker.num_options, seed))
+        self.num_frames += 100
+        return {2: 3.0, 3: 5.0, 4: 4.0}[worker.num_options] + seed % 2
+
+    monkeypatch.setattr(GoalFinder, "try_worker", try_worker)
+    given = {name: Given(RepeatActions(n)) for name, n in {"a": 2, "b": 3, "c": 4}.items()}
+    found = BestSource(given, trials=2).find("Breakout", make_pool, seed=1, log=quiet)
+    assert found.worker.num_options == 3
+    assert load_options(found.saved).num_options == 3
+    assert found.report["source"] == "b"
+    assert {name: row["score"] for name, row in found.report["sources"].items()} == {
+        "a": 3.5,
+        "b": 5.5,
+        "c": 4.5,
+    }
+    assert found.num_frames == 3 * 7 + 6 * 100  # of all sources, and of the trials
+    assert asked == [(n, 10_000 + i) for n in (2, 3, 4) for i in (0, 1)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(({},), "got none"), (({"a": RepeatSource()},), "trials >= 1; got 0")],
+)
+def test_a_choice_of_nothing_is_refused(arguments, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        BestSource(*arguments, trials=0)
 
 
 # ------------------------------------------------------------------------------ networks

@@ -327,6 +327,7 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
             "GoalFinder",
             "ActionSetSource",
             "ActionSource",
+            "BestSource",
             "RepeatSource",
             "GoalSource",
             "DIAYNSource",

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.atari.sources import (
         ActionSetSource,
         ActionSource,
+        BestSource,
         GoalSource,
         RepeatSource,
     )
@@ -82,6 +83,7 @@ __all__ = [
     "AtariAgent",
     "AtariProgress",
     "AtariSearch",
+    "BestSource",
     "Candidate",
     "CollectorError",
     "Controllability",
@@ -145,6 +147,7 @@ _MODULES = {
     "AtariAgent": "atari.agent",
     "AtariProgress": "atari.agent",
     "AtariSearch": "atari.agent",
+    "BestSource": "atari.sources",
     "Candidate": "atari.goals",
     "CollectorError": "restarting_collector",
     "Controllability": "skills.controllability",

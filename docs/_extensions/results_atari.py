@@ -50,6 +50,35 @@ def atari(runs: Sequence[dict[str, Any]]) -> str:
     return text
 
 
+def sources(data: dict[str, Any]) -> str:
+    """Return a table of every source of options, game by game under both protocols."""
+    rows = data["rows"]
+    games = sorted({row["game"] for row in rows})
+    names = list(dict.fromkeys(row["source"] for row in rows))
+    protocols = ("deterministic", "sticky")
+
+    def cell(source: str, game: str, protocol: str) -> str:
+        found = [
+            r for r in rows if (r["source"], r["game"], r["protocol"]) == (source, game, protocol)
+        ]
+        # An episode that goes on is cut off: it might have scored more.
+        return ", ".join(f"{r['score']:g}{'' if r['ended'] else '+'}" for r in found) or "-"
+
+    table_rows = []
+    for name in names:
+        spent = [r["frames_finding_options"] for r in rows if r["source"] == name]
+        cells = [cell(name, game, p) for game in games for p in protocols]
+        table_rows.append([name, *cells, f"{max(spent) / 1e6:.2f} million"])
+    head = [f"{game}, {p}" for game in games for p in protocols]
+    text = (
+        f"One planned episode each, cut off after {data['real_steps']:,} base steps (then marked "
+        f"+), {data['ratio']:g} simulated base steps per real one, options of "
+        f"{data['option_steps']} base steps, {data['base_steps']:,} base steps to train a network, "
+        f"seed {data['seed']}. Last column: the most frames that finding the options took.\n"
+    )
+    return text + "\n" + table(["options from", *head, "frames for finding"], table_rows)
+
+
 def best(runs: Sequence[dict[str, Any]], game: str) -> str:
     """Return the best deterministic score in a game, or that there is none."""
     scores = [

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from results_atari import atari as atari_section
-from results_atari import best
+from results_atari import best, sources
 from results_reliability import RELIABILITY
 from results_tables import ATARI, SECTIONS, Section, table
 
@@ -71,6 +71,7 @@ _ATARI = {
             "atari/runs.json",
             atari_section,
         ),
+        Section("Where options come from", "atari/sources.json", sources),
     )
 }
 

@@ -321,8 +321,27 @@ class GoalFinder:
             seed: of the start and of the search. Default: the start that ``make_pool`` gives, and
                 the finder's own seed.
         """
-        settings = self.settings
         worker = JoinedWorkers([c.worker for c in options])
+        return self.try_worker(
+            worker, option_steps=option_steps, real_steps=real_steps, ratio=ratio, seed=seed
+        )
+
+    def try_worker(
+        self,
+        worker: OptionWorker,
+        *,
+        option_steps: int | None = None,
+        real_steps: int | None = None,
+        ratio: float | None = None,
+        seed: int | None = None,
+    ) -> float:
+        """Return the score of a planner's short episode with all options of a worker.
+
+        Args:
+            worker: of any kind.
+            option_steps, real_steps, ratio, seed: as those of :meth:`trial`.
+        """
+        settings = self.settings
         pool = self.make_pool(
             worker, settings.option_steps if option_steps is None else option_steps
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +15,7 @@ from torchrl_hmcts.trainers.atari.goals import (
     GoalSearch,
     repeat_candidates,
 )
-from torchrl_hmcts.trainers.atari.options import MakePool, Options, plain_worker
+from torchrl_hmcts.trainers.atari.options import MakePool, Options, WorkerSource, plain_worker
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,72 @@ class GoalSource:
         finder = GoalFinder(make_pool, self.settings, search=self.search, seed=seed, log=log)
         chosen = finder.find()
         return _joined(chosen, finder.num_frames, finder.report)
+
+
+@dataclass(frozen=True)
+class BestSource:
+    r"""The options of whichever source a planner's trials score best with.
+
+    .. math:: \arg\max_i \frac{1}{n} \sum_{j < n} \mathrm{score}_j(\text{options of source } i)
+
+    Every source looks for its options first; the frames of all of them count.
+
+    Attributes:
+        sources: by name.
+        settings: real steps, ratio and length of options of the trials.
+        search: the planner of the trials.
+        trials: starts and searches over which the score of a source is averaged; n.
+
+    Raises:
+        ValueError: if there is no source, or ``trials`` is below 1.
+
+    Example:
+        >>> from torchrl_hmcts.envs import AtariOptionPool
+        >>> from torchrl_hmcts.trainers import ActionSource, BestSource, GoalSearch, RepeatSource
+        >>> def make_pool(worker, max_steps):
+        ...     return AtariOptionPool("Pong", worker, max_steps=max_steps, num_processes=0)
+        >>> small = GoalSearch(min_options=1, options=1, trial_steps=4, trial_ratio=1.0)
+        >>> best = BestSource({"all": RepeatSource(), "some": ActionSource(small)}, small, trials=1)
+        >>> found = best.find("Pong", make_pool, seed=0, log=lambda text: None)
+        >>> list(found.report["sources"])
+        ['all', 'some']
+    """
+
+    sources: Mapping[str, WorkerSource]
+    settings: GoalSearch = field(default_factory=GoalSearch)
+    search: AtariSearch = field(default_factory=AtariSearch)
+    trials: int = 2
+
+    def __post_init__(self) -> None:
+        if not self.sources:
+            raise ValueError("BestSource chooses among sources; got none.")
+        if self.trials < 1:
+            raise ValueError(f"BestSource needs trials >= 1; got {self.trials}.")
+
+    def find(
+        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
+    ) -> Options:
+        """Return the options of a game."""
+        finder = GoalFinder(make_pool, self.settings, search=self.search, seed=seed, log=log)
+        seeds = [seed * 10_000 + i for i in range(self.trials)]
+        found: dict[str, Options] = {}
+        scores: dict[str, float] = {}
+        for name, source in self.sources.items():
+            options = source.find(game, make_pool, seed=seed, log=log)
+            found[name] = options
+            scores[name] = sum(finder.try_worker(options.worker, seed=s) for s in seeds) / len(
+                seeds
+            )
+            log(f"source {name}, {options.names}: {scores[name]:g}")
+        best = max(scores, key=lambda name: scores[name])
+        chosen = found[best]
+        report = {
+            **chosen.report,
+            "source": best,
+            "sources": {n: {"score": scores[n], "options": o.names} for n, o in found.items()},
+        }
+        frames = finder.num_frames + sum(options.num_frames for options in found.values())
+        return dataclasses.replace(chosen, num_frames=frames, report=report)
 
 
 def _joined(chosen: Sequence[Candidate], frames: int, report: dict[str, Any]) -> Options:

@@ -24,6 +24,7 @@ from torchrl_hmcts.trainers.atari.options import Options, WorkerSource, load_opt
 from torchrl_hmcts.trainers.atari.sources import (
     ActionSetSource,
     ActionSource,
+    BestSource,
     GoalSource,
     RepeatSource,
 )
@@ -307,19 +308,23 @@ class AtariRun:
 
     def _source(self) -> WorkerSource:
         config = self.config
+        settings = GoalSearch(
+            min_options=2, trial_steps=config.trial_steps, trial_ratio=config.trial_ratio
+        )
+        simple: dict[str, WorkerSource] = {
+            "action_sets": ActionSetSource(settings, self.search()),
+            "actions": ActionSource(settings, self.search()),
+            "goals": GoalSource(settings, self.search()),
+        }
+        if config.source == "best":
+            return BestSource(simple, settings, self.search())
         if config.source == "repeat":
             return RepeatSource()
-        settings = GoalSearch(trial_steps=config.trial_steps, trial_ratio=config.trial_ratio)
-        if config.source == "action_sets":
-            return ActionSetSource(settings, self.search())
-        if config.source == "actions":
-            return ActionSource(settings, self.search())
+        if config.source in simple:
+            return simple[config.source]
         family, _, kind = config.source.partition("_")
         if family == "goals":
-            goals = GoalSource(settings, self.search())
-            if not kind:
-                return goals
-            network = DistilledSource(goals)
+            network = DistilledSource(simple["goals"])
             if kind == "network":
                 return network
             if kind == "fine_tuned":

@@ -9,7 +9,7 @@ from torchrl_hmcts.arguments import name_arguments
 GUIDES = ("none", "prior", "prior_value")
 PROTOCOLS = ("deterministic", "sticky")
 SOURCES = (
-    "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions", "action_sets",
+    "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions", "action_sets",
     "repeat", "diayn", "diayn_displacement", "diayn_controllable", "diayn_retrained",
 )  # fmt: skip
 
@@ -36,8 +36,9 @@ class AtariConfig:
     protocol: str = "deterministic"
     """"deterministic" (comparable with the source and the planning papers) or "sticky" (actions
     stick with probability 0.25, and the planner is given no random generator)."""
-    source: str = "goals"
-    """Where options come from: "goals" (found by a probe and trials), "goals_network" (the
+    source: str = "best"
+    """Where options come from: "best" ("action_sets", "actions" or "goals", whichever a planner's
+    trials score best with), "goals" (found by a probe and trials), "goals_network" (the
     same, carried out by one network that learned them), "goals_fine_tuned" (that network, trained
     further by SAC on its goals and the game), "goals_retrained" (the same on what searches
     simulated, Algorithm 3), "repeat" (one for each action), "actions"
@@ -80,9 +81,9 @@ class AtariConfig:
     """Leaves of the tree that are simulated together."""
     num_processes: int = -1
     """Processes that emulate; 0: in the command's own; -1: one for each core."""
-    trial_steps: int = 300
+    trial_steps: int = 1_000
     """Real base steps of a trial in which options are compared."""
-    trial_ratio: float = 5.0
+    trial_ratio: float = 10.0
     """Simulated base steps per real one in such a trial."""
     replant_every: int = 100
     """Decisions between checkpoints, at which the tree is planted anew so that a resumed run goes
