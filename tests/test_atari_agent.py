@@ -256,7 +256,7 @@ def test_a_run_is_evaluated_with_what_it_found_and_learned(tmp_path, monkeypatch
     ("wrong", "message"),
     [
         ({"protocol": "random"}, "deterministic, sticky; got 'random'"),
-        ({"source": "luck"}, "one of goals, .*repeat.*got 'luck'"),
+        ({"source": "luck"}, "one of best, goals, .*repeat.*got 'luck'"),
         ({"ratio": 0.0}, "ratio must be above 0; got 0.0"),
         ({"gamma": 1.5}, r"gamma must be in \(0, 1\]; got 1.5"),
         ({"frames": 0}, "frames must be at least 1; got 0"),

@@ -45,7 +45,7 @@ BEST = "the best of each game"
 KEPT = (
     "game", "protocol", "source", "seed", "score_max", "score_final", "score_mean", "episodes",
     "frames", "base_steps", "options", "option_steps", "c", "frames_finding_options",
-    "frames_tuning", "seconds", "finding", "tuning",
+    "frames_tuning", "frames_per_decision", "seconds", "finding", "tuning",
 )  # fmt: skip
 SETTINGS = (
     "ratio", "tree_policy", "rollout_options", "gamma", "width_novelty", "leaves_per_wave",
@@ -59,7 +59,7 @@ def read(folder: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     metrics = json.loads(path.read_text())
-    row = {key: metrics[key] for key in KEPT}
+    row = {key: metrics[key] for key in KEPT if key in metrics}
     config = metrics["config"]
     row["settings"] = {key: config[key] for key in SETTINGS if key in config}
     words = [f"{k}={v}" for k, v in sorted(config.items()) if k not in ("out", "resume")]

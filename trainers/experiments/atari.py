@@ -394,6 +394,8 @@ class AtariRun:
         config = self.config
         scores = [row["score"] for row in self.scores]
         guided = f"guide={config.guide}"
+        before = self.options.num_frames + self.tuned.num_frames
+        decisions = max(1, sum(int(row["decisions"]) for row in self.scores))
         return {
             "game": config.game,
             "protocol": config.protocol,
@@ -410,6 +412,7 @@ class AtariRun:
             "c": self.tuned.c,
             "frames_finding_options": self.options.num_frames,
             "frames_tuning": self.tuned.num_frames,
+            "frames_per_decision": round((self.num_frames - before) / decisions, 1),
             "seconds": round(self.seconds, 1),
             "finding": self.options.report,
             "tuning": self.tuned.trials,

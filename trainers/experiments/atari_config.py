@@ -9,8 +9,8 @@ from torchrl_hmcts.arguments import name_arguments
 GUIDES = ("none", "prior", "prior_value")
 PROTOCOLS = ("deterministic", "sticky")
 SOURCES = (
-    "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions", "action_sets",
-    "repeat", "diayn", "diayn_displacement", "diayn_controllable", "diayn_retrained",
+    "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
+    "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable", "diayn_retrained",
 )  # fmt: skip
 
 

@@ -42,14 +42,16 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size
 th, td { border-bottom: 1px solid var(--line); padding: .3rem .8rem .3rem 0; text-align: left;
   vertical-align: top; }
 th { font-weight: 600; }
-td.number, th.number { text-align: right; white-space: nowrap; }
+td.number { white-space: nowrap; }
+td.number, th.number { text-align: right; }
 td.text { overflow-wrap: anywhere; min-width: 6rem; }
 td small { color: var(--muted); white-space: nowrap; }
 .groups { columns: 21rem; column-gap: 2.5rem; }
 .groups > div { break-inside: avoid; margin-bottom: 1rem; }
 .name { display: inline-block; min-width: 9rem; }
 .groups table { width: 100%; }
-.groups td:last-child { text-align: right; padding-right: 0; }
+.groups td:last-child { text-align: right; }
+.groups th:last-child, .groups td:last-child { padding-right: 0; }
 .groups h3 { margin-top: .6rem; }
 @media (max-width: 600px) {
   .stack tr { display: grid; grid-template-columns: 1fr auto; border-bottom: 1px solid var(--line);
@@ -155,8 +157,16 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[Any] = (), kind: str = "
         True
     """
     lines = []
+    rows = [list(row) for row in rows]
     if head:
-        lines.append("<tr>" + "".join(f"<th>{text(cell)}</th>" for cell in head) + "</tr>")
+        kinds = [_kind(cell) for cell in rows[0]] if rows else [""] * len(head)
+        names = (
+            f'<th class="number">{text(cell)}</th>'
+            if kind == "number"
+            else f"<th>{text(cell)}</th>"
+            for cell, kind in zip(head, kinds, strict=True)
+        )
+        lines.append("<tr>" + "".join(names) + "</tr>")
     for row in rows:
         cells = (f'<td class="{_kind(cell)}">{text(cell)}</td>' for cell in row)
         lines.append("<tr>" + "".join(cells) + "</tr>")

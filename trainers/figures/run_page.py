@@ -70,7 +70,11 @@ def _tables(metrics: Mapping[str, Any], prefix: str) -> list[Html]:
         elif _are_records(value):
             head = [column.replace("_", " ") for column in value[0]]
             title = (prefix + name).replace(".", ": ").replace("_", " ")
-            shown = table(([plain(x) for x in row.values()] for row in value), head)
+            cells = [
+                [x if isinstance(x, int | float) else plain(x) for x in row.values()]
+                for row in value
+            ]
+            shown = table(cells, head)
             inner.append(Html(f"<h3>{text(title)}</h3>" + shown))
         else:
             rows.append((key, value))
