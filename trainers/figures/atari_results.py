@@ -178,7 +178,7 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
         raise figure.how_to_get_data(f"there is no run of {game} with its curves.")
     shown = Figure(figsize=(10.0, 4.2), layout="constrained")
     panels = shown.subplots(1, 2)
-    running = all(RUNNING in row["curves"] for rows in groups.values() for row in rows)
+    running = any(RUNNING in row["curves"] for rows in groups.values() for row in rows)
     titles = {
         RUNNING if running else "score": "score of the episode being played"
         if running
