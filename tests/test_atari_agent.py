@@ -26,6 +26,7 @@ from torchrl_hmcts.trainers import (  # noqa: E402
     GoalFinder,
     GoalSearch,
 )
+from torchrl_hmcts.trainers.atari.trials import RememberedTrials, Trial  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari import (  # noqa: E402
     AtariRun,
     evaluate_atari,
@@ -228,6 +229,51 @@ def test_a_run_in_pieces_is_the_run_in_one(tmp_path, guide) -> None:
     other = AtariRun(AtariConfig(**{**config.__dict__, "ratio": 4.0}))
     with pytest.raises(ValueError, match="other settings: ratio=4.0 instead of 3.0"):
         other.load_state_dict(saved[-1])
+
+
+def test_a_run_stopped_while_it_looks_for_options_plays_no_trial_twice(
+    tmp_path, monkeypatch
+) -> None:
+    config = AtariConfig(
+        game="Pong", frames=1_000, max_episode_frames=400, source="actions", tune_trials=2,
+        trial_steps=6, trial_ratio=1.0, ratio=1.0, num_processes=0, out=str(tmp_path), seed=4,
+    )  # fmt: skip
+    played = []
+    real = AtariRun.make_pool
+
+    def make_pool(self, worker, max_steps, **kwargs):
+        if len(played) == stop_after:
+            raise KeyboardInterrupt
+        played.append(worker.num_options)
+        return real(self, worker, max_steps, **kwargs)
+
+    monkeypatch.setattr(AtariRun, "make_pool", make_pool)
+    stop_after = -1
+    whole = AtariRun(config)
+    whole.play(lambda: None, lambda: None)
+    assert len(json.loads((tmp_path / "checkpoints" / "trials.json").read_text())["trials"]) > 10
+    pools, played[:] = len(played), []
+    (tmp_path / "checkpoints" / "trials.json").unlink()
+    stop_after = 8
+    with pytest.raises(KeyboardInterrupt):
+        AtariRun(config).play(lambda: None, lambda: None)
+    stop_after = -1
+    second = AtariRun(config)
+    second.play(lambda: None, lambda: None)
+    assert len(played) == pools + 1  # the pool that only names the actions is made twice
+    assert second.options.names == whole.options.names
+    assert second.tuned == whole.tuned
+    assert second.scores == whole.scores
+
+
+def test_trials_of_other_settings_or_a_damaged_file_are_played_again(tmp_path) -> None:
+    path = tmp_path / "trials.json"
+    RememberedTrials(None, path, {"game": "Pong"}).remember("key", Trial(1.0, 2, 3))
+    assert RememberedTrials(None, path, {"game": "Pong"}).recall("key") == Trial(1.0, 2, 3)
+    assert RememberedTrials(None, path, {"game": "Breakout"}).recall("key") is None
+    for text in ("[]", "{", '{"settings": {"game": "Pong"}}'):
+        path.write_text(text)
+        assert RememberedTrials(None, path, {"game": "Pong"}).recall("key") is None
 
 
 @pytest.mark.parametrize("guide", ["none", "prior"])

@@ -22,7 +22,8 @@ from torchrl_hmcts.envs import (
     OptionWorker,
     RepeatActions,
 )
-from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariSearch
+from torchrl_hmcts.trainers.atari.agent import AtariSearch
+from torchrl_hmcts.trainers.atari.trials import play_trial
 from torchrl_hmcts.trainers.skills.controllability import Controllability, probe_controllability
 
 
@@ -342,18 +343,18 @@ class GoalFinder:
             option_steps, real_steps, ratio, seed: as those of :meth:`trial`.
         """
         settings = self.settings
-        pool = self.make_pool(
-            worker, settings.option_steps if option_steps is None else option_steps
+        trial = play_trial(
+            self.make_pool,
+            worker,
+            _with_ratio(self.search, settings.trial_ratio if ratio is None else ratio),
+            option_steps=settings.option_steps if option_steps is None else option_steps,
+            real_steps=settings.trial_steps if real_steps is None else real_steps,
+            seed=self.seed if seed is None else seed,
+            start=seed,
         )
-        search = _with_ratio(self.search, settings.trial_ratio if ratio is None else ratio)
-        if seed is not None:
-            pool.set_seed(seed)
-        agent = AtariAgent(pool, search, seed=self.seed if seed is None else seed)
-        steps = settings.trial_steps if real_steps is None else real_steps
-        progress = agent.play(max_steps=steps)
-        self._spent(pool)
+        self.num_frames += trial.num_frames
         # An episode that ended early counts by its score alone; ties go to who lived longer.
-        return progress.score + 1e-6 * progress.real_steps
+        return trial.score + 1e-6 * trial.real_steps
 
 
 def _with_ratio(search: AtariSearch, ratio: float) -> AtariSearch:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from torchrl_hmcts.envs import AtariOptionPool, OptionWorker
-from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariSearch
-from torchrl_hmcts.trainers.atari.sources import Options
+from torchrl_hmcts.trainers.atari.agent import AtariSearch
+from torchrl_hmcts.trainers.atari.options import Options
+from torchrl_hmcts.trainers.atari.trials import play_trial
 
 OPTION_STEPS = (10, 5, 20, 30)
 
@@ -77,7 +78,6 @@ def tune_search(
     tuned = Tuned(OPTION_STEPS[0], config.c)
 
     def trial(option_steps: int, c: float) -> float:
-        pool = make_pool(options.worker, option_steps)
         search = AtariSearch(
             ratio=min(config.ratio, 10.0),
             c=c,
@@ -85,15 +85,20 @@ def tune_search(
             leaves_per_wave=config.leaves_per_wave,
             width_novelty=config.width_novelty,
         )
-        agent = AtariAgent(pool, search, seed=config.seed)
-        progress = agent.play(max_steps=2 * config.trial_steps)
-        tuned.num_frames += pool.num_frames
-        pool.close()
-        row = {"option_steps": option_steps, "c": c, "score": progress.score}
-        row["real_steps"] = progress.real_steps
+        played = play_trial(
+            make_pool,
+            options.worker,
+            search,
+            option_steps=option_steps,
+            real_steps=2 * config.trial_steps,
+            seed=config.seed,
+        )
+        tuned.num_frames += played.num_frames
+        row = {"option_steps": option_steps, "c": c, "score": played.score}
+        row["real_steps"] = played.real_steps
         tuned.trials.append(row)
         log(f"trial: {row}")
-        return progress.score + 1e-6 * progress.real_steps  # ties go to who lived longer
+        return played.score + 1e-6 * played.real_steps  # ties go to who lived longer
 
     if config.tune_with == "grid":
         for option_steps in OPTION_STEPS[: config.tune_trials]:

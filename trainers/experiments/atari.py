@@ -29,6 +29,7 @@ from torchrl_hmcts.trainers.atari.sources import (
     RepeatSource,
 )
 from torchrl_hmcts.trainers.atari.trained_sources import FineTunedSource, RetrainedSource
+from torchrl_hmcts.trainers.atari.trials import RememberedTrials
 from torchrl_hmcts.trainers.atari.tuning import Tuned, tune_search
 from torchrl_hmcts.trainers.checkpoints import write_json, write_text
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
@@ -53,7 +54,8 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     """Run ``hmcts train experiment=atari`` and return its figures, as in ``metrics.json``.
 
     Finds options, then plays episodes until the frames are spent. A run that is stopped goes on
-    with ``resume=true`` from its newest checkpoint; what it would have found does not change.
+    with ``resume=true`` from its newest checkpoint, and while it still looks for options from its
+    last trial; what it would have found does not change.
 
     Args:
         config: see :class:`~torchrl_hmcts.trainers.experiments.atari_config.AtariConfig`.
@@ -78,7 +80,9 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     run = AtariRun(config)
     saved = out / "checkpoints" / "run.pt"
-    if config.resume and saved.is_file():
+    if not config.resume:
+        _trials(out).unlink(missing_ok=True)
+    elif saved.is_file():
         run.load_state_dict(torch.load(saved, weights_only=True))
     save = lambda: _save(saved, run.state_dict())  # noqa: E731
     begin = time.perf_counter()
@@ -209,11 +213,11 @@ class AtariRun:
             self.take_over(Path(config.options_from), "options_from")
         if self.options is None:
             self.options = self._source().find(
-                config.game, self.make_pool, seed=config.seed, log=print
+                config.game, self._remembering(), seed=config.seed, log=print
             )
             self._frames_before += self.options.num_frames
         if self.tuned is None:
-            self.tuned = tune_search(self.options, self.make_pool, config, log=print)
+            self.tuned = tune_search(self.options, self._remembering(), config, log=print)
             self._frames_before += self.tuned.num_frames
         self.seconds += time.perf_counter() - begin
         agent = self._agent()
@@ -254,6 +258,11 @@ class AtariRun:
                 self._seed_episode(agent)
                 agent.begin()
             save()
+
+    def _remembering(self) -> RememberedTrials:
+        """Makes pools whose trials a run that is stopped and resumed does not play again."""
+        settings = {k: v for k, v in dataclasses.asdict(self.config).items() if k not in _FREE}
+        return RememberedTrials(self.make_pool, _trials(Path(self.config.out)), settings)
 
     def take_over(self, folder: Path, key: str) -> None:
         """Take options, their length and what a guide has learned from another run.
@@ -491,6 +500,10 @@ def draw(run: AtariRun, out: Path) -> dict[str, str]:
         recorder.close()
     pictures["episode.gif"] = "The first minute of an episode, planned with fewer simulations."
     return pictures
+
+
+def _trials(out: Path) -> Path:
+    return out / "checkpoints" / "trials.json"
 
 
 def _write_curves(run: AtariRun, path: Path) -> None:
