@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_hmcts.trainers.config import parse_overrides
+from torchrl_hmcts.trainers.experiments.registry import DEMO, find_experiment
+
 DOCS = Path(__file__).parents[1] / "docs"
 GENERATED = {"auto_tutorials", "auto_reference", "auto_results", "_build"}
 PACKAGES = ("planners", "objectives", "modules", "transforms", "envs", "trainers", "testing")
@@ -141,6 +144,30 @@ class TestCodeOfThePages:
         namespace: dict = {}
         for block in BLOCK.findall(PAGES[page]):
             exec(compile(block, page, "exec"), namespace)  # noqa: S102
+
+
+def commands() -> list[tuple[str, str]]:
+    """Returns each ``hmcts`` command of README and pages that can be typed as it stands."""
+    texts = {**PAGES, "README.md": (DOCS.parent / "README.md").read_text()}
+    found = []
+    for page, text in texts.items():
+        for line in re.findall(r"(?:^    |`)(hmcts [^`\n#]+)", text, re.MULTILINE):
+            if not re.search(r"\.\.\.|=[A-Z]+\b", line):  # NAME, DIR, S stand for something
+                found.append((page, line.strip()))
+    return sorted(set(found))
+
+
+@pytest.mark.parametrize(("page", "command"), commands())
+def test_every_command_of_the_pages_is_understood(page: str, command: str) -> None:
+    pytest.importorskip("omegaconf")
+    _, verb, *words = command.split()
+    assert verb in {"demo", "train", "evaluate", "sweep", "report", "list"}
+    if verb not in {"demo", "train"} or not words:  # the bare verb is a name, no command
+        return
+    name = next((word[11:] for word in words if word.startswith("experiment=")), "demo")
+    experiment = DEMO if verb == "demo" else find_experiment(name)
+    keys = [word for word in words if not word.startswith("experiment=")]
+    parse_overrides(experiment.config_class, keys, others=["log_level"])  # raises
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])

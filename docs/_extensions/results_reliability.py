@@ -52,6 +52,46 @@ def leaks(data: dict[str, Any]) -> str:
     return table(["", "number", "MiB more", "Python objects more"], rows)
 
 
+def coverage(data: dict[str, Any]) -> str:
+    rows = [
+        [name, row["lines"], row["reached"], f"{100 * row['share']:.1f} %"]
+        for name, row in data["folders"].items()
+    ]
+    return table(["folder", "lines", "reached by tests", "share"], rows)
+
+
+def mutants(data: dict[str, Any]) -> str:
+    lines = {
+        "possible mutants": "mutants_possible",
+        "drawn at random and tried": "tried",
+        "noticed by a test at the first run": "killed_at_first_run",
+        "noticed after tests were added": "killed_after_tests_were_added",
+        "cannot be noticed (reasons in the file)": "equivalent",
+        "survived": "survived",
+    }
+    rows: list[list[Any]] = [[text, data[key]] for text, key in lines.items()]
+    rows.append(["share noticed, of all tried", f"{100 * data['killed_share']:.0f} %"])
+    rows.append(["at the first run", f"{100 * data['killed_share_at_first_run']:.0f} %"])
+    return table(["", "count"], rows)
+
+
+def pythons(data: dict[str, Any]) -> str:
+    rows = [
+        [
+            row["python"],
+            row["torch"],
+            row["torchrl"],
+            row["test_files"],
+            row["passed"],
+            row["skipped"],
+            ", ".join(row["failed"]) or "none",
+        ]
+        for row in data["pythons"].values()
+    ]
+    head = ["Python", "torch", "torchrl", "test files", "passed", "skipped", "failed"]
+    return table(head, rows)
+
+
 _HEAD = ("tests", "passed", "failed", "skipped")
 
 
@@ -67,4 +107,7 @@ RELIABILITY = (
     Section("Senseless input, many more cases", "reliability/fuzz_slow.json", fuzz),
     Section("TorchRL's contracts", "reliability/contracts.json", contracts),
     Section("Memory", "reliability/leaks.json", leaks),
+    Section("Lines that the tests reach", "reliability/coverage.json", coverage),
+    Section("Wrong lines that the tests notice", "reliability/mutants.json", mutants),
+    Section("The wheel on several Pythons", "pythons.json", pythons),
 )

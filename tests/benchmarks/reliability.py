@@ -4,9 +4,10 @@
     python tests/benchmarks/reliability.py kills --kills 50
     python tests/benchmarks/reliability.py fuzz --slow        (100,000 cases)
     python tests/benchmarks/reliability.py ray                (kills processes of a Ray cluster)
+    python tests/benchmarks/reliability.py coverage           (reads what `make coverage` measured)
 
 Each part is a file of its own: kills.json, fuzz.json, fuzz_slow.json, tests.json, contracts.json,
-ray.json, leaks.json, with the command that made it. A test that fails is named in it.
+ray.json, leaks.json, coverage.json, with the command that made it; a test that fails is named.
 """
 
 from __future__ import annotations
@@ -127,19 +128,40 @@ def leaks() -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-PARTS = ["kills", "fuzz", "tests", "contracts", "ray", "leaks"]
+def coverage() -> dict[str, Any]:
+    """Returns the share of the lines that the tests reach, by folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "coverage.json"
+        words = ["-m", "coverage", "json", "-q", "-o", str(path)]
+        subprocess.run([sys.executable, *words], cwd=ROOT, check=True)
+        files = json.loads(path.read_text())["files"]
+    found: dict[str, dict[str, Any]] = {}
+    for name, file in files.items():
+        for group in (Path(name).parts[0], "all"):
+            row = found.setdefault(group, {"lines": 0, "reached": 0})
+            row["lines"] += file["summary"]["num_statements"]
+            row["reached"] += file["summary"]["covered_lines"]
+    for row in found.values():
+        row["share"] = round(row["reached"] / row["lines"], 4)
+    return {"folders": found}
+
+
+PARTS = ["kills", "fuzz", "tests", "contracts", "leaks", "ray", "coverage"]
+SEPARATE = ["ray", "coverage"]  # what needs more than the extra dev, or a run before
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; default: all but ray")
+    parser.add_argument(
+        "parts", nargs="*", help=f"of {', '.join(PARTS)}; default: all but {SEPARATE}"
+    )
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--slow", action="store_true", help="fuzz 100,000 cases")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "reliability")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     command = "python tests/benchmarks/reliability.py"
-    for part in arguments.parts or [part for part in PARTS if part != "ray"]:
+    for part in arguments.parts or [part for part in PARTS if part not in SEPARATE]:
         begin, words, name = time.time(), part, part
         if part == "kills":
             words = f"kills --kills {arguments.kills}"
@@ -160,6 +182,8 @@ def main() -> None:
             )
         elif part == "leaks":
             figures = leaks()
+        elif part == "coverage":
+            figures = coverage()
         else:
             parser.error(f"{part!r} is none of {', '.join(PARTS)}")
         record = {
