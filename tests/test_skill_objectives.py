@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, EnvBase, TransformedEnv
@@ -423,6 +424,70 @@ def make_loss(objective: SkillObjective, **kwargs: Any) -> DiscreteSkillSACLoss:
         action_space=spec,
         **kwargs,
     )
+
+
+def make_prior(logits: list[float]) -> TensorDictModule:
+    """Returns a policy that does not look at anything."""
+    row = torch.tensor(logits)
+    return TensorDictModule(lambda z: row.expand(*z.shape, 4), ["skill"], ["logits"])
+
+
+def test_a_uniform_policy_prior_is_the_entropy_up_to_a_constant() -> None:
+    td = make_env(6).rollout(1).reshape(-1).set("action", torch.arange(6) % 4)
+    td["next", "reward"] = torch.randn(6, 1)
+    plain = make_loss(make_objective("diayn", num_skills=4), alpha_init=0.2, gamma=0.9)
+    kept = make_loss(
+        make_objective("diayn", num_skills=4),
+        alpha_init=0.2,
+        gamma=0.9,
+        policy_prior=make_prior([0.0] * 4),
+    )
+    for loss in (kept, plain):
+        SoftUpdate(loss, tau=0.05)
+    ours, theirs = kept(td), plain(td)
+    torch.testing.assert_close(
+        ours["loss_actor"], theirs["loss_actor"] + 0.2 * math.log(4), atol=1e-5, rtol=0
+    )
+    # The target loses gamma * alpha * log 4 where the episode goes on.
+    difference = plain._compute_target(td) - kept._compute_target(td)
+    going_on = ~td["next", "terminated"].flatten()
+    expected = going_on * 0.9 * 0.2 * math.log(4)
+    torch.testing.assert_close(difference, expected, atol=1e-5, rtol=0)
+
+
+def test_the_best_policy_is_the_prior_times_the_exponential_of_the_values() -> None:
+    loss = make_loss(
+        make_objective("diayn", num_skills=4),
+        alpha_init=0.5,
+        policy_prior=make_prior([0.0, 1.0, -1.0, 0.5]),
+    )
+    td = TensorDict(skill=torch.zeros(1, dtype=torch.int64), batch_size=[1])
+    values = torch.tensor([[0.3, -0.2, 0.9, 0.1]])
+    best = (torch.tensor([0.0, 1.0, -1.0, 0.5]) + values / 0.5).log_softmax(-1)
+    theta = best.clone().requires_grad_()
+    loss._log_probs = lambda td: theta.log_softmax(-1)
+    found, _ = loss._actor_loss(values, td)
+    found.backward()
+    torch.testing.assert_close(theta.grad, torch.zeros(1, 4), atol=1e-6, rtol=0)
+    # Its value is minus alpha times the logarithm of the partition function.
+    partition = (torch.tensor([0.0, 1.0, -1.0, 0.5]).softmax(-1) * (values / 0.5).exp()).sum()
+    torch.testing.assert_close(found, -0.5 * partition.log())
+
+
+def test_a_policy_prior_is_neither_trained_nor_saved_and_must_write_logits() -> None:
+    network = TensorDictModule(torch.nn.Linear(2, 4), ["velocity"], ["logits"])
+    loss = make_loss(make_objective("diayn", num_skills=4), policy_prior=network)
+    td = make_env(6).rollout(1).reshape(-1).set("action", torch.arange(6) % 4)
+    td["next", "reward"] = torch.randn(6, 1)
+    SoftUpdate(loss, tau=0.05)
+    out = loss(td)
+    sum(v for k, v in out.items() if k.startswith("loss")).backward()
+    assert all(p.grad is None for p in network.parameters())
+    plain = make_loss(make_objective("diayn", num_skills=4))
+    assert loss.state_dict().keys() == plain.state_dict().keys()
+    wrong = TensorDictModule(torch.nn.Linear(2, 4), ["velocity"], ["action"])
+    with pytest.raises(TypeError, match="'logits' of its policy_prior"):
+        make_loss(make_objective("diayn", num_skills=4), policy_prior=wrong)
 
 
 @pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")

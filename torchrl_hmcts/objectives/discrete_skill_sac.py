@@ -21,6 +21,8 @@ from torchrl_hmcts.objectives.functional import run_network, takes_weights
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
 from torchrl_hmcts.objectives.trains_objective import TrainsObjective
 
+_LEAST_LOG_PROB = -10.0  # of a policy prior: no action is out of reach for ever
+
 
 class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
     r"""Discrete soft actor-critic with twin critics, conditioned on skills, and a skill objective.
@@ -37,6 +39,10 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
     a :class:`~torchrl_hmcts.transforms.SkillReward` with the same objective on the replay buffer.
     Being a :class:`torchrl.objectives.DiscreteSACLoss`, it runs with ``SoftUpdate``, ``Trainer``
     and ``SACTrainer`` unchanged. No loss sends gradients into the parameters of another.
+
+    With a ``policy_prior`` :math:`\pi_0`, :math:`\log \pi` gives way to :math:`\log \pi - \log
+    \pi_0`: the policy is kept near another one instead of near the uniform one, and the best it can
+    do is :math:`\pi \propto \pi_0 \exp(Q / \alpha)`.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy pi(a | s, z), e.g. a
@@ -57,6 +63,9 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
         min_alpha, max_alpha (float, optional): bounds of a tuned alpha. Default ``None``.
         target_entropy_weight (float): target entropy as a fraction of ``log A``. Default ``0.5``.
         target_entropy (float or "auto"): target entropy in nats. Default ``"auto"``.
+        policy_prior (TensorDictModuleBase, optional): :math:`\pi_0`; writes ``logits`` ``[*B, A]``
+            from entries that actor or critics read too. It is read as it is, and neither trained
+            nor saved here. Use a fixed alpha with it. Default ``None``: the uniform policy.
         num_qvalue_nets (int): number of critics. Default ``2``, the twins.
         loss_function (str): ``"l2"`` (default), ``"l1"`` or ``"smooth_l1"`` for the critics.
         delay_qvalue (bool): bootstrap from target critics, to be moved by ``SoftUpdate``. Default
@@ -75,7 +84,7 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
         ``entropy`` are left out.
 
     Raises:
-        TypeError: if the objective is no :class:`SkillObjective`.
+        TypeError: if the objective is no :class:`SkillObjective`, or the prior writes no logits.
         ValueError: if ``gamma`` is outside [0, 1], ``alpha_init`` is not positive, or the reduction
             is unknown or not that of the objective.
 
@@ -84,6 +93,8 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
 
     Reference:
         Christodoulou, "Soft Actor-Critic for Discrete Action Settings", 2019, arXiv 1910.07207.
+        Policy prior: Teh et al., "Distral: Robust Multitask Reinforcement Learning", 2017, arXiv
+        1707.04175.
 
     Examples:
         >>> from torchrl.data import Categorical
@@ -131,6 +142,7 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
         max_alpha: float | None = None,
         target_entropy_weight: float = 0.5,
         target_entropy: float | str = "auto",
+        policy_prior: TensorDictModuleBase | None = None,
         num_qvalue_nets: int = 2,
         loss_function: str = "l2",
         delay_qvalue: bool = True,
@@ -163,7 +175,16 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
             scalar_output_mode="exclude" if reduction == "none" else None,
         )
         self._attach(objective, gamma)
+        if policy_prior is not None and "logits" not in getattr(policy_prior, "out_keys", ()):
+            raise TypeError(
+                f"{owner} reads the entry 'logits' of its policy_prior, which "
+                f"{type(policy_prior).__name__} does not write. Use e.g. TensorDictModule(network, "
+                f"['observation', 'skill'], ['logits'])."
+            )
+        self.__dict__["policy_prior"] = policy_prior  # no sub-module: it stays its owner's
         self._set_fast_paths()
+
+    policy_prior: TensorDictModuleBase | None
 
     def _set_fast_paths(self) -> None:
         # A SkillActor's logits are all that is needed of it; its distribution would cost more than
@@ -179,6 +200,14 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
         with params.to_module(actor, preserve_module_state=False):
             return actor.get_dist(tensordict.copy()).logits
 
+    def _relative(self, log_prob: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Returns log pi - log pi_0, ``[*B, A]``; log pi without a prior."""
+        if self.policy_prior is None:
+            return log_prob
+        with torch.no_grad():
+            logits = self.policy_prior(tensordict.copy()).get("logits")
+        return log_prob - logits.log_softmax(-1).clamp_min(_LEAST_LOG_PROB)
+
     def _action_values(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
         """Returns Q(s, z, .) of all critics, ``[N, *B, A]``."""
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
@@ -192,7 +221,8 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
             after = tensordict.get("next").copy()
             log_prob = self._log_probs(after)
             value = self._action_values(after, self.target_qvalue_network_params).amin(0)
-            value = (log_prob.exp() * (value - self._alpha * log_prob)).sum(-1, keepdim=True)
+            relative = self._relative(log_prob, after)
+            value = (log_prob.exp() * (value - self._alpha * relative)).sum(-1, keepdim=True)
             after.set(self.value_estimator.tensor_keys.value, value)
             transitions = tensordict.copy().set("next", after)
             return self.value_estimator.value_estimate(transitions).squeeze(-1)
@@ -215,7 +245,8 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         log_prob = self._log_probs(tensordict)
         prob = log_prob.exp()
-        loss = (prob * (self._alpha * log_prob - min_value)).sum(-1)
+        relative = self._relative(log_prob, tensordict)
+        loss = (prob * (self._alpha * relative - min_value)).sum(-1)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(loss, tensordict=tensordict, weights=weights)
         return loss, {"log_prob": (prob * log_prob).sum(-1).detach()}

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import SoftUpdate
@@ -156,6 +157,10 @@ def make_goal_training(found: Options, game: str, seed: int, **loss_kwargs: Any)
             "DistilledSource(GoalSource())."
         )
     goals = goals_of(load_options({"parts": found.saved["teacher"]}))
+    hidden = tuple(network.sizes[1:])
+    distilled = SkillMLP(128, network.num_actions, network.num_options, hidden=hidden)
+    distilled.requires_grad_(False)
+    network.store(list(distilled.parameters()))
     env = make_skill_env(game, network.num_options, skill_steps=1, num_envs=1, seed=seed)
     loss = DIAYNTrainer.make_loss(
         env,
@@ -163,7 +168,8 @@ def make_goal_training(found: Options, game: str, seed: int, **loss_kwargs: Any)
         objective=OptionGoals(goals),
         in_keys=["observation"],
         critic_keys=["observation"],
-        hidden=tuple(network.sizes[1:]),
+        hidden=hidden,
+        policy_prior=TensorDictModule(distilled, ["observation", "skill"], ["logits"]),
         seed=seed,
         **loss_kwargs,
     )
@@ -179,7 +185,9 @@ class FineTunedSource:
     .. math:: r = c_g\, r_{goal}(s, z, a, s') + c_e\, \mathrm{sign}(r_{game})
 
     with the goals' reward of :class:`OptionGoals`. The actor begins as the network that imitates
-    the rules; the critics learn alone first, since critics that know nothing would spoil it.
+    the rules, the critics learn alone first, and the policy is kept near where it began
+    (``policy_prior`` of :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`): critics of a
+    policy that hardly varies know little of other actions, and would spoil it.
 
     Attributes:
         source: gives the network, e.g. ``DistilledSource(GoalSource())``.
@@ -187,8 +195,8 @@ class FineTunedSource:
         warm_up: share of them in which only the critics learn.
         skill_steps: base steps for which an option is kept.
         goal_weight, game_weight: :math:`c_g`, :math:`c_e`.
-        lr: Adam's learning rate of the actor and of the critics.
-        alpha: weight of the entropy, fixed.
+        lr, critic_lr: Adam's learning rates of the actor and of the critics.
+        alpha: weight of the divergence from the network at the start, fixed.
         gamma: discount per base step.
         num_envs: emulators that play at a time.
         updates_per_batch: updates for every 64 base steps.
@@ -212,9 +220,10 @@ class FineTunedSource:
     skill_steps: int = 40
     goal_weight: float = 1.0
     game_weight: float = 1.0
-    lr: float = 3e-4
-    alpha: float = 0.02
-    gamma: float = 0.95
+    lr: float = 1e-4
+    critic_lr: float = 3e-4
+    alpha: float = 0.1
+    gamma: float = 0.9
     num_envs: int = 8
     updates_per_batch: int = 16
 
@@ -237,7 +246,6 @@ class FineTunedSource:
         )
         batch = 8 * self.num_envs
         batches = max(1, round(self.base_steps / batch))
-        first = round(self.warm_up * batches)
         env = make_skill_env(
             game,
             network.num_options,
@@ -246,25 +254,26 @@ class FineTunedSource:
             clip_reward=True,
             seed=seed,
         )
-        trainer = None
-        for count, lr in ((first, 0.0), (batches - first, self.lr)):
-            if not count:
-                continue
-            trainer = DIAYNTrainer(
-                env,
-                loss,
-                total_frames=count * batch,
-                frames_per_batch=batch,
-                updates_per_batch=self.updates_per_batch,
-                actor_lr=lr,
-                critic_lr=self.lr,
-                objective_lr=self.lr,
-                target_tau=0.01,
-                reward=reward,
-                seed=seed,
-            )
-            trainer.train()
-        assert trainer is not None
+        trainer = DIAYNTrainer(
+            env,
+            loss,
+            total_frames=batches * batch,
+            frames_per_batch=batch,
+            updates_per_batch=self.updates_per_batch,
+            actor_lr=0.0,
+            critic_lr=self.critic_lr,
+            objective_lr=self.critic_lr,
+            target_tau=0.01,
+            reward=reward,
+            seed=seed,
+        )
+
+        def begin_with_the_critics() -> None:
+            if trainer.collected_frames >= self.warm_up * self.base_steps:
+                _learning_rate(trainer.optimizer, "actor", self.lr)
+
+        trainer.register_op("pre_optim_steps", begin_with_the_critics)
+        trainer.train()
         network.load(_actor_parameters(loss))
         data = trainer.replay_buffer.storage.get(slice(None))
         share = loss.objective.reward(data).mean().item()
@@ -344,7 +353,7 @@ class RetrainedSource:
         training = found.training
         warm_up = self.warm_up if training is None else 0.0
         if training is None:
-            training = make_goal_training(found, game, seed, gamma=0.95, alpha_init=0.02)
+            training = make_goal_training(found, game, seed, gamma=0.9, alpha_init=0.1)
         loss = training.loss
         keys = list(dict.fromkeys([*loss.in_keys, *loss.objective.in_keys]))
         reward = SkillReward(

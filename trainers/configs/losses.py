@@ -143,6 +143,8 @@ class DiscreteSkillSACLossConfig(LossComponentConfig):
     """Target entropy as a fraction of log A."""
     target_entropy: Any = "auto"
     """Target entropy in nats."""
+    policy_prior: Any = None
+    """Writes the logits of a policy that pi is kept near; none: the uniform one."""
     num_qvalue_nets: int = 2
     """Number of critics."""
     loss_function: str = "l2"
