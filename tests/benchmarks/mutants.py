@@ -94,6 +94,18 @@ EQUIVALENT: dict[tuple[str, str, str, int], str] = {
         "0 -> 1",
         0,
     ): "node 0 is the root, which no option leads to",
+    (
+        "torchrl_hmcts/planners/kernels.py",
+        'if child >= 0 and nodes[child]["twin"] >= 0:',
+        "GtE -> Gt",
+        0,
+    ): "node 0 is the root, which no option leads to",
+    (
+        "torchrl_hmcts/planners/novelty.py",
+        "while size < 4 * num_features or size <= self._owners.shape[1]:",
+        "Mult -> Div",
+        0,
+    ): "how much room a hash table begins with; it is doubled until a state's values fit",
 }
 SWAPS: dict[type, type] = {
     ast.Lt: ast.LtE,
