@@ -10,6 +10,7 @@ episode being played at every 1,000th base step.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from torchrl_hmcts.trainers.experiments.run_folder import RunCurve
-from torchrl_hmcts.trainers.figures.curve_panels import common_steps
+from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS, common_steps
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
 from torchrl_hmcts.trainers.figures.intervals import bootstrap
 from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
@@ -29,8 +30,6 @@ _DPI = 110
 _FEW = 30
 RUNNING = "score_of_the_running_episode"
 """The curve of the running score."""
-_SECOND = {"deterministic": "#db2777", "sticky": "#65a30d"}
-_COLORS = {"deterministic": "#1d4ed8", "sticky": "#16a34a"}
 
 
 @dataclass(frozen=True)
@@ -178,6 +177,7 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
         raise figure.how_to_get_data(f"there is no run of {game} with its curves.")
     shown = Figure(figsize=(10.0, 4.2), layout="constrained")
     panels = shown.subplots(1, 2)
+    colors = dict(zip(groups, itertools.cycle(GROUP_COLORS), strict=False))
     running = any(RUNNING in row["curves"] for rows in groups.values() for row in rows)
     titles = {
         RUNNING if running else "score": "score of the episode being played"
@@ -186,17 +186,13 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
         "score_max": "highest score so far",
     }
     for axes, (entry, title) in zip(panels, titles.items(), strict=True):
-        shown_before: list[str] = []
-        for protocol, rows in groups.items():
+        for protocol, color in colors.items():
+            rows = groups[protocol]
             curves = [row["curves"][entry] for row in rows if entry in row["curves"]]
             if not curves:
                 continue
             steps, values = common_steps(curves)
-            name = protocol.partition(",")[0]
-            color, style = _COLORS.get(name, "#7c3aed"), "-"
-            if any(other.partition(",")[0] == name for other in shown_before):
-                color, style = _SECOND.get(name, "#db2777"), "--"  # another source of options
-            shown_before.append(protocol)
+            style = "--" if protocol.startswith("sticky") else "-"
             if len(curves) > 1:
                 axes.fill_between(
                     steps, values.min(0), values.max(0), color=color, alpha=0.16, linewidth=0
@@ -214,7 +210,7 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
         axes.spines[["top", "right"]].set_visible(False)
     source, (algorithm, baseline) = TABLE_5_1[game], best_baseline(game)
     panels[1].axhline(
-        source.score, color="#d97706", linestyle="--", linewidth=1.4, label="the source's highest"
+        source.score, color="#111827", linestyle="--", linewidth=1.4, label="the source's highest"
     )
     panels[0].axhline(
         baseline, color="#71717a", linestyle=":", linewidth=1.4, label=f"{algorithm} (Table A.1)"
