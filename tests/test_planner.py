@@ -530,6 +530,20 @@ def test_revisits_are_simulations_that_cost_no_simulator_call() -> None:
     assert planner.last_search.statistics()["revisits"] == 86
 
 
+def test_a_budget_of_simulations_is_spent_however_long_nothing_new_was_found() -> None:
+    # 10,000 fruitless revisits end a search only where nothing else does.
+    env = CountingEnv(BINARY_TREE, terminal=LEAVES)
+    planner = MCTSPlanner(
+        env,
+        tree_policy=UCT(20.0),
+        expand="one",
+        exhausted="revisit",
+        leaves_per_wave=8,
+        budget=simulations(10_500),
+    )
+    assert planner(env.reset())["num_simulations"].item() == 10_500
+
+
 def test_the_search_stops_when_its_nodes_are_used_up() -> None:
     env = TableEnv(RING)
     for leaves, most in ((1, 27), (4, 36)):  # 3 new nodes a leaf; the wave that crosses 25
