@@ -101,6 +101,12 @@ EQUIVALENT: dict[tuple[str, str, str, int], str] = {
         0,
     ): "node 0 is the root, which no option leads to",
     (
+        "torchrl_hmcts/planners/kernels.py",
+        "lowest = value if value < lowest else lowest",
+        "Lt -> LtE",
+        0,
+    ): "of two equal numbers either is the lower",
+    (
         "torchrl_hmcts/planners/novelty.py",
         "while size < 4 * num_features or size <= self._owners.shape[1]:",
         "Mult -> Div",
