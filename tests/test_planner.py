@@ -188,6 +188,21 @@ def test_an_exhausted_search_without_a_reward_says_that_it_found_no_plan() -> No
     assert plan.options.shape == (0,)
 
 
+def test_a_search_without_a_plan_counts_minus_one_steps_to_it() -> None:
+    env = TableEnv({(0, 0): (1, 0.0, 1), (1, 0): (0, 0.0, 1)})
+    search = MCTSPlanner(env, budget=simulations(5)).search(env.reset().unsqueeze(0))
+    assert search.expansions_to_plan.tolist() == [-1]
+    assert search.base_steps_to_plan.tolist() == [-1]
+
+
+def test_without_durations_an_option_is_discounted_by_gamma_and_by_0_where_it_ends() -> None:
+    env = TableEnv(BINARY_TREE, terminal=LEAVES)
+    search = MCTSPlanner(env, gamma=0.5, budget=FOREVER).search(env.reset().unsqueeze(0))
+    nodes = search.tree.nodes[0, : search.tree.num_nodes[0]]
+    assert len(nodes) == 15
+    assert sorted(nodes["discount"][1:].tolist()) == [0.0] * 8 + [0.5] * 6
+
+
 def test_roots_that_are_finished_cost_no_more_simulation() -> None:
     table = {(s, 0): (s + 1, float(s == 5), 1) for s in range(6)}
     env = CountingEnv(table, terminal=[6])
