@@ -47,7 +47,7 @@ TESTS = {  # of a file; others have the general ones of their folder
     "subtree_reuse transpositions planner_reference kernels_in_python",
     "search.py": "planner_golden array_search planner subtree_reuse transpositions novelty",
     "mcts.py": "planner_golden planner subtree_reuse evaluators transpositions planner_reference",
-    "tree.py": "planner_golden subtree_reuse array_search planner_reference tree_drawing",
+    "tree.py": "planner_golden subtree_reuse array_search planner_reference tree_drawing planner",
     "novelty.py": "novelty planner",
     "novelty_kernels.py": "novelty kernels_in_python",
     "transpositions.py": "transpositions",
