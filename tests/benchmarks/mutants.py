@@ -107,6 +107,12 @@ EQUIVALENT: dict[tuple[str, str, str, int], str] = {
         0,
     ): "of two equal numbers either is the lower",
     (
+        "torchrl_hmcts/planners/tree.py",
+        "if TYPE_CHECKING:",
+        "condition turned round",
+        0,
+    ): "what it imports is named in annotations only",
+    (
         "torchrl_hmcts/planners/novelty.py",
         "while size < 4 * num_features or size <= self._owners.shape[1]:",
         "Mult -> Div",
