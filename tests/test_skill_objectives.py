@@ -426,6 +426,21 @@ def make_loss(objective: SkillObjective, **kwargs: Any) -> DiscreteSkillSACLoss:
     )
 
 
+def test_the_td_error_is_the_larger_of_both_critics_distances_to_the_target() -> None:
+    loss = make_loss(make_objective("diayn", num_skills=4))
+    SoftUpdate(loss, tau=0.05)
+    td = make_env(6).rollout(1).reshape(-1).set("action", torch.arange(6) % 4)
+    td["next", "reward"] = torch.randn(6, 1)
+    _, metadata = loss.qvalue_loss(td)
+    values = loss._action_values(td, loss.qvalue_network_params)  # [2, 6, 4]
+    distances = (values[:, torch.arange(6), td["action"]] - loss._compute_target(td)).abs()
+    torch.testing.assert_close(metadata["td_error"], distances.amax(0).detach())
+    for i in range(2):
+        torch.testing.assert_close(
+            metadata[f"qvalue_loss_{i}"], distances[i].square().mean().detach()
+        )
+
+
 def make_prior(logits: list[float]) -> TensorDictModule:
     """Returns a policy that does not look at anything."""
     row = torch.tensor(logits)
