@@ -96,6 +96,18 @@ def test_states_are_found_as_in_a_dictionary(seed: int, num_bytes: int) -> None:
             held[1].clear()
 
 
+def test_what_was_forgotten_stays_so_when_room_is_made() -> None:
+    known = Transpositions("state")
+    known.start(1)
+    codes = np.arange(100, dtype=np.int64).reshape(-1, 1).view(np.uint8)
+    root, nodes = np.zeros(100, np.int64), np.arange(1, 101)
+    known.find(root[:1], codes[:1], nodes[:1])
+    known.restart(0)
+    assert (known.find(root[1:], codes[1:], nodes[1:]) == -1).all()  # more than the first room
+    assert known.find(root[:1], codes[:1], nodes[:1]).tolist() == [-1]
+    assert known.find(root, codes, nodes + 200).tolist() == nodes.tolist()
+
+
 def test_states_of_another_size_are_refused() -> None:
     known = Transpositions("state")
     known.start(1)
