@@ -104,8 +104,9 @@ def test_what_was_forgotten_stays_so_when_room_is_made() -> None:
     known.find(root[:1], codes[:1], nodes[:1])
     known.restart(0)
     assert (known.find(root[1:], codes[1:], nodes[1:]) == -1).all()  # more than the first room
-    assert known.find(root[:1], codes[:1], nodes[:1]).tolist() == [-1]
-    assert known.find(root, codes, nodes + 200).tolist() == nodes.tolist()
+    assert known.find(root[:1], codes[:1], np.array([500])).tolist() == [-1]
+    again = known.find(root, codes, nodes + 200)
+    assert again.tolist() == [500, *range(2, 101)]
 
 
 def test_states_of_another_size_are_refused() -> None:
