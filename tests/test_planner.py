@@ -196,11 +196,17 @@ def test_a_search_without_a_plan_counts_minus_one_steps_to_it() -> None:
 
 
 def test_without_durations_an_option_is_discounted_by_gamma_and_by_0_where_it_ends() -> None:
-    env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    search = MCTSPlanner(env, gamma=0.5, budget=FOREVER).search(env.reset().unsqueeze(0))
-    nodes = search.tree.nodes[0, : search.tree.num_nodes[0]]
-    assert len(nodes) == 15
-    assert sorted(nodes["discount"][1:].tolist()) == [0.0] * 8 + [0.5] * 6
+    env = ChainEnv(length=3)  # which writes no duration: state 2 ends the episode
+    planner = MCTSPlanner(env, gamma=0.5, budget=SearchBudget(expansions=4, until_plan=False))
+    assert planner.simulator.duration_key is None
+    search = planner.search(env.reset().unsqueeze(0))
+    count = search.tree.num_nodes[0]
+    discounts = search.tree.nodes["discount"][0, 1:count]
+    states = search.tree.get_states(
+        np.zeros(count - 1, np.int64), np.arange(1, count), planner.simulator.state_keys
+    )["state"]
+    assert set(states.flatten().tolist()) == {0, 1, 2}
+    assert discounts.tolist() == [0.0 if s == 2 else 0.5 for s in states.flatten().tolist()]
 
 
 def test_roots_that_are_finished_cost_no_more_simulation() -> None:
