@@ -11,7 +11,12 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS
-from torchrl_hmcts.trainers.figures.atari_results import TABLE_5_1, TABLE_A_1, best_baseline
+from torchrl_hmcts.trainers.figures.atari_results import (
+    TABLE_5_1,
+    TABLE_A_1,
+    _how,
+    best_baseline,
+)
 from torchrl_hmcts.trainers.figures.dissertation import FIGURES, find_figure, find_results
 
 ASKED = (
@@ -147,6 +152,20 @@ def test_table_5_1_has_ours_beside_the_sources_and_the_baselines(tmp_path) -> No
     page = (tmp_path / "table5.1.html").read_text()
     assert "Table A.1" in page
     assert "trpo_mpi" in page
+    # (60 - 1.7) / (30.5 - 1.7), the mean of three seeds, beside one seed under sticky actions
+    rows = [re.sub("<[^>]+>", " ", row).split() for row in page.split("</tr>")]
+    assert [row for row in rows if "final" in row] == [
+        ["deterministic", "final", "2.02", "1.68", "to", "2.37", "1"],
+        ["sticky", "final", "1.68", "a", "game", "has", "one", "seed", "1"],
+    ]
+
+
+def test_frames_per_decision_are_those_of_the_episodes_alone() -> None:
+    episodes = [{"decisions": 30}, {"decisions": 20}]
+    spent = {"frames": 6_000, "frames_finding_options": 800, "frames_tuning": 200}
+    old = {**spent, "episodes": episodes, "source": "goals", "options": ["a", "b"]}
+    assert _how([{**old, "option_steps": 5, "seconds": 7.4}]) == ["goals", "2, 5", 6_000, 100, 7]
+    assert _how([{**old, "frames_per_decision": 90.0}])[3] == 90
 
 
 def test_the_sources_numbers_fit_each_other() -> None:

@@ -19,27 +19,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from torchrl_hmcts.trainers.experiments.run_folder import read_curves
 from torchrl_hmcts.trainers.figures.atari_results import (
     RUNNING,
     TABLE_5_1,
+    aggregate,
     best_baseline,
     best_source,
+    human_normalised,
 )
-from torchrl_hmcts.trainers.figures.intervals import interquartile_mean
 
-# Human and random scores as in dqn_zoo's atari_data.py.
-HUMAN = {
-    "BeamRider": (16926.5, 363.9),
-    "Breakout": (30.5, 1.7),
-    "Enduro": (860.5, 0.0),
-    "SpaceInvaders": (1668.7, 148.0),
-    "Qbert": (13455.0, 163.9),
-    "Seaquest": (42054.7, 68.4),
-    "Pong": (14.6, -20.7),
-}
 UCT_SOURCE = "primitive actions, UCT"
 BEST = "the best of each game"
 KEPT = (
@@ -104,21 +93,6 @@ def add_known(rows: list[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
     return sorted(every, key=lambda row: tuple(map(str, key_of(row))))
 
 
-def bootstrap(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
-    """Interquartile mean and its 95 % interval, resampling the seeds within each game."""
-    generator = np.random.default_rng(0)
-    drawn = [generator.choice(np.array(g), size=(draws, len(g))) for g in scores]
-    means = interquartile_mean(np.concatenate(drawn, -1))
-    middle = float(interquartile_mean(np.concatenate([np.array(g) for g in scores])))
-    low, high = np.percentile(means, [2.5, 97.5])
-    return middle, float(low), float(high)
-
-
-def normalised(row: Mapping[str, Any], key: str) -> float:
-    human, random = HUMAN[row["game"]]
-    return (row[key] - random) / (human - random)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="*")
@@ -160,8 +134,8 @@ def main() -> None:
             )
         for key in ("score_max", "score_final"):
             games = sorted({row["game"] for row in members})
-            scores = [[normalised(r, key) for r in members if r["game"] == g] for g in games]
-            middle, low, high = bootstrap(scores)
+            scores = [[human_normalised(r, key) for r in members if r["game"] == g] for g in games]
+            middle, low, high = aggregate(scores)
             summary.append(
                 {
                     "protocol": protocol,

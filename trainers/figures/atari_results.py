@@ -17,13 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from torchrl_hmcts.trainers.experiments.run_folder import RunCurve
 from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS, common_steps
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
-from torchrl_hmcts.trainers.figures.intervals import bootstrap
+from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
 from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
 
 _DPI = 110
@@ -55,6 +56,18 @@ TABLE_5_1 = {
     "Pong": SourceScore(20, 3, 10),
 }
 """The dissertation's Table 5.1, by game."""
+
+# Human and random scores as in dqn_zoo's atari_data.py.
+HUMAN_AND_RANDOM = {
+    "BeamRider": (16926.5, 363.9),
+    "Breakout": (30.5, 1.7),
+    "Enduro": (860.5, 0.0),
+    "SpaceInvaders": (1668.7, 148.0),
+    "Qbert": (13455.0, 163.9),
+    "Seaquest": (42054.7, 68.4),
+    "Pong": (14.6, -20.7),
+}
+"""Scores that count as 1 and 0 where scores are normalised, by game."""
 
 _A_1_GAMES = ("Enduro", "SpaceInvaders", "Qbert", "Seaquest", "Pong", "BeamRider", "Breakout")
 TABLE_A_1 = {
@@ -129,6 +142,47 @@ def _by_source(
             name = protocol if len(found) == 1 else f"{protocol}, options: {source}"
             split[name] = [row for row in rows if str(row.get("source", "")) == source]
     return split
+
+
+def human_normalised(row: Mapping[str, Any], key: str) -> float:
+    """Return a run's score in units of what a human scores more than random play.
+
+    Args:
+        row: summary of a run.
+        key: ``"score_max"`` or ``"score_final"``.
+
+    Reference:
+        Mnih et al., "Human-level control through deep reinforcement learning", 2015.
+
+    Example:
+        >>> human_normalised({"game": "Pong", "score_max": 14.6}, "score_max")
+        1.0
+    """
+    human, random = HUMAN_AND_RANDOM[row["game"]]
+    return float((row[key] - random) / (human - random))
+
+
+def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
+    """Return the interquartile mean over games and seeds with its stratified 95 % interval.
+
+    Args:
+        scores: human-normalised, of the seeds of each game.
+        draws: resamples of the seeds within each game, from a fixed seed.
+
+    Reference:
+        Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
+        2021, arXiv 2108.13264.
+
+    Example:
+        >>> aggregate([[1.0], [2.0], [3.0], [10.0]])
+        (2.5, 2.5, 2.5)
+    """
+    generator = np.random.default_rng(0)
+    drawn = [generator.choice(np.array(g), size=(draws, len(g))) for g in scores]
+    means = interquartile_mean(np.concatenate(drawn, -1))
+    middle = float(interquartile_mean(np.concatenate([np.array(g) for g in scores])))
+    low, high = np.percentile(means, [2.5, 97.5])
+    return middle, float(low), float(high)
 
 
 def best_source(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -264,6 +318,21 @@ def write_table(sources: Sources, path: Path, name: str) -> str:
             line.append(_interval([float(r["score_final"]) for r in group if "score_final" in r]))
             line.append(len(group))
         cells.append(line)
+    ours = {
+        protocol: [best_source(by_protocol(rows, game).get(protocol, [])) for game in TABLE_5_1]
+        for protocol in protocols
+    }
+    how = [
+        [game, protocol, *_how(group)]
+        for protocol in protocols
+        for game, group in zip(TABLE_5_1, ours[protocol], strict=True)
+        if group
+    ]
+    means = [
+        [protocol, text(key.replace("score_", "")), *_aggregated(ours[protocol], key)]
+        for protocol in protocols
+        for key in ("score_max", "score_final")
+    ]
     baselines = [
         [algorithm, *(row[game] for game in TABLE_5_1)] for algorithm, row in TABLE_A_1.items()
     ]
@@ -277,6 +346,10 @@ def write_table(sources: Sources, path: Path, name: str) -> str:
             "Table 5.1",
             Html(f'<p class="lead">{text(note)}</p>'),
             table(cells, head),
+            Html("<h2>What they took</h2>"),
+            table(how, _HOW),
+            Html("<h2>Human-normalised scores of all games</h2>"),
+            table(means, ["protocol", "score", "interquartile mean", "95 % interval", "games"]),
             Html("<h2>Table A.1: means of OpenAI Baselines, as the source gives them</h2>"),
             table(baselines, ["", *TABLE_5_1]),
         )
@@ -286,6 +359,45 @@ def write_table(sources: Sources, path: Path, name: str) -> str:
     text_file = path.with_suffix(".md")
     text_file.write_text("\n".join(f"| {line} |" for line in markdown) + "\n")
     return f"Table 5.1 with {len(rows)} run(s) of ours; as Markdown: {text_file.name}."
+
+
+_HOW = (
+    "game", "protocol", "options from", "options, steps", "frames, all kinds",
+    "frames per decision", "seconds",
+)  # fmt: skip
+
+
+def _how(group: Sequence[Mapping[str, Any]]) -> list[Any]:
+    """What the runs of a game took: means over the seeds."""
+    first = group[0]
+
+    def mean(key: str) -> Any:
+        values = [float(row[key]) for row in group if row.get(key) is not None]
+        return round(sum(values) / len(values)) if values else "-"
+
+    per_decision = mean("frames_per_decision")
+    if per_decision == "-" and first.get("episodes"):  # a run of before it was written
+        decisions = sum(int(e["decisions"]) for row in group for e in row["episodes"])
+        spent = ("frames_finding_options", "frames_tuning")
+        frames = sum(row["frames"] - sum(row.get(key, 0) for key in spent) for row in group)
+        per_decision = round(frames / max(1, decisions))
+    found = f"{len(first.get('options', []))}, {first.get('option_steps', '-')}"
+    return [first.get("source", "-"), found, mean("frames"), per_decision, mean("seconds")]
+
+
+def _aggregated(groups: Sequence[Sequence[Mapping[str, Any]]], key: str) -> list[Any]:
+    """The interquartile mean over all games with its interval, if every game has two seeds."""
+    scores = [[human_normalised(row, key) for row in group if key in row] for group in groups]
+    scores = [seeds for seeds in scores if seeds]
+    if not scores:
+        return ["-", "-", 0]
+    middle, low, high = aggregate(scores)
+    several = min(map(len, scores)) > 1  # one run of a game says nothing about others of it
+    return [
+        f"{middle:.2f}",
+        f"{low:.2f} to {high:.2f}" if several else "a game has one seed",
+        len(scores),
+    ]
 
 
 def _interval(values: list[float]) -> Html | str:
