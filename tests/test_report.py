@@ -23,7 +23,7 @@ from torchrl_hmcts.trainers.experiments.run_folder import (
 )
 from torchrl_hmcts.trainers.figures.comparison_page import group_runs
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
-from torchrl_hmcts.trainers.figures.page_parts import plain
+from torchrl_hmcts.trainers.figures.page_parts import picture, plain
 from torchrl_hmcts.trainers.figures.report import write_page, write_run_page
 
 EVIL = '<script>alert("x")</script>'
@@ -73,6 +73,15 @@ def test_the_page_of_a_run_shows_figures_pictures_curve_config_and_command(tmp_p
     assert "2 CPUs, Linux x86_64" in page
     assert "Base steps of training" in page  # what the key means
     assert 'title="default: 2000000">4000' in page  # what is not the default stands out
+
+
+def test_a_gif_with_a_video_beside_it_links_to_it(tmp_path) -> None:
+    path = tmp_path / "episode.gif"
+    iio.imwrite(path, np.zeros((2, 8, 8, 3), np.uint8), loop=0)
+    assert "mp4" not in picture(path, "An episode.", embed=False)
+    path.with_suffix(".mp4").write_bytes(b"x")
+    assert '<a href="episode.mp4">As a video</a>' in picture(path, "An episode.", embed=False)
+    assert "mp4" not in picture(path, "An episode.", embed=True)  # it does not lie beside the page
 
 
 def test_a_page_names_no_folder_of_the_machine(tmp_path) -> None:

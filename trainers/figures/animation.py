@@ -1,4 +1,4 @@
-"""GIFs of episodes."""
+"""GIFs and videos of episodes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import imageio.v3 as iio
+import imageio_ffmpeg
 import numpy as np
 from tensordict import TensorDictBase
 
@@ -58,12 +59,12 @@ def write_gif(
     milliseconds: float,
     last: float | None = 1500.0,
 ) -> None:
-    """Write pictures as an endless GIF.
+    """Write pictures as an endless GIF, and as a video beside it (``.mp4``, H.264).
 
     Args:
         frames: uint8 ``[height, width, 3]`` each. Where several in a row are the same, one is
-            written that is shown as long as all of them.
-        path: file to write.
+            written into the GIF that is shown as long as all of them.
+        path: GIF to write; the video has the same name.
         milliseconds: for which a frame is shown.
         last: milliseconds for which the last one is shown. Default: a second and a half; ``None``:
             as long as the others.
@@ -78,6 +79,29 @@ def write_gif(
         durations[-1] += last - milliseconds
     shown: float | list[float] = durations if len(kept) > 1 else durations[0]
     iio.imwrite(path, np.stack(kept), extension=".gif", duration=shown, loop=0)
+    still = 0 if last is None else round(last / milliseconds) - 1
+    _write_video([*frames, *[frames[-1]] * still], Path(path).with_suffix(".mp4"), milliseconds)
+
+
+def _write_video(frames: Sequence[np.ndarray], path: Path, milliseconds: float) -> None:
+    """Write pictures as a video; ones of odd height or width get a row or column more."""
+    height, width = frames[0].shape[:2]
+    room = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 halves the colours' resolution
+    shown = [np.pad(frame, room, mode="edge") for frame in frames]
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        (width + width % 2, height + height % 2),
+        fps=1000.0 / milliseconds,
+        codec="libx264",
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+    )
+    writer.send(None)
+    try:
+        for frame in shown:
+            writer.send(np.ascontiguousarray(frame))
+    finally:
+        writer.close()
 
 
 def _pale(color: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -113,7 +113,7 @@ def plain(value: Any) -> str:
 
 
 def picture(path: Path, caption: str | Html = "", *, embed: bool) -> Html:
-    """Return a picture with its caption.
+    """Return a picture with its caption, and a link to the video of the same name if there is one.
 
     Args:
         path: PNG, GIF or SVG.
@@ -126,7 +126,11 @@ def picture(path: Path, caption: str | Html = "", *, embed: bool) -> Html:
         data = base64.b64encode(path.read_bytes()).decode()
         source = f"data:{_MEDIA[path.suffix.lower()]};base64,{data}"
     alt = html.escape(caption or path.stem)
-    shown = f"<figcaption>{text(caption)}</figcaption>" if caption else ""
+    video = path.with_suffix(".mp4")
+    link = ""
+    if path.suffix.lower() == ".gif" and video.is_file() and not embed:
+        link = f' <a href="{html.escape(video.name)}">As a video</a>'
+    shown = f"<figcaption>{text(caption)}{link}</figcaption>" if caption or link else ""
     image = f'<img src="{html.escape(source)}" alt="{alt}"{kind}>'
     return Html(f'<figure><div class="scroll">{image}</div>{shown}</figure>')
 
