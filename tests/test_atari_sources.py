@@ -301,7 +301,7 @@ def test_while_the_critics_warm_up_the_actor_stays_and_then_it_learns() -> None:
     assert 0.0 <= other.report["fine_tuned_goal_reward"] <= 1.0
     again = load_options(other.saved)
     assert again.worker.weights.equal(other.worker.worker.weights)
-    assert len(other.training.data) == 48  # of the second half
+    assert len(other.training.data) == 96  # those of the warm-up too
 
 
 def test_what_cannot_be_trained_further_is_refused() -> None:

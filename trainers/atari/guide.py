@@ -178,8 +178,8 @@ class SearchGuide:
                 loss.backward()
                 self._optimizer.step()
                 rows.append(out.detach())
-        means = torch.stack(rows).mean(0)  # type: ignore[call-overload]
-        self.last = {key: float(value) for key, value in means.items()}
+        stacked: Any = torch.stack(rows)  # type: ignore[call-overload]
+        self.last = {key: float(value) for key, value in stacked.mean(0).items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return weights, optimiser, examples and counters, plain data and tensors."""

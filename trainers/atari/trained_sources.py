@@ -268,8 +268,10 @@ class FineTunedSource:
             seed=seed,
         )
 
+        alone = round(self.warm_up * batches) * batch
+
         def begin_with_the_critics() -> None:
-            if trainer.collected_frames >= self.warm_up * self.base_steps:
+            if trainer.collected_frames > alone:
                 _learning_rate(trainer.optimizer, "actor", self.lr)
 
         trainer.register_op("pre_optim_steps", begin_with_the_critics)
