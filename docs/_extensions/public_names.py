@@ -97,7 +97,12 @@ def tensorclass_docstring(
 def skip_foreign(
     app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any
 ) -> bool | None:
-    """Leave out what a decorator of tensordict put into a class of ours."""
+    """Leave out what a decorator of tensordict put into a class of ours, and fields of tuples.
+
+    The fields of a NamedTuple are among the Attributes of its docstring already.
+    """
+    if type(obj).__name__ == "_tuplegetter":
+        return True
     function = getattr(obj, "fget", None) or getattr(obj, "__func__", obj)
     module = getattr(function, "__module__", None) or ""
     return True if module.startswith(("tensordict", "torch.", "torchrl.")) else None
