@@ -406,6 +406,7 @@ def test_every_python_block_of_the_page_runs(
     assert len(blocks) == 4
     for block in blocks:
         exec(compile(block, str(page), "exec"), namespace)  # noqa: S102
-    assert {path.name for path in tmp_path.iterdir()} == {"episode.png", "episode.gif"}
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {"episode.png", "episode.gif", "episode.mp4"}
     for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", text):
         assert (page.parent / target).exists(), f"links to {target}, which is missing"
