@@ -5,14 +5,17 @@ Letters: *B batch of the tensordict, m its elements, T ``max_steps``.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -26,6 +29,25 @@ from torchrl_hmcts.envs.atari_process import (
 )
 from torchrl_hmcts.envs.atari_ram import NO_OP_STARTS, atari_specs
 from torchrl_hmcts.envs.atari_workers import OptionWorker
+
+
+@dataclass
+class PendingStep:
+    """A step of a pool that was begun: the ticket of :meth:`AtariOptionPool.step_async`."""
+
+    tensordict: TensorDictBase
+    slots: list[int] | None  # None once it was used
+    done: list[np.ndarray]  # outcomes of what the slots had no room for, before them
+
+    def use(self) -> list[int]:
+        """Return the slots, once."""
+        if self.slots is None:
+            raise RuntimeError(
+                "This step was waited for before, and its outcome returned then. Call step_async "
+                "again to take another."
+            )
+        slots, self.slots = self.slots, None
+        return slots
 
 
 class AtariOptionPool(EnvBase):
@@ -195,6 +217,7 @@ class AtariOptionPool(EnvBase):
             self._slots = self._processes.slots
         else:
             self._slots = np.zeros(NUM_SLOTS, slot_type(width, run))
+        self._free = list(range(NUM_SLOTS))  # slots that no step under way uses
         self.on_step: Callable[[TensorDictBase, TensorDictBase], object] | None = None
         """Called with what was stepped and what came of it, e.g. to keep what a search simulates
         (with ``record=True`` the steps inside the options, too)."""
@@ -275,7 +298,7 @@ class AtariOptionPool(EnvBase):
                 "tensordict has not. Pass what reset() or a step wrote."
             )
         # Rows of an AtariRAMEnv may hold its random generator, which is not a planner's to know.
-        rows: np.ndarray = row.numpy(force=True)[..., : self._emulator.states.width]
+        rows = _array(row)[..., : self._emulator.states.width]
         return rows.reshape(-1, rows.shape[-1])
 
     def _begin(self, count: int) -> dict[str, np.ndarray]:
@@ -296,20 +319,35 @@ class AtariOptionPool(EnvBase):
         return out
 
     def _observed(self, out: dict[str, np.ndarray], shape: torch.Size) -> TensorDict:
-        ram = torch.from_numpy(out["ram"])
+        if "observation" in self._read_outs:  # by numpy: torch is slow where its code is not cached
+            out["observation"] = out["ram"] / np.float32(255.0)
         if "ram" not in self._read_outs:
             del out["ram"]
         entries = {key: torch.from_numpy(value) for key, value in out.items()}
-        if "observation" in self._read_outs:
-            entries["observation"] = ram.to(torch.float32) / 255.0
         if len(shape) != 1:
             entries = {k: v.reshape(*shape, *v.shape[1:]) for k, v in entries.items()}
         return TensorDict._new_unsafe(entries, shape)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        shape = tensordict.batch_size
+        return self.step_wait(self.step_async(tensordict))
+
+    def step_async(self, tensordict: TensorDictBase) -> PendingStep:
+        """Begin a step, on which the processes work while the caller goes on.
+
+        Several can be under way. With ``num_processes=0`` a step is done at once.
+
+        Args:
+            tensordict: what a step reads, of any batch shape.
+
+        Returns:
+            A ticket for :meth:`step_wait`.
+
+        Raises:
+            ValueError: if an option does not exist.
+            RuntimeError: if the steps under way take all the room there is.
+        """
         rows = self._rows(tensordict)
-        options = tensordict.get("option").numpy(force=True).reshape(-1)
+        options = _array(tensordict.get("option")).reshape(-1)
         count = len(rows)
         if count and not (0 <= options.min() and options.max() < self.num_options):
             bad = int(options.min()) if options.min() < 0 else int(options.max())
@@ -320,38 +358,83 @@ class AtariOptionPool(EnvBase):
         if not self.determinised:
             seeds = (self._key + self._num_calls + np.arange(count)) & np.iinfo(np.int64).max
             self._num_calls += count
-        out = self._begin(count)
-        rewards = np.zeros((count, 1), np.float32)
-        flags = {key: np.zeros((count, 1), np.bool_) for key in ("terminated", "truncated")}
-        for begin in range(0, count, NUM_SLOTS):
-            part = slice(begin, min(begin + NUM_SLOTS, count))
-            used = self._slots[: part.stop - begin]
-            used["state"], used["option"], used["seed"] = rows[part], options[part], seeds[part]
-            self._run_slots(len(used))
-            out["emulator_state"][part], out["ram"][part] = used["after"], used["ram"]
-            rewards[part, 0] = used["reward"]
-            for key in ("score", "life_losses", "duration", "lives", "episode_frame"):
-                out[key][part, 0] = used[key]
-            for key, flag in flags.items():
-                flag[part, 0] = used[key]
-            if self._run.record:
-                for key in ("inner_ram", "inner_action", "inner_reward"):
-                    out[key][part] = used[key]
-        reward = rewards - np.float32(self.life_loss_penalty) * out["life_losses"]
-        result = self._observed(out, shape)
-        ends = {**flags, "done": flags["terminated"] | flags["truncated"], "reward": reward}
-        for key, value in ends.items():
-            result.set(key, torch.from_numpy(value).reshape(*shape, 1))
+        if count and not self._free:
+            raise RuntimeError(
+                f"All the {NUM_SLOTS} options that a pool has room for are under way. Call "
+                f"step_wait with the tickets of earlier steps first."
+            )
+        done, begin = [], 0
+        while True:
+            slots = self._free[: count - begin]
+            part = slice(begin, begin + len(slots))
+            del self._free[: len(slots)]
+            for field, values in (("state", rows), ("option", options), ("seed", seeds)):
+                self._slots[field][slots] = values[part]
+            self._submit(slots)
+            begin = part.stop
+            if begin == count:
+                return PendingStep(tensordict, slots, done)
+            done.append(self._collect(slots))  # more than there is room for: in several goes
+
+    def step_wait(self, ticket: PendingStep) -> TensorDictBase:
+        """Wait for a step that was begun and return what it writes as next.
+
+        Args:
+            ticket: from :meth:`step_async`; each counts once.
+
+        Raises:
+            RuntimeError: if the worker raises an error, the processes were stopped meanwhile, or
+                the ticket was used before.
+        """
+        outcomes = [*ticket.done, self._collect(ticket.use())]
+        result = self._outcome(np.concatenate(outcomes), ticket.tensordict.batch_size)
         if self.on_step is not None:
-            self.on_step(tensordict, result)
+            self.on_step(ticket.tensordict, result)
         return result
 
-    def _run_slots(self, count: int) -> None:
-        if self._processes is not None:
-            self._processes.run_slots(count)
-            return
-        for i in range(count):
-            run_option(self._emulator, self.worker, self._run, self._slots, i, self._own_frames)
+    def step_abandon(self, ticket: PendingStep) -> None:
+        """Give up a step that was begun, for which nobody will wait."""
+        if ticket.slots is not None:
+            with contextlib.suppress(RuntimeError):
+                self._collect(ticket.use())
+
+    def _submit(self, slots: list[int]) -> None:
+        try:
+            if self._processes is not None:
+                self._processes.submit(slots)
+                return
+            for i in slots:
+                run_option(self._emulator, self.worker, self._run, self._slots, i, self._own_frames)
+        except BaseException:
+            self._free += slots
+            raise
+
+    def _collect(self, slots: list[int]) -> np.ndarray:
+        """Wait for the options in some slots, free these and return what they held."""
+        try:
+            if self._processes is not None:
+                self._processes.wait(slots)
+            outcomes: np.ndarray = self._slots[slots]
+            return outcomes
+        finally:
+            self._free += slots
+
+    def _outcome(self, used: np.ndarray, shape: torch.Size) -> TensorDict:
+        """What a step writes, from slots whose options have been run."""
+        out = {"emulator_state": used["after"].copy(), "ram": used["ram"].copy()}
+        for key in ("lives", "episode_frame", "duration"):
+            out[key] = used[key].reshape(-1, 1)
+        for key in ("score", "life_losses"):
+            out[key] = used[key].astype(np.float32).reshape(-1, 1)
+        for key in ("terminated", "truncated"):
+            out[key] = used[key].reshape(-1, 1)
+        out["done"] = out["terminated"] | out["truncated"]
+        rewards = used["reward"].astype(np.float32).reshape(-1, 1)
+        out["reward"] = rewards - np.float32(self.life_loss_penalty) * out["life_losses"]
+        if self._run.record:
+            for key in ("inner_ram", "inner_action", "inner_reward"):
+                out[key] = used[key].copy()
+        return self._observed(out, shape)
 
     def render(self, tensordict: TensorDictBase) -> np.ndarray:
         """Return a state's picture, uint8 ``[210, 160, 3]``; see :meth:`AtariRAMEnv.render`."""
@@ -367,6 +450,11 @@ class AtariOptionPool(EnvBase):
         if self._processes is not None:
             self._processes.stop()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    array: np.ndarray = (tensor if tensor.is_cpu else tensor.cpu()).numpy()
+    return array
 
 
 def _check_worker(worker: Any, emulator: AtariEmulator) -> None:

@@ -14,6 +14,7 @@ import os
 import select
 import signal
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,8 +25,8 @@ from torch import Tensor
 from torchrl_hmcts.envs.atari_emulator import AtariEmulator
 from torchrl_hmcts.envs.atari_workers import OptionWorker
 
-NUM_SLOTS = 128
-"""Options that can be under way at once; more are run in several goes."""
+NUM_SLOTS = 512
+"""Options that can be under way at once; larger batches are run in several goes."""
 
 _NUMBER = np.dtype("<i4")
 _MAX_MESSAGE = 4000  # of an error; what a pipe takes at once
@@ -203,7 +204,7 @@ class EmulatorProcesses:
         start_method: ``"forkserver"`` or ``"spawn"``.
 
     Raises:
-        RuntimeError: in :meth:`run_slots`, if the worker fails or processes die again and again.
+        RuntimeError: in :meth:`wait`, if the worker fails or processes die again and again.
     """
 
     def __init__(
@@ -227,6 +228,8 @@ class EmulatorProcesses:
         self._memory = Channel(memory, frames)
         self.slots, self._frames = self._memory.views(slot)
         self._running: _Running | None = None
+        self._waiting: set[int] = set()  # slots whose options are under way
+        self._lost: set[int] = set()  # slots whose options will not be run
 
     @property
     def num_frames(self) -> int:
@@ -267,60 +270,77 @@ class EmulatorProcesses:
                 end.close()
         self._running = running
 
-    def run_slots(self, count: int) -> None:
-        """Run the options in the first ``count`` slots."""
-        if not count:
-            return
+    def submit(self, slots: Sequence[int]) -> None:
+        """Have the options in some slots run; :meth:`wait` says when they are done."""
         try:
-            waiting, deaths = set(range(count)), 0
-            while waiting:
-                before = len(waiting)
-                self.start()
-                dead = self._run(waiting)
-                deaths = len(dead) if len(waiting) < before else deaths + len(dead)
+            self.start()
+            self._waiting.update(slots)
+            self._lost.difference_update(slots)
+            self._write(slots)
+        except BaseException:
+            self.stop()
+            raise
+
+    def wait(self, slots: Sequence[int]) -> None:
+        """Wait until the options in some slots have been run."""
+        if not self._lost.isdisjoint(slots):
+            raise RuntimeError(
+                "The processes were stopped while this step was under way, by an error or by "
+                "close(), so that it has no outcome. Take the step again."
+            )
+        try:
+            deaths = 0
+            while not self._waiting.isdisjoint(slots):
+                before = len(self._waiting)
+                dead = self._listen()
+                deaths = len(dead) if len(self._waiting) < before else deaths + len(dead)
                 self.num_restarts += len(dead)
-                if waiting and deaths >= _DEATHS_IN_A_ROW:
+                if self._running is not None or not self._waiting:
+                    continue
+                if deaths >= _DEATHS_IN_A_ROW:
                     raise RuntimeError(
                         f"{deaths} processes of the pool died one after the other without an "
                         f"outcome, with the exit codes {dead} (a negative one is a signal). If "
                         f"they die at once, put what the script does under "
                         f"`if __name__ == '__main__':`, as multiprocessing needs it."
                     )
+                self.start()
+                self._write(sorted(self._waiting))
         except BaseException:  # e.g. an interrupt: outcomes still under way are nobody's
             self.stop()
             raise
 
-    def _run(self, waiting: set[int]) -> list[int | None]:
-        """Run what is waiting until all is done or a process dies; return their exit codes."""
+    def _write(self, slots: Sequence[int]) -> None:
+        assert self._running is not None
+        with contextlib.suppress(BrokenPipeError):  # all have died
+            os.write(self._running.jobs.fileno(), np.array(slots, _NUMBER).tobytes())
+
+    def _listen(self) -> list[int | None]:
+        """Take what is done, an option at least, or stop all if one died; return exit codes."""
         running = self._running
         assert running is not None
         results = running.results.fileno()
-        with contextlib.suppress(BrokenPipeError):  # all have died
-            os.write(running.jobs.fileno(), np.array(sorted(waiting), _NUMBER).tobytes())
-        while waiting:
-            ready = [fd for fd, _ in running.poll.poll()]
-            if results in ready:
-                waiting.difference_update(_numbers(results))
-            if results not in ready or len(ready) > 1:
-                return self._bury(running, waiting)
-        return []
-
-    def _bury(self, running: _Running, waiting: set[int]) -> list[int | None]:
-        """Take what was finished, and stop those that live: who had what cannot be known."""
+        ready = [fd for fd, _ in running.poll.poll()]
+        if results in ready:
+            self._waiting.difference_update(_numbers(results))
+        if ready == [results]:
+            return []
         if running.errors.poll():
             text = os.read(running.errors.fileno(), _MAX_MESSAGE).decode(errors="replace")
             if text:
                 raise RuntimeError(f"An option failed in {text}")
         codes = [p.exitcode for p in running.processes if not p.is_alive()]
-        self.stop(collect=waiting)
+        self._kill()  # those that live, too: who had what cannot be known
         return codes
 
-    def stop(self, *, collect: set[int] | None = None) -> None:
-        """Stop the processes; they start again when needed.
+    def stop(self) -> None:
+        """Stop the processes, which start again when needed; what is under way is lost."""
+        self._kill()
+        self._lost |= self._waiting
+        self._waiting.clear()
 
-        Args:
-            collect: takes out of this set what they had finished.
-        """
+    def _kill(self) -> None:
+        """Stop the processes and take what they had finished."""
         running, self._running = self._running, None
         if running is None:
             return
@@ -329,11 +349,11 @@ class EmulatorProcesses:
             process.kill()
         for process in running.processes:
             process.join(5.0)
-        while collect is not None and running.results.poll():
+        while running.results.poll():
             numbers = _numbers(running.results.fileno())
             if not numbers:
                 break
-            collect.difference_update(numbers)
+            self._waiting.difference_update(numbers)
         for process in running.processes:
             with contextlib.suppress(ValueError):
                 process.close()

@@ -20,6 +20,7 @@ from torchrl_hmcts.envs import (  # noqa: E402
     RepeatActions,
     SharedMLP,
 )
+from torchrl_hmcts.envs.atari_process import NUM_SLOTS  # noqa: E402
 from torchrl_hmcts.modules import SkillMLP  # noqa: E402
 from torchrl_hmcts.planners import (  # noqa: E402
     PUCT,
@@ -28,6 +29,7 @@ from torchrl_hmcts.planners import (  # noqa: E402
     MCTSPlanner,
     MostVisited,
     SearchBudget,
+    TreeRollout,
 )
 
 OUTCOME = ["emulator_state", "ram", "reward", "duration", "lives", "done", "life_losses"]
@@ -232,13 +234,15 @@ def test_processes_that_die_again_and_again_are_an_error(tmp_path):
     assert pool.pids == []
 
 
-def test_killed_processes_do_not_change_a_search(pool, worker):
+@pytest.mark.parametrize("waves", [1, 2])
+def test_killed_processes_do_not_change_a_search(pool, worker, waves):
     planner = MCTSPlanner(
         pool,
         tree_policy=PUCT(),
         backup=MaxBackup(),
         expand="one",
         leaves_per_wave=6,
+        waves_in_flight=waves,
         budget=SearchBudget(base_steps=600, until_plan=False),
     )
     td = pool.reset()
@@ -258,8 +262,105 @@ def test_killed_processes_do_not_change_a_search(pool, worker):
         assert (left[0, :count] == right[0, :count]).all(), field
 
 
+def test_steps_under_way_at_the_same_time_do_not_touch_each_other(pool, worker):
+    here = local(worker)
+    td = here.reset()
+    batches = [every_option(td, pool, copies=k) for k in (1, 3, 2)]
+    for batch in batches:
+        batch["option"] = batch["option"].flip(0)
+    for order in ((0, 1, 2), (2, 0, 1)):
+        tickets = [pool.step_async(batch.clone()) for batch in batches]
+        assert pool.step(batches[0].clone())["next", "ram"].shape[0] == 3  # and others besides
+        for i in order:
+            after, expected = pool.step_wait(tickets[i]), here.step(batches[i].clone())["next"]
+            for key in OUTCOME:
+                assert after[key].equal(expected[key]), (order, i, key)
+
+
+def test_a_ticket_counts_once_and_one_that_is_given_up_frees_its_room(pool):
+    td = every_option(pool.reset(), pool)
+    ticket = pool.step_async(td.clone())
+    pool.step_wait(ticket)
+    with pytest.raises(RuntimeError, match=r"waited for before.*step_async again"):
+        pool.step_wait(ticket)
+    pool.step_abandon(ticket)
+    for _ in range(NUM_SLOTS):  # three options each
+        pool.step_abandon(pool.step_async(td.clone()))
+    assert sorted(pool._free) == list(range(NUM_SLOTS))
+
+
+def test_when_all_room_is_taken_another_step_is_refused():
+    here = local(RepeatActions(2), max_steps=1)
+    td = here.reset()
+    tickets = [here.step_async(td.expand(NUM_SLOTS).clone().set("option", torch.ones(NUM_SLOTS)))]
+    with pytest.raises(RuntimeError, match=rf"{NUM_SLOTS} options.*step_wait"):
+        here.step_async(every_option(td, here))
+    here.step_wait(tickets[0])
+    assert here.step(every_option(td, here))["next", "done"].shape == (2, 1)
+
+
+def test_a_crash_while_steps_are_under_way_loses_none_of_them(tmp_path):
+    (tmp_path / "armed").touch()
+    worker = Kills(tmp_path / "armed", once=True)
+    pool = AtariOptionPool("Breakout", worker, max_steps=5, num_processes=2, seed=0)
+    td = every_option(pool.reset(), pool, copies=2)
+    tickets = [pool.step_async(td.clone()) for _ in range(3)]
+    expected = local(worker, max_steps=5).step(td.clone())["next"]
+    for ticket in reversed(tickets):
+        assert pool.step_wait(ticket)["emulator_state"].equal(expected["emulator_state"])
+    assert pool.num_restarts == 1
+    pool.close()
+
+
+def test_steps_under_way_when_the_processes_stop_have_no_outcome():
+    pool = AtariOptionPool("Breakout", RepeatActions(2), max_steps=400, num_processes=1, seed=0)
+    td = every_option(pool.reset(), pool)
+    ticket = pool.step_async(td.clone())
+    pool._processes.stop()
+    with pytest.raises(RuntimeError, match=r"stopped while this step was under way.*step again"):
+        pool.step_wait(ticket)
+    abandoned = pool.step_async(td.clone())
+    pool._processes.stop()
+    pool.step_abandon(abandoned)  # no error: nobody asks for the outcome
+    assert pool.step(td.clone())["next", "duration"][0].item() == 400
+    pool.close()
+
+
+@pytest.mark.parametrize("waves", [1, 3])
+def test_a_search_is_the_same_on_processes_and_without(pool, worker, waves):
+    trees = []
+    for simulator in (pool, local(worker)):
+        planner = MCTSPlanner(
+            simulator,
+            tree_policy=PUCT(normalize="tree"),
+            expand="one",
+            rollout=TreeRollout(3),
+            leaves_per_wave=2,
+            waves_in_flight=waves,
+            budget=SearchBudget(base_steps=400, until_plan=False),
+        )
+        search = planner.search(local(worker).reset(), seed=1)
+        count = int(search.tree.num_nodes[0])
+        states = search.tree.states["emulator_state"][0, :count]
+        trees.append((search.tree.nodes[0, :count].tobytes(), states.numpy().tobytes()))
+        assert count > 60
+    assert trees[0] == trees[1]
+
+
 def test_the_planner_discounts_as_the_options_do(worker):
     assert MCTSPlanner(local(worker, gamma=0.9)).gamma == 0.9
+
+
+def test_an_error_of_the_worker_where_it_is_called_costs_no_room():
+    worker = Fails()
+    here = local(worker)
+    worker.owner = None
+    td = every_option(here.reset(), here)
+    for _ in range(NUM_SLOTS + 1):
+        with pytest.raises(KeyError, match="no such feature"):
+            here.step(td.clone())
+    worker.owner = os.getpid()
+    assert here.step(td.clone())["next", "duration"].item() == 6
 
 
 def test_an_error_of_the_worker_is_raised_with_its_traceback():

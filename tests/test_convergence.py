@@ -148,8 +148,10 @@ def layered_smdp(seed: int) -> Table:
 
 
 @pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("leaves_per_wave", [1, 7])
-def test_max_backup_is_exact_once_nothing_is_left(seed: int, leaves_per_wave: int) -> None:
+@pytest.mark.parametrize(("leaves_per_wave", "waves_in_flight"), [(1, 1), (7, 1), (1, 4), (3, 2)])
+def test_max_backup_is_exact_once_nothing_is_left(
+    seed: int, leaves_per_wave: int, waves_in_flight: int
+) -> None:
     table = layered_smdp(seed)
     best = [0.0] * 6  # from the last state to the first
     for s in range(4, -1, -1):
@@ -164,6 +166,7 @@ def test_max_backup_is_exact_once_nothing_is_left(seed: int, leaves_per_wave: in
         gamma=GAMMA,
         backup=MaxBackup(),
         leaves_per_wave=leaves_per_wave,
+        waves_in_flight=waves_in_flight,
         final_choice=HighestValue(),
         budget=SearchBudget(simulations=100_000, until_plan=False),
     )
@@ -176,8 +179,8 @@ def test_max_backup_is_exact_once_nothing_is_left(seed: int, leaves_per_wave: in
     assert chosen == pytest.approx(best[0])
 
 
-@pytest.mark.parametrize("leaves_per_wave", [2, 8])
-def test_leaves_of_a_wave_do_not_revisit_while_others_are_in_flight(leaves_per_wave: int) -> None:
+@pytest.mark.parametrize("in_flight", [(2, 1), (8, 1), (1, 2), (1, 8), (2, 4)])
+def test_leaves_do_not_revisit_while_others_are_in_flight(in_flight: tuple[int, int]) -> None:
     # Option 0 ends at 0.85; option 1 is worth 1.3, which takes a dozen visits to see. Were the
     # other leaves of a wave free to revisit option 0 until in-flight counts no longer kept them
     # from option 1, they would spend the whole budget there.
@@ -188,7 +191,7 @@ def test_leaves_of_a_wave_do_not_revisit_while_others_are_in_flight(leaves_per_w
         for a in range(rng.randint(2, 3))
     }
     visits = {}
-    for leaves in (1, leaves_per_wave):
+    for leaves, waves in ((1, 1), in_flight):
         env = TableEnv(table, terminal=[4])
         planner = MCTSPlanner(
             env,
@@ -197,8 +200,9 @@ def test_leaves_of_a_wave_do_not_revisit_while_others_are_in_flight(leaves_per_w
             expand="one",
             exhausted="revisit",
             leaves_per_wave=leaves,
+            waves_in_flight=waves,
             budget=SearchBudget(simulations=1500, until_plan=False),
         )
-        visits[leaves] = planner(env.reset())["root_visits"].tolist()
-    assert visits[1][1] > 1000
-    assert visits[leaves_per_wave][1] > 0.95 * visits[1][1], visits
+        visits[leaves, waves] = planner(env.reset())["root_visits"].tolist()
+    assert visits[1, 1][1] > 1000
+    assert visits[in_flight][1] > 0.95 * visits[1, 1][1], visits

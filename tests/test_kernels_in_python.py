@@ -137,6 +137,12 @@ SEARCHES: dict[str, dict[str, Any]] = {
     },
     "chance": {"chance": ProgressiveWidening(), "expand": "one", "leaves_per_wave": 2},
     "rollouts": {"rollout": TreeRollout(max_options=4), "expand": "one", "leaves_per_wave": 2},
+    "waves in flight": {
+        "chance": ProgressiveWidening(),
+        "expand": "one",
+        "rollout": TreeRollout(max_options=4),
+        "waves_in_flight": 3,
+    },
     "python": {"tree_policy": least_visited, "expand": "one", "leaves_per_wave": 2},
     "python, all": {"tree_policy": least_visited, "leaves_per_wave": 2, "exhausted": "revisit"},
     "python, chance": {

@@ -555,13 +555,17 @@ def test_roots_that_are_walked_down_together_have_the_trees_they_have_alone(
 
 
 @settings(max_examples=30)
-@given(seed=seeds, config=configs, leaves_per_wave=st.sampled_from([2, 5, 255]))
-def test_several_leaves_per_wave_leave_a_consistent_tree_and_nothing_in_flight(
-    seed: int, config: dict[str, Any], leaves_per_wave: int
+@given(
+    seed=seeds,
+    config=configs,
+    in_flight=st.sampled_from([(2, 1), (5, 1), (255, 1), (1, 2), (1, 255), (3, 4)]),
+)
+def test_several_leaves_in_flight_leave_a_consistent_tree_and_none_in_flight(
+    seed: int, config: dict[str, Any], in_flight: tuple[int, int]
 ) -> None:
     smdp = random_smdp(seed)
     planner = planner_for(smdp, config, simulations=60)
-    planner.leaves_per_wave = leaves_per_wave
+    planner.leaves_per_wave, planner.waves_in_flight = in_flight
     env = planner.simulator.env
     assert isinstance(env, TableEnv)
     start = next(s for s in range(smdp.num_states) if s not in smdp.terminal)

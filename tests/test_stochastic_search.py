@@ -277,7 +277,7 @@ def bandit_with(**kwargs: Any) -> Search:
 def test_a_root_that_wants_no_more_outcomes_ends_without_a_limit_of_simulations(
     policy: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchrl_hmcts.planners.mcts._MAX_FRUITLESS_REVISITS", 200)
+    monkeypatch.setattr("torchrl_hmcts.planners.growth._MAX_FRUITLESS_REVISITS", 200)
     # k = 1, alpha = 0: no second outcome is ever drawn, so 50 expansions are never reached.
     search = bandit_with(chance=ProgressiveWidening(k=1, alpha=0), tree_policy=policy, expand="one")
     assert search.num_expansions.tolist() == [2]

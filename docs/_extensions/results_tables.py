@@ -332,13 +332,36 @@ def lab_speed(data: list[dict[str, Any]]) -> str:
 
 
 def atari_speed(data: dict[str, Any]) -> str:
-    names = {"agent": "search, trees, network, processes", "bare": "bare emulators, as many"}
-    names["ratio"] = "ratio"
     rows = [
-        [text, data[key]["frames_per_second"], data[key]["frames_per_cpu_second"]]
-        for key, text in names.items()
+        [
+            game["game"],
+            *(
+                game[who][key]
+                for key in ("frames_per_second", "frames_per_cpu_second")
+                for who in ("agent", "bare", "ratio")
+            ),
+        ]
+        for game in data["games"]
     ]
-    return table(["", "frames per second", "frames per CPU second"], rows)
+    heads = ["game", "agent, frames per second", "bare emulators, as many", "ratio"]
+    return table([*heads, "agent, frames per CPU second", "bare", "ratio"], rows)
+
+
+def atari_waves(data: dict[str, Any]) -> str:
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for run in data["runs"]:
+        key = (run["game"], run["leaves_per_wave"], run["waves_in_flight"])
+        groups.setdefault(key, []).append(run)
+    rows = [
+        [
+            *key,
+            ", ".join(f"{run['score']:g}" for run in runs),
+            round(sum(run["simulated_per_real_step"] for run in runs) / len(runs)),
+        ]
+        for key, runs in groups.items()
+    ]
+    heads = ["game", "leaves per wave", "waves in flight", "scores of seeds 0, 1, 2"]
+    return table([*heads, "simulated base steps per real one"], rows)
 
 
 SECTIONS: dict[str, tuple[Section, ...]] = {
@@ -408,7 +431,8 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
         Section("What the planner costs", "planner/planner_figures.json", planner_costs),
         Section("Training", "skills/training_speed.json", training_speed),
         Section("LabMazeEnv", "lab_speed.json", lab_speed),
-        Section("Atari: search beside bare emulation", "atari_speed.json", atari_speed),
+        Section("Atari: search beside bare emulation", "atari/speed.json", atari_speed),
+        Section("Atari: leaves that are simulated together", "atari/waves.json", atari_waves),
     ),
 }
 

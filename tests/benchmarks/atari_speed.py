@@ -95,15 +95,17 @@ def rates(frames: int, seconds: float, cpu: float) -> dict[str, float]:
 class Agent:
     """Decision after decision: search, take the chosen option, go on from there."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
-        num_actions = AtariEmulator(args.game).num_actions
+    def __init__(self, game: str, args: argparse.Namespace) -> None:
+        num_actions = AtariEmulator(game).num_actions
         worker = SharedMLP(args.options, num_actions)
         network = SkillMLP(128, num_actions, args.options, hidden=(128, 128, 128))
         worker.load(network.parameters())
         self.pool = AtariOptionPool(
-            args.game, worker, max_steps=args.steps, num_processes=args.processes, seed=0
+            game, worker, max_steps=args.steps, num_processes=args.processes, seed=0
         )
-        search = AtariSearch(ratio=args.ratio, leaves_per_wave=args.leaves)
+        search = AtariSearch(
+            ratio=args.ratio, leaves_per_wave=args.leaves, waves_in_flight=args.waves
+        )
         self.agent = AtariAgent(self.pool, search, seed=0)
         self.frames = args.frames
         self.run()
@@ -141,22 +143,10 @@ def memory(game: str, nodes: int) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--game", default="Breakout")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--options", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=10, help="steps of an option")
-    parser.add_argument("--leaves", type=int, default=4, help="leaves per wave")
-    parser.add_argument("--ratio", type=float, default=25.0, help="simulated steps per real one")
-    parser.add_argument("--frames", type=int, default=12_000, help="of one side of a round")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--nodes", type=int, default=0, help="of the tree whose memory is measured")
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    agent = Agent(args)
-    others = BareProcesses(args.processes, args.game, args.frames)
+def compare(game: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Run the agent and the bare processes in turns; return the medians and every round."""
+    agent = Agent(game, args)
+    others = BareProcesses(args.processes, game, args.frames)
     rounds = []
     for _ in range(args.rounds):
         ours, theirs = agent.run(), others.run()
@@ -164,23 +154,50 @@ def main() -> None:
         rounds.append({"agent": ours, "bare": theirs, "ratio": ratios})
     agent.pool.close()
     others.close()
+    result: dict[str, Any] = {"game": game, "restarts": agent.pool.num_restarts, "rounds": rounds}
+    for name in ("agent", "bare", "ratio"):
+        result[name] = {
+            key: statistics.median(r[name][key] for r in rounds)
+            for key in ("frames_per_second", "frames_per_cpu_second")
+        }
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--games", nargs="+", default=["Breakout"])
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--options", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=10, help="steps of an option")
+    parser.add_argument("--leaves", type=int, default=8, help="leaves per wave")
+    parser.add_argument("--waves", type=int, default=2, help="waves in flight")
+    parser.add_argument("--ratio", type=float, default=25.0, help="simulated steps per real one")
+    parser.add_argument("--frames", type=int, default=40_000, help="of one side of a round")
+    parser.add_argument("--rounds", type=int, default=8)
+    parser.add_argument("--nodes", type=int, default=0, help="of the tree whose memory is measured")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    print(
+        "| game | agent, frames/s | bare | ratio | agent, frames per CPU second | bare | ratio |\n"
+        "|---|---|---|---|---|---|---|"
+    )
+    games = []
+    for game in args.games:
+        games.append(compare(game, args))
+        row = [
+            f"{games[-1][name][key]:.{2 if name == 'ratio' else 0}f}"
+            for key in ("frames_per_second", "frames_per_cpu_second")
+            for name in ("agent", "bare", "ratio")
+        ]
+        print(f"| {game} | {' | '.join(row)} |", flush=True)
     result: dict[str, Any] = {
         "command": "python tests/benchmarks/atari_speed.py",
         "arguments": {k: v for k, v in vars(args).items() if k != "out"},
-        "restarts": agent.pool.num_restarts,
-        "rounds": rounds,
+        "games": games,
     }
-    print("| | frames/s | frames per CPU second |\n|---|---|---|")
-    for name in ("agent", "bare", "ratio"):
-        wall, cpu = (
-            statistics.median(r[name][key] for r in rounds)
-            for key in ("frames_per_second", "frames_per_cpu_second")
-        )
-        digits = 3 if name == "ratio" else 0
-        result[name] = {"frames_per_second": wall, "frames_per_cpu_second": cpu}
-        print(f"| {name}, median of {len(rounds)} | {wall:.{digits}f} | {cpu:.{digits}f} |")
     if args.nodes:
-        result["memory"] = memory(args.game, args.nodes)
+        result["memory"] = memory(args.games[0], args.nodes)
         print(json.dumps(result["memory"]))
     if args.out is not None:
         args.out.write_text(json.dumps(result, indent=1) + "\n")

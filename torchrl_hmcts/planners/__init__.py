@@ -14,7 +14,8 @@ from torchrl_hmcts.planners.evaluators import (
     ValueEvaluator,
 )
 from torchrl_hmcts.planners.goals import GoalPlanner
-from torchrl_hmcts.planners.mcts import MCTSPlanner, SearchProgress
+from torchrl_hmcts.planners.growth import SearchProgress
+from torchrl_hmcts.planners.mcts import MCTSPlanner
 from torchrl_hmcts.planners.model_control import ModelBasedControl
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty

@@ -19,7 +19,7 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_hmcts.planners.mcts import SEED_KEY, Evaluator
+from torchrl_hmcts.planners.node_evaluation import SEED_KEY, Evaluator
 
 if TYPE_CHECKING:
     from torchrl_hmcts.planners.simulator import Simulator

@@ -412,7 +412,7 @@ def select(nodes, edges, roots, settings, gumbel, wave):
         start, chosen = 0, -1
         if together:
             start, chosen = root["at"], root["choice"]
-        scheduled = 0
+        scheduled = root["scheduled"]
         revisits = 0
         for _ in range(s["leaves"]):
             found = False
@@ -442,7 +442,7 @@ def select(nodes, edges, roots, settings, gumbel, wave):
                     break
                 if s["mark"]:
                     _release(tree, links, n)
-                if met == _COLLISION or not revisit:  # e.g. a leaf that this wave simulates
+                if met == _COLLISION or not revisit:  # e.g. a leaf that is being simulated
                     break
                 if scheduled and s["widening"] > 0.0:
                     break  # what is in flight keeps options above from being drawn again
@@ -474,7 +474,7 @@ def extend(nodes, edges, roots, settings, ended, draws, wave):
     for i in range(ended.shape[0]):
         b, n = ended[i]["root"], ended[i]["new_node"]
         root, tree, links = roots[b], nodes[b], edges[b]
-        scheduled = 0
+        scheduled = root["scheduled"]
         for j in range(count):
             scheduled += wave[j]["root"] == b
         if tree[n]["flags"] & (TERMINAL | PRUNED | CLOSED):

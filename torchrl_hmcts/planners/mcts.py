@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -22,63 +21,23 @@ from torchrl_hmcts.planners.backups import Backup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
 from torchrl_hmcts.planners.chance import ProgressiveWidening
 from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, MostVisited
+from torchrl_hmcts.planners.growth import Growth, SearchProgress
+from torchrl_hmcts.planners.node_evaluation import (
+    Evaluator,
+    leaf_values,
+    node_codes,
+    node_features,
+    option_priors,
+)
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.search import (
-    NO_LIMIT,
-    Outcomes,
-    RootStates,
-    Search,
-    Wave,
-    check_search,
-)
+from torchrl_hmcts.planners.search import RootStates, Search, check_search
 from torchrl_hmcts.planners.simulator import Simulator
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import TERMINAL
 from torchrl_hmcts.planners.tree_policies import UCT, Gumbel, TreePolicy
 from torchrl_hmcts.planners.tree_rollout import TreeRollout
-
-Evaluator = Callable[[TensorDictBase], Tensor]
-
-# Entry with a seed for each state, int64 [m], given to evaluators that draw random numbers.
-SEED_KEY = "_seed"
-
-# Revisits in a row, without a limit of simulations, after which a root has nothing left to find.
-_MAX_FRUITLESS_REVISITS = 10_000
-
-
-@dataclass(frozen=True)
-class SearchProgress:
-    """What a progress display is told after every wave.
-
-    ``search`` is the search as it stands; ``extract_plans(search)`` gives the best plans so far.
-
-    Attributes:
-        num_roots (int): roots of the search.
-        num_active (int): roots whose search still goes on.
-        num_found (int): roots with a plan.
-        expansions (int): nodes expanded so far, of all roots.
-        base_steps (int): base steps simulated so far, of all roots.
-        seconds (float): since the search began.
-        search (Search): the search as it stands, of B roots.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> env, told = ChainEnv(length=4), []
-        >>> _ = MCTSPlanner(env, progress=told.append).plan(env.reset())
-        >>> told[-1].num_found, told[-1].num_roots
-        (1, 1)
-    """
-
-    num_roots: int
-    num_active: int
-    num_found: int
-    expansions: int
-    base_steps: int
-    seconds: float
-    search: Search
 
 
 class MCTSPlanner(TensorDictModuleBase):
@@ -129,6 +88,12 @@ class MCTSPlanner(TensorDictModuleBase):
             option that the tree policy chooses, as in the textbook.
         leaves_per_wave (int): leaves of each root that share a simulator call. More are faster for
             few roots and search less selectively. At most 255; default 1.
+        waves_in_flight (int): waves that are simulated at a time, the next one chosen before the
+            outcomes of those before it are known. For a simulator that works beside the planner,
+            such as :class:`AtariOptionPool` with processes: with 2 it has work while the planner
+            inserts and selects. Outcomes are inserted in the order of the waves, whichever is
+            ready first, so that the tree is the same each time, and on every simulator. Times
+            ``leaves_per_wave`` at most 255; default 1.
         exhausted: what a descent does with an option behind which nothing is left to simulate:
             ``"skip"`` it (default: every simulation finds something new), or ``"revisit"`` it and
             back its known value up once more, at no simulator's cost, so that visits and mean
@@ -180,6 +145,7 @@ class MCTSPlanner(TensorDictModuleBase):
         budget: SearchBudget | None = None,
         expand: Literal["all", "one"] = "all",
         leaves_per_wave: int = 1,
+        waves_in_flight: int = 1,
         exhausted: Literal["skip", "revisit"] = "skip",
         duration_key: NestedKey = "duration",
         mask_key: NestedKey = "action_mask",
@@ -201,6 +167,7 @@ class MCTSPlanner(TensorDictModuleBase):
             expand=expand,
             leaves_per_wave=leaves_per_wave,
             exhausted=exhausted,
+            waves_in_flight=waves_in_flight,
         )
         if rollout is not None and (expand != "one" or isinstance(tree_policy, Gumbel)):
             raise ValueError(
@@ -247,6 +214,7 @@ class MCTSPlanner(TensorDictModuleBase):
         self.budget = budget
         self.expand = expand
         self.leaves_per_wave = leaves_per_wave
+        self.waves_in_flight = waves_in_flight
         self.exhausted = exhausted
         self.progress = progress
         self._seeds = None if seed is None else np.random.SeedSequence(seed)
@@ -306,7 +274,7 @@ class MCTSPlanner(TensorDictModuleBase):
         """
         begin = time.perf_counter()
         search = self.plant(td, seed=seed)
-        return self._grow(search, begin, np.arange(search.num_roots))
+        return Growth(self, search).run(begin, np.arange(search.num_roots))
 
     def plant(self, td: TensorDictBase, *, seed: int | None = None) -> Search:
         """Plant a tree at every state of ``td``; nothing is simulated until :meth:`resume`."""
@@ -323,6 +291,7 @@ class MCTSPlanner(TensorDictModuleBase):
             expand=self.expand,
             leaves_per_wave=self.leaves_per_wave,
             exhausted=self.exhausted,
+            waves_in_flight=self.waves_in_flight,
             capacity=self._capacity(num_roots),
         )
         self._seed(search, seed)
@@ -344,7 +313,7 @@ class MCTSPlanner(TensorDictModuleBase):
 
         Only the roots ``where`` (bool ``[*B]``) are searched, all by default.
         """
-        return self._grow(search, time.perf_counter(), _rows(search, where))
+        return Growth(self, search).run(time.perf_counter(), _rows(search, where))
 
     def advance(
         self,
@@ -454,188 +423,21 @@ class MCTSPlanner(TensorDictModuleBase):
                     f"Root {bad} has no option that may be taken: its action mask is all False. "
                     f"Plan from a state that is not a dead end, or mark it as done."
                 )
-            values = self._evaluate(root, simulator.terminated(root), lambda: search.seeds[where])
+            values = leaf_values(
+                self.leaf_evaluator, root, simulator.terminated(root), lambda: search.seeds[where]
+            )
             known = RootStates(
                 values=values,
                 done=done,
-                priors=self._priors(root),
+                priors=option_priors(self.option_prior, root, self.num_options),
                 masks=masks,
-                features=self._features(root),
-                codes=self._codes(root),
+                features=node_features(self.novelty, root),
+                codes=node_codes(self.transpositions, root),
             )
         search.start(known, rows)
         search.tree.set_states(where, np.zeros_like(where), simulator.state(root))
         if self.root_noise is not None:
             search.add_noise(self.root_noise, where)
-
-    @torch.no_grad()
-    def _grow(self, search: Search, begin: float, rows: np.ndarray) -> Search:
-        budget = self.budget
-        search.begin(budget.simulations)
-        if isinstance(self.tree_policy, Gumbel):
-            assert budget.simulations is not None
-            search.halve(budget.simulations)
-            # There is one schedule per search: after an interruption it goes on where it stood.
-            search.roots["simulations"] = search.tree.edges["visits"][:, 0].sum(-1)
-        # Without a limit of simulations a root may revisit what it knows for ever.
-        endless = budget.simulations is None and bool(search.settings["revisit"][0])
-        since = search.roots["revisits"].copy()  # at the last outcome of each root
-        active = self._still_active(search, rows)
-        while len(active):
-            wave = search.select(active)
-            if len(wave):
-                self._simulate(search, wave)
-            if self.rollout is not None:
-                further = wave
-                for _ in range(self.rollout.max_options):
-                    further = search.extend(further)
-                    if not len(further):
-                        break
-                    self._simulate(search, further)
-            seconds = time.perf_counter() - begin
-            if self.progress is not None:
-                self.progress(
-                    SearchProgress(
-                        num_roots=search.num_roots,
-                        num_active=len(active),
-                        num_found=int((search.best_node >= 0).sum()),
-                        expansions=int(search.num_expansions.sum()),
-                        base_steps=int(search.num_base_steps.sum()),
-                        seconds=seconds,
-                        search=search,
-                    )
-                )
-            if budget.seconds is not None and seconds >= budget.seconds:
-                break
-            if endless:
-                revisits = search.roots["revisits"]
-                since[wave.roots] = revisits[wave.roots]
-                active = active[revisits[active] - since[active] < _MAX_FRUITLESS_REVISITS]
-            active = self._still_active(search, active)
-        for root in rows[search.exhausted(rows)]:
-            search.solve(int(root))
-        return search
-
-    def _still_active(self, search: Search, active: np.ndarray) -> np.ndarray:
-        """The roots among ``active`` that have budget left and something to simulate."""
-        budget = self.budget
-        kept, stuck = np.empty_like(active), np.empty_like(active)
-        num_kept, num_stuck = search._kernels.still_active(
-            search.tree.nodes,
-            search.tree.roots,
-            active,
-            NO_LIMIT if budget.expansions is None else budget.expansions,
-            NO_LIMIT if budget.base_steps is None else budget.base_steps,
-            NO_LIMIT if budget.nodes is None else budget.nodes,
-            budget.until_plan,
-            budget.improve_expansions,
-            kept,
-            stuck,
-        )
-        if not num_stuck:
-            return kept[:num_kept]
-        revisits = search.revisits_exhausted
-        opened = [b for b in stuck[:num_stuck].tolist() if search.relax(b) or revisits]
-        return np.sort(np.concatenate((kept[:num_kept], np.array(opened, np.int64))))
-
-    def _simulate(self, search: Search, wave: Wave) -> None:
-        try:
-            self._insert(search, wave)
-        except BaseException:
-            search.cancel(wave)
-            raise
-
-    def _insert(self, search: Search, wave: Wave) -> None:
-        simulator, tree = self.simulator, search.tree
-        states = tree.get_states(wave.roots, wave.nodes, simulator.state_keys)
-        after = simulator.step(states, wave.options)
-        terminated, done = simulator.terminated(after), simulator.done(after)
-        durations = simulator.durations(after)
-        if simulator.duration_key is None:
-            discounts = np.where(terminated, np.float32(0.0), np.float32(self.gamma))
-        else:
-            discounts = np.where(terminated, 0.0, self.gamma**durations).astype(np.float32)
-        outcomes = Outcomes(
-            rewards=simulator.rewards(after),
-            discounts=discounts,
-            durations=durations,
-            done=done,
-            values=self._evaluate(after, terminated, lambda: _row_seeds(search, wave)),
-            priors=self._priors(after),
-            masks=simulator.masks(after),
-            features=self._features(after),
-            codes=self._codes(after),
-        )
-        merges = None
-        if self.chance is not None:
-            merges = self._find_merges(search, wave, after, done)
-        nodes = search.insert(wave, outcomes, merges)
-        tree.set_states(wave.roots, nodes, after)
-
-    def _find_merges(
-        self, search: Search, wave: Wave, after: TensorDictBase, done: np.ndarray
-    ) -> np.ndarray:
-        """Known outcomes of the same option with the same state, or -1, int64 ``[m]``."""
-        tree, keys = search.tree, self.simulator.state_keys
-        merges = np.full(len(wave), -1, np.int64)
-        assert tree.states is not None
-        first = tree.edges["child"][wave.roots, wave.nodes, wave.options]
-        for i in np.flatnonzero(first >= 0).tolist():
-            b, node = wave.roots[i], int(first[i])
-            while node >= 0:
-                if bool(tree.nodes["flags"][b, node] & TERMINAL) == done[i] and all(
-                    torch.equal(tree.states.get(key)[b, node], after.get(key)[i]) for key in keys
-                ):
-                    merges[i] = node
-                    break
-                node = int(tree.nodes["sibling"][b, node])
-        return merges
-
-    def _evaluate(
-        self, td: TensorDictBase, terminated: np.ndarray, seeds: Callable[[], np.ndarray]
-    ) -> np.ndarray:
-        if self.leaf_evaluator is None:
-            return np.zeros(td.batch_size[0], np.float32)
-        if getattr(self.leaf_evaluator, "is_random", False):
-            td = td.copy().set(SEED_KEY, torch.from_numpy(seeds()))
-        values = _as_tensor(self.leaf_evaluator(td), "leaf_evaluator")
-        num_states = td.batch_size[0]
-        if tuple(values.shape) not in ((num_states,), (num_states, 1)):
-            raise ValueError(
-                f"The leaf evaluator returned shape {list(values.shape)}; it must give one value "
-                f"per state, [{num_states}] or [{num_states}, 1]."
-            )
-        values_np: np.ndarray = values.reshape(-1).to(torch.float32).cpu().numpy()
-        if not np.isfinite(values_np).all():
-            raise ValueError(
-                f"The leaf evaluator returned {values_np[~np.isfinite(values_np)][0]}. Values must "
-                f"be finite; check the network's input and weights."
-            )
-        return np.where(terminated, np.float32(0.0), values_np)
-
-    def _priors(self, td: TensorDictBase) -> np.ndarray:
-        if self.option_prior is None:
-            return np.zeros((0, self.num_options), np.float32)
-        priors = _as_tensor(self.option_prior(td), "option_prior")
-        shape = (td.batch_size[0], self.num_options)
-        if tuple(priors.shape) != shape:
-            raise ValueError(
-                f"The option prior returned shape {list(priors.shape)}; it must give one "
-                f"probability per node and option, {list(shape)}."
-            )
-        if not (torch.isfinite(priors) & (priors >= 0)).all():
-            bad = priors[~(torch.isfinite(priors) & (priors >= 0))][0].item()
-            raise ValueError(
-                f"The option prior returned {bad}. Probabilities must be finite and not negative; "
-                f"apply a softmax to logits."
-            )
-        return priors.to(torch.float32).cpu().contiguous().numpy()
-
-    def _features(self, td: TensorDictBase) -> np.ndarray | None:
-        return None if self.novelty is None else self.novelty.features(td)
-
-    def _codes(self, td: TensorDictBase) -> np.ndarray | None:
-        return None if self.transpositions is None else self.transpositions.codes(td)
 
     def choose(self, search: Search) -> np.ndarray:
         """Return the option to take in each root of a search, int64 ``[B]``."""
@@ -658,25 +460,6 @@ def _rows(search: Search, where: Tensor | None) -> np.ndarray:
             f"{list(where.shape)}."
         )
     return np.flatnonzero(where.reshape(-1).cpu().numpy())
-
-
-def _row_seeds(search: Search, wave: Wave) -> np.ndarray:
-    """A seed for each outcome that depends on its root, node, option and order, int64 ``[m]``."""
-    mixed = search.seeds[wave.roots].astype(np.uint64) * np.uint64(0xBF58476D1CE4E5B9)
-    counted = search.num_simulations[wave.roots]
-    for part in (wave.nodes, wave.options, counted):
-        mixed = (mixed ^ part.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
-    return (mixed >> np.uint64(1)).astype(np.int64)
-
-
-def _as_tensor(value: Tensor, name: str) -> Tensor:
-    if not isinstance(value, Tensor):
-        raise TypeError(
-            f"{name} must return a tensor; got {type(value).__name__}. Wrap a TensorDictModule as "
-            f'lambda td: module(td)["state_value"].'
-        )
-    return value
 
 
 def _option_gamma(env: EnvBase) -> float:

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_hmcts.planners.mcts import Evaluator
+from torchrl_hmcts.planners.node_evaluation import Evaluator
 
 
 class PolicyValueEvaluator:

@@ -29,7 +29,7 @@ def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) ->
     nodes, edges, roots = tree.nodes, tree.edges, tree.roots
     settings = search.settings[0]
     revisit = bool(settings["revisit"])
-    scheduled = np.zeros(search.num_roots, np.int64)
+    scheduled = roots["scheduled"].copy()
     waits = np.zeros(search.num_roots, np.bool_)  # ran into a leaf that is being simulated
     count = 0
 

@@ -35,8 +35,9 @@ NO_LIMIT = np.iinfo(np.int64).max
 class Wave:
     """What to simulate next: take ``options[i]`` in node ``nodes[i]`` of root ``roots[i]``."""
 
-    def __init__(self, records: np.ndarray) -> None:
+    def __init__(self, records: np.ndarray, *, detached: bool = False) -> None:
         self.records = records  # [m] of tree.WAVE
+        self.detached = detached  # others may be selected before it is inserted
         self.roots = np.ascontiguousarray(records["root"])  # [m] int64
         self.nodes = np.ascontiguousarray(records["node"])  # [m] int64
         self.options = np.ascontiguousarray(records["option"])  # [m] int64
@@ -78,6 +79,7 @@ def check_search(
     expand: str,
     leaves_per_wave: int,
     exhausted: str,
+    waves_in_flight: int = 1,
 ) -> None:
     """Refuse arguments that make no search, with a message in the name of ``owner``.
 
@@ -93,18 +95,23 @@ def check_search(
             raise ValueError(f"{owner}: {name} is {names[0]!r} or {names[1]!r}; got {value!r}.")
     if not 1 <= leaves_per_wave <= 255:
         raise ValueError(f"{owner} needs leaves_per_wave from 1 to 255; got {leaves_per_wave}.")
+    if waves_in_flight < 1 or leaves_per_wave * waves_in_flight > 255:
+        raise ValueError(
+            f"{owner} needs waves_in_flight >= 1, with leaves_per_wave * waves_in_flight <= 255; "
+            f"got waves_in_flight={waves_in_flight}, leaves_per_wave={leaves_per_wave}."
+        )
     if not callable(tree_policy) and not isinstance(tree_policy, (UCT, PUCT, Gumbel)):
         raise TypeError(
             f"{owner} needs a tree policy: UCT(), PUCT(), Gumbel(), TorchRLScore(...) or a "
             f"callable over NodeStatistics; got {tree_policy!r}."
         )
     if isinstance(tree_policy, Gumbel) and (
-        num_simulations is None or expand != "one" or leaves_per_wave != 1
+        num_simulations is None or expand != "one" or leaves_per_wave * waves_in_flight != 1
     ):
         raise ValueError(
             f"Gumbel halves a known number of simulations of one option each; got "
             f"budget.simulations={num_simulations}, expand={expand!r}, "
-            f"leaves_per_wave={leaves_per_wave}. Pass "
+            f"leaves_per_wave={leaves_per_wave}, waves_in_flight={waves_in_flight}. Pass "
             f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
             f"leaves_per_wave=1."
         )
@@ -126,6 +133,7 @@ class Search:
         leaves_per_wave: leaves each root contributes to a wave, at most 255.
         exhausted: what a descent does with an option behind which nothing is left to simulate:
             ``"skip"`` it, or ``"revisit"`` it and back its known value up once more.
+        waves_in_flight: waves that are selected before the first of them is inserted.
         capacity: nodes per root to make room for at first.
 
     Example:
@@ -150,6 +158,7 @@ class Search:
         expand: Literal["all", "one"] = "all",
         leaves_per_wave: int = 1,
         exhausted: Literal["skip", "revisit"] = "skip",
+        waves_in_flight: int = 1,
         capacity: int = 64,
     ) -> None:
         from torchrl_hmcts.planners import kernels
@@ -170,7 +179,7 @@ class Search:
         settings["backup"] = kernels.MAX_BACKUP if self.max_backup else kernels.MEAN_BACKUP
         settings["expand_all"] = self.expand_all
         settings["leaves"] = leaves_per_wave
-        settings["mark"] = leaves_per_wave > 1
+        settings["mark"] = leaves_per_wave * waves_in_flight > 1
         # Chance options never close, and halving counts visits: both land on what they know.
         revisit = exhausted == "revisit" or self.stochastic or isinstance(tree_policy, Gumbel)
         settings["revisit"] = revisit
@@ -337,7 +346,7 @@ class Search:
         Only with ``expand="one"``. Each root draws its own random numbers.
         """
         draws = np.empty(len(wave))
-        for root in np.unique(wave.roots).tolist():
+        for root in sorted(set(wave.roots.tolist())):
             if root not in self._rollouts:
                 self._rollouts[root] = self.generator(root, "rollout")
             rows = wave.roots == root
@@ -348,8 +357,22 @@ class Search:
         )
         return Wave(self._wave[:count])
 
+    def detach(self, wave: Wave) -> Wave:
+        """Return a wave before whose insertion others can be selected.
+
+        Until it is inserted or cancelled its simulations count as spent.
+        """
+        np.add.at(self.roots["scheduled"], wave.roots, 1)
+        return Wave(wave.records.copy(), detached=True)
+
+    def _attach(self, wave: Wave) -> None:
+        if wave.detached:
+            np.subtract.at(self.roots["scheduled"], wave.roots, 1)
+            wave.detached = False
+
     def cancel(self, wave: Wave) -> None:
         """Take a wave back that will not be inserted, e.g. after an error in the simulator."""
+        self._attach(wave)
         self._kernels.cancel(self.tree.nodes, self.tree.edges, self.settings, wave.records)
 
     def insert(
@@ -361,6 +384,7 @@ class Search:
         -1; only in a stochastic simulator.
         """
         tree, m = self.tree, len(wave)
+        self._attach(wave)
         self._reserve_wave()
         novel = np.ones(m, np.bool_)
         nothing = np.empty(0, np.int64)

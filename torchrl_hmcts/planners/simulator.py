@@ -1,7 +1,9 @@
 """A macro environment as the planner sees it: states in, outcomes of options out.
 
 Two kinds of env can be set to any state. A stateless one (``batch_locked=False``) keeps its state
-in the tensordict: all states of a wave are one call. One with a state of its own (e.g. TorchRL's
+in the tensordict: all states of a wave are one call. If its type has ``step_async(td) -> ticket``
+and ``step_wait(ticket) -> next``, as that of :class:`AtariOptionPool`, it works on several waves
+beside the planner. One with a state of its own (e.g. TorchRL's
 MuJoCo envs) is set by ``reset(td, set_state=True)`` and steps as many states at a time as its batch
 size holds.
 
@@ -11,6 +13,7 @@ Letters: ``m`` states of one call, ``A`` options.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,6 +68,8 @@ class Simulator:
                 f"{env.action_keys}."
             )
         self.env = env
+        # Of the type: a TransformedEnv hands on attributes, which would go past its transforms.
+        self._works_beside = self.stateless and hasattr(type(env), "step_async")
         self.option_key = env.action_keys[0]
         spec = env.full_action_spec[self.option_key]
         self._one_hot = isinstance(spec, OneHot)
@@ -144,11 +149,37 @@ class Simulator:
 
     def step(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Take option ``options[i]`` in state ``i``; return what the env writes as next."""
+        self._choose(states, options)
+        after = self.env._step(states) if self.stateless else self._step_in_turn(states)
+        return self._completed(states, after)
+
+    def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
+        """Begin what :meth:`step` does; :meth:`receive` returns what comes of it, in any order."""
+        if not self._works_beside:
+            return self.step(states, options)
+        self._choose(states, options)
+        return states, self.env.step_async(states)
+
+    def receive(self, sent: Any) -> TensorDictBase:
+        """Wait for what :meth:`send` began; return what the env writes as next."""
+        if not self._works_beside:
+            after: TensorDictBase = sent
+            return after
+        states, ticket = sent
+        return self._completed(states, self.env.step_wait(ticket))
+
+    def abandon(self, sent: Any) -> None:
+        """Give up what :meth:`send` began and nobody will receive."""
+        if self._works_beside:
+            self.env.step_abandon(sent[1])
+
+    def _choose(self, states: TensorDictBase, options: np.ndarray) -> None:
         option = torch.from_numpy(options)
         if self.env.device is not None and self.env.device.type != "cpu":
             option = option.to(self.env.device)
         _put(states, self.option_key, self.encode(option))
-        after = self.env._step(states) if self.stateless else self._step_in_turn(states)
+
+    def _completed(self, states: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
         if any(_entry(after, key) is None for key in self._done_keys):
             self.env._complete_done(self._done_spec, after)
         for key in self.state_keys:

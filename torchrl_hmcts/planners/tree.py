@@ -66,6 +66,7 @@ ROOT = np.dtype(
         ("active", np.int64),
         ("simulations", np.int64),
         ("limit", np.int64),
+        ("scheduled", np.int64),  # simulations of waves that are detached and not yet inserted
         ("revisits", np.int64),
         ("expansions", np.int64),
         ("base_steps", np.int64),
@@ -89,7 +90,7 @@ WAVE = np.dtype(
 # Bits of a node's flags. The compiled kernels hold their values: after changing one, delete the
 # __pycache__ of this folder, since numba looks at kernels.py only.
 EXPANDED = 1  # its options have been simulated
-PENDING = 2  # its options are being simulated in this wave
+PENDING = 2  # its options are being simulated
 TERMINAL = 4  # the episode ends here, by termination or truncation
 PRUNED = 8  # the novelty test refused it
 CLOSED = 16  # no simulation below it can add anything

@@ -35,12 +35,14 @@ class AtariSearch:
     """How the agent searches.
 
     Attributes:
-        ratio: simulated base steps per base step of an option at most; ρ.
+        ratio: simulated base steps per base step of an option, after which no new leaf is selected;
+            ρ. The leaves and rollouts under way are finished: with 4 leaves and 25, about 38.
         tree_policy: ``"puct"`` with a max backup over values scaled to [0, 1], or ``"uct"`` with a
             mean backup, its c times the greatest reward seen.
         c: weight of exploration.
         rollout_options: options of the rollouts that stay in the tree; 0 for none.
         leaves_per_wave: leaves that are simulated together.
+        waves_in_flight: waves that are simulated at a time; 2 keep a pool's processes busy.
         width_novelty: whether states without a byte value that is new to the tree are pruned.
         reuse: whether the subtree below the option carried out is searched further.
         life_loss_penalty: what a lost life costs in planning; None for the greatest reward of an
@@ -59,6 +61,7 @@ class AtariSearch:
     c: float = 2.0
     rollout_options: int = 5
     leaves_per_wave: int = 4
+    waves_in_flight: int = 1
     width_novelty: bool = False
     reuse: bool = True
     life_loss_penalty: float | None = None
@@ -68,9 +71,11 @@ class AtariSearch:
             value = getattr(self, name)
             if not least <= value < math.inf:
                 raise ValueError(f"AtariSearch needs {name} >= {least:g}, finite; got {value}.")
-        if not 1 <= self.leaves_per_wave <= 255:
+        leaves, waves = self.leaves_per_wave, self.waves_in_flight
+        if min(leaves, waves) < 1 or leaves * waves > 255:
             raise ValueError(
-                f"AtariSearch needs leaves_per_wave from 1 to 255; got {self.leaves_per_wave}."
+                f"AtariSearch needs leaves_per_wave >= 1 and waves_in_flight >= 1, with a product "
+                f"of at most 255; got {leaves} and {waves}."
             )
         if self.tree_policy not in ("puct", "uct"):
             raise ValueError(
@@ -96,6 +101,7 @@ class AtariSearch:
             option_prior=None if guide is None else guide.prior,
             leaf_evaluator=None if guide is None else guide.value,
             leaves_per_wave=self.leaves_per_wave,
+            waves_in_flight=self.waves_in_flight,
             novelty=WidthNovelty("ram") if self.width_novelty else None,
             final_choice=HighestValue(random_ties=True),
             budget=SearchBudget(base_steps=self.budget(pool.max_steps), until_plan=False),

@@ -24,6 +24,7 @@ class TuningConfig(Protocol):
     ratio: float
     rollout_options: int
     leaves_per_wave: int
+    waves_in_flight: int
     width_novelty: bool
     c: float
     trial_steps: int
@@ -83,6 +84,7 @@ def tune_search(
             c=c,
             rollout_options=config.rollout_options,
             leaves_per_wave=config.leaves_per_wave,
+            waves_in_flight=config.waves_in_flight,
             width_novelty=config.width_novelty,
         )
         played = play_trial(

@@ -55,6 +55,9 @@ class MCTSPlannerConfig(ComponentConfig):
     chooses, as in the textbook."""
     leaves_per_wave: int = 1
     """Leaves of each root that share a simulator call."""
+    waves_in_flight: int = 1
+    """Waves that are simulated at a time, the next one chosen before the outcomes of those before
+    it are known."""
     exhausted: str = "skip"
     """What a descent does with an option behind which nothing is left to simulate: "skip" it
     (default: every simulation finds something new), or "revisit" it and back its known value up

@@ -354,6 +354,7 @@ class AtariRun:
             c=config.c if self.tuned is None else self.tuned.c,
             rollout_options=config.rollout_options,
             leaves_per_wave=config.leaves_per_wave,
+            waves_in_flight=config.waves_in_flight,
             width_novelty=config.width_novelty,
         )
 

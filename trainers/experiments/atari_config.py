@@ -63,7 +63,7 @@ class AtariConfig:
     skill_base_steps: int = 40_000
     """Base steps of a DIAYN worker's training."""
     ratio: float = 25.0
-    """Simulated base steps per real one."""
+    """Simulated base steps per real one, after which a search selects no new leaves."""
     rollout_options: int = 5
     """Options of the rollouts that stay in the tree."""
     tree_policy: str = "puct"
@@ -79,6 +79,8 @@ class AtariConfig:
     """Prune states without a RAM byte value that is new to the tree (width-1 search)."""
     leaves_per_wave: int = 4
     """Leaves of the tree that are simulated together."""
+    waves_in_flight: int = 1
+    """Waves of leaves that are simulated at a time; with processes, 2 keep them busy."""
     num_processes: int = -1
     """Processes that emulate; 0: in the command's own; -1: one for each core."""
     trial_steps: int = 1_000
@@ -105,7 +107,7 @@ class AtariConfig:
                 raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
         for name in (
             "frames", "max_episode_frames", "tune_trials", "num_skills", "skill_base_steps",
-            "leaves_per_wave", "trial_steps", "replant_every",
+            "leaves_per_wave", "waves_in_flight", "trial_steps", "replant_every",
         ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
