@@ -96,3 +96,9 @@ def test_the_page_escapes_what_it_shows(tmp_path):
     for raw in ("<b>", "<script>", "<i>", '"<u>'):
         assert raw not in page
     assert "a&lt;script&gt;.x" in page
+
+
+def test_keys_may_be_written_as_those_of_a_hydra_group() -> None:
+    assert parse_overrides(DemoConfig, ["env.seed=3", "out=x"]) == DemoConfig(seed=3, out="x")
+    with pytest.raises(ValueError, match=r"Unknown key 'sede'.*seed"):
+        parse_overrides(DemoConfig, ["env.sede=3"])

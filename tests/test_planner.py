@@ -315,6 +315,30 @@ def test_a_dead_end_below_the_root_is_closed() -> None:
     assert planner.plan(env.reset()).returns.item() == 1.0
 
 
+def test_a_python_policy_takes_no_option_of_a_dead_end_that_others_pass_by() -> None:
+    class DeadEnd(CountingEnv):
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            after = super()._step(tensordict)
+            after["action_mask"][after["state"] == 1] = False
+            return after
+
+    # Root 0 revisits the dead end 1 while root 1 goes round and round between 2 and 3.
+    table = {(0, 0): (1, 0.5, 1), (0, 1): (2, 0.0, 1), (1, 0): (1, 9.0, 1)}
+    table |= {(2, 0): (3, 0.0, 1), (3, 0): (2, 0.0, 1)}
+    env = DeadEnd(table)
+    planner = MCTSPlanner(
+        env,
+        tree_policy=lambda statistics: -statistics.option_visits,
+        expand="one",
+        exhausted="revisit",
+        budget=simulations(12),
+    )
+    search = planner.search(at(env, [0, 2]))
+    assert search.num_simulations.tolist() == [12, 12]
+    assert search.roots["revisits"][0] > 0 == search.roots["revisits"][1]
+    assert all(state != 1 for call in env.calls for state, _ in call)
+
+
 def test_a_root_without_an_option_is_refused() -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
     td = at(env, [0, 1])

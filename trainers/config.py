@@ -108,6 +108,9 @@ def parse_overrides(
 ) -> C:
     """Build a configuration from ``key=value`` words, types checked.
 
+    Keys of an experiment have one level; those who know Hydra may write ``env.game=Pong`` all the
+    same.
+
     Args:
         config_class: a dataclass whose fields all have defaults.
         overrides: words of the command line.
@@ -130,6 +133,7 @@ def parse_overrides(
     from yaml import YAMLError  # values are read as YAML
 
     names = [field.name for field in fields(config_class)]  # type: ignore[arg-type]
+    overrides = [word.removeprefix("env.") for word in overrides]
     for word in overrides:
         key, separator, _ = word.partition("=")
         if not separator:
@@ -139,12 +143,12 @@ def parse_overrides(
     try:
         merged = OmegaConf.merge(
             OmegaConf.structured(config_class if base is None else base),
-            OmegaConf.from_dotlist(list(overrides)),
+            OmegaConf.from_dotlist(overrides),
         )
         return config_class(**{name: getattr(merged, name) for name in names})
     except YAMLError as error:
         raise ValueError(
-            f"A value of {list(overrides)} cannot be read: {str(error).splitlines()[0]}. Close "
+            f"A value of {overrides} cannot be read: {str(error).splitlines()[0]}. Close "
             "its quotes and brackets."
         ) from None
     except OmegaConfBaseException as error:

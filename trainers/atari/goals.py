@@ -6,7 +6,7 @@ Letters: S states, F = 128 bytes of RAM.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -346,7 +346,7 @@ class GoalFinder:
         trial = play_trial(
             self.make_pool,
             worker,
-            _with_ratio(self.search, settings.trial_ratio if ratio is None else ratio),
+            replace(self.search, ratio=settings.trial_ratio if ratio is None else ratio),
             option_steps=settings.option_steps if option_steps is None else option_steps,
             real_steps=settings.trial_steps if real_steps is None else real_steps,
             seed=self.seed if seed is None else seed,
@@ -355,10 +355,6 @@ class GoalFinder:
         self.num_frames += trial.num_frames
         # An episode that ended early counts by its score alone; ties go to who lived longer.
         return trial.score + 1e-6 * trial.real_steps
-
-
-def _with_ratio(search: AtariSearch, ratio: float) -> AtariSearch:
-    return AtariSearch(**{**search.__dict__, "ratio": ratio})
 
 
 def _silent(text: str) -> None:
