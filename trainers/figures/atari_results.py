@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from torchrl_hmcts.trainers.experiments.run_folder import RunCurve
-from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS, common_steps
+from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
 from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
@@ -203,6 +204,35 @@ def best_source(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return [row for row in rows if row.get("source") == winner.get("source")]
 
 
+def over_seeds(
+    curves: Sequence[RunCurve], *, from_start: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bring curves that begin and end at different steps together.
+
+    A seed counts from its first value on, since looking for options takes some longer than others,
+    and keeps its last value to the end.
+
+    Args:
+        curves: one per seed, S of them.
+        from_start: count steps from the first of each curve.
+
+    Returns:
+        Steps ``[G]`` and values ``[S, G]``, NaN before a curve begins.
+
+    Example:
+        >>> one = RunCurve("x", [0, 10, 20], [0, 1, 2], "steps")
+        >>> two = RunCurve("x", [10, 30], [1, 3], "steps")
+        >>> over_seeds([one, two])[1].tolist()
+        [[0.0, 1.0, 2.0, 2.0], [nan, 1.0, 2.0, 3.0]]
+    """
+    own = [np.asarray(curve.steps, float) for curve in curves]
+    if from_start:
+        own = [steps - steps[0] for steps in own]
+    steps = np.unique(np.concatenate(own))
+    rows = zip(own, curves, strict=True)
+    return steps, np.stack([np.interp(steps, x, c.values, left=np.nan) for x, c in rows])
+
+
 def draw_game(sources: Sources, path: Path, name: str) -> str:
     """Draw the scores in a game against emulated steps: mean, least and largest over the seeds.
 
@@ -233,6 +263,7 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
     panels = shown.subplots(1, 2)
     colors = dict(zip(groups, itertools.cycle(GROUP_COLORS), strict=False))
     running = any(RUNNING in row["curves"] for rows in groups.values() for row in rows)
+    all_steps = "emulated steps, those in which options were looked for included"
     titles = {
         RUNNING if running else "score": "score of the episode being played"
         if running
@@ -241,21 +272,9 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
     }
     for axes, (entry, title) in zip(panels, titles.items(), strict=True):
         for protocol, color in colors.items():
-            rows = groups[protocol]
-            curves = [row["curves"][entry] for row in rows if entry in row["curves"]]
-            if not curves:
-                continue
-            steps, values = common_steps(curves)
-            style = "--" if protocol.startswith("sticky") else "-"
-            if len(curves) > 1:
-                axes.fill_between(
-                    steps, values.min(0), values.max(0), color=color, alpha=0.16, linewidth=0
-                )
-            label = f"{protocol}, {len(curves)} seed{'s' if len(curves) > 1 else ''}"
-            marker = "o" if len(steps) <= _FEW else ""  # a single episode is no line
-            axes.plot(
-                steps, values.mean(0), style, color=color, linewidth=2.0, marker=marker, label=label
-            )
+            curves = [row["curves"][entry] for row in groups[protocol] if entry in row["curves"]]
+            if curves:
+                _draw_protocol(axes, entry, protocol, curves, color)
         axes.set_title(title, fontsize=10, loc="left")
         axes.grid(alpha=0.25)
         axes.set_xlim(left=0)
@@ -271,10 +290,34 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
     )
     for axes in panels:
         axes.legend(frameon=False, fontsize=9)
-    shown.supxlabel("emulated steps", fontsize=10)
+    panels[0].set_xlabel("emulated steps since the options were found" if running else all_steps)
+    panels[1].set_xlabel(all_steps)
     shown.suptitle(game, fontsize=11, x=0.01, ha="left")
     shown.savefig(path, dpi=_DPI)
-    return f"{game}: mean, least and largest over the seeds, against emulated steps."
+    return (
+        f"{game}: mean, least and largest over the seeds that have found their options, against "
+        "emulated steps."
+    )
+
+
+def _draw_protocol(
+    axes: Axes, entry: str, protocol: str, curves: Sequence[RunCurve], color: str
+) -> None:
+    steps, values = over_seeds(curves, from_start=entry == RUNNING)
+    step: Any = "post" if entry == "score_max" else None
+    if len(curves) > 1:
+        low, high = np.nanmin(values, 0), np.nanmax(values, 0)
+        axes.fill_between(steps, low, high, step=step, color=color, alpha=0.16, linewidth=0)
+    axes.plot(
+        steps,
+        np.nanmean(values, 0),
+        "--" if protocol.startswith("sticky") else "-",
+        color=color,
+        linewidth=2.0,
+        marker="o" if len(steps) <= _FEW else "",  # a single episode is no line
+        label=f"{protocol}, {len(curves)} seed{'s' if len(curves) > 1 else ''}",
+        drawstyle=f"steps-{step}" if step else "default",
+    )
 
 
 def write_table(sources: Sources, path: Path, name: str) -> str:
