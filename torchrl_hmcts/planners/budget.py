@@ -12,8 +12,8 @@ class SearchBudget:
     """Limits of a search, each per root; the first that is reached ends the root's search.
 
     Simulations are exact with ``expand="one"``; with ``"all"`` the last leaf still simulates all of
-    its options. The others are looked at after every wave, so a search may exceed them by what one
-    wave simulates.
+    its options. The others are looked at after every wave, with a ``TreeRollout`` after its
+    rollouts, so a search may exceed them by what one wave simulates, or all that are in flight.
 
     Args:
         expansions: nodes whose options are simulated (with ``expand="one"``: options simulated).
