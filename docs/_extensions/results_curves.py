@@ -9,12 +9,14 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
+from torchrl_hmcts.trainers.figures.dissertation import draw_figure
+
 _COLORS = ("#1d4ed8", "#e66100", "#00798c", "#5d3a9b", "#d41159", "#8c6e00", "#5a5a5a")
 
 
-def draw_curves(results: Path, folder: Path) -> dict[str, str]:
-    """Write the pictures into a folder; return their names by the file that they show."""
-    drawn = {}
+def draw_curves(results: Path, folder: Path) -> dict[str, dict[str, str]]:
+    """Write the pictures into a folder; return captions by name, by the file that they show."""
+    drawn: dict[str, dict[str, str]] = {}
     for name, draw in (
         ("a3c/a3c_figures.json", cartpole),
         ("lab/labmaze.json", lab_training),
@@ -25,7 +27,13 @@ def draw_curves(results: Path, folder: Path) -> dict[str, str]:
             figure = Figure(figsize=(8.0, 3.6), layout="constrained")
             draw(json.loads((results / name).read_text()), figure)
             figure.savefig(folder / picture, dpi=160)
-            drawn[name] = picture
+            drawn[name] = {picture: ""}
+    if (results / "atari/runs.json").exists():
+        games = [draw_figure(f"5.{number}", [], results, folder) for number in range(1, 8)]
+        drawn["atari/runs.json"] = {
+            game.path.name: f"The source's figure {game.figure.name}. {game.caption}"
+            for game in games
+        }
     return drawn
 
 

@@ -92,12 +92,12 @@ def command_of(name: str, data: Any, listed: dict[str, str]) -> str:
     return ""
 
 
-def page(results: Path = RESULTS, curves: dict[str, str] | None = None) -> str:
+def page(results: Path = RESULTS, curves: dict[str, dict[str, str]] | None = None) -> str:
     """Return the page, in Markdown; pictures are named relative to docs/auto_results.
 
     Args:
         results: folder of the data.
-        curves: pictures drawn for this page, by the file whose data they show.
+        curves: pictures drawn for this page with their captions, by the file whose data they show.
     """
     listed = commands((results / "README.md").read_text())
     parts, shown = [_HEAD, beside_the_source(results)], set()
@@ -107,7 +107,7 @@ def page(results: Path = RESULTS, curves: dict[str, str] | None = None) -> str:
             continue
         parts.append(f"## {heading}\n")
         for section in present:
-            parts.append(_section(section, results, listed, (curves or {}).get(section.data)))
+            parts.append(_section(section, results, listed, (curves or {}).get(section.data, {})))
             shown |= {section.data, *section.also, *(name for name, _ in section.pictures)}
     left = [name for name in data_files(results) if name not in shown]
     if left:
@@ -129,7 +129,9 @@ def data_files(results: Path = RESULTS) -> list[str]:
     )
 
 
-def _section(section: Section, results: Path, listed: dict[str, str], curve: str | None) -> str:
+def _section(
+    section: Section, results: Path, listed: dict[str, str], curves: dict[str, str]
+) -> str:
     data = load(results / section.data)
     try:
         text = section.write(data)
@@ -141,11 +143,13 @@ def _section(section: Section, results: Path, listed: dict[str, str], curve: str
     made = command_of(section.data, data, listed)
     lines = [f"{'#' * section.level} {section.title}\n", text]
     lines.append(f"[{section.data}](../results/{section.data}): {made}\n")
-    if curve:
-        lines.append(f"![{section.title}]({curve})\n")
+    pictures = dict(curves)
     for name, caption in section.pictures:
         if (results / name).exists():
-            lines.append(f":::{{figure}} ../results/{name}\n:alt: {caption}\n\n{caption}\n:::\n")
+            pictures[f"../results/{name}"] = caption
+    for name, caption in pictures.items():
+        shown = caption or section.title
+        lines.append(f":::{{figure}} {name}\n:alt: {shown}\n\n{caption}\n:::\n")
     return "\n".join(lines)
 
 

@@ -57,6 +57,8 @@ def read(folder: Path) -> dict[str, Any] | None:
     guide = config.get("guide", "none")
     if guide not in ("none", row["source"].rpartition("=")[2]):
         row["source"] += f", guide={guide}"
+    if config.get("width_novelty"):
+        row["source"] += ", width_novelty"
     if row["settings"].get("tree_policy", "puct") == "uct":
         row["source"] = UCT_SOURCE
     curves = read_curves(folder)
