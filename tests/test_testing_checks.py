@@ -94,6 +94,20 @@ class LooksAtItsNeighbours(ChainEnv):
         return out.set("reward", out["reward"] + float(tensordict["state"].numel()))
 
 
+class MixesTickets(ChainEnv):
+    """Gives whoever waits what was begun last."""
+
+    def step_async(self, tensordict: TensorDictBase) -> int:
+        self.last = tensordict
+        return 0
+
+    def step_wait(self, ticket: int) -> TensorDictBase:
+        return self._step(self.last)
+
+    def step_abandon(self, ticket: int) -> None:
+        pass
+
+
 class WrongDtype(ChainEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         out = super()._step(tensordict)
@@ -120,6 +134,7 @@ def test_an_env_that_is_broken_is_refused(env: ChainEnv, message: str) -> None:
         (HiddenClock(), "HiddenClock: .*'reward'"),
         (LooksAtItsNeighbours(), "set to a state and stepped it gives 'reward'"),
         (WritesIntoItsInput(), "WritesIntoItsInput.*'state'"),
+        (MixesTickets(), r"MixesTickets: step 0 of \d+ under way gave .*Keep apart"),
         (PointMassEnv(continuous=True), "PointMassEnv fails as the simulator .* discrete action"),
         (
             TableEnv({(0, 0): (1, 0.0, 0), (1, 0): (0, 0.0, 1)}),

@@ -1,9 +1,9 @@
 """A macro environment as the planner sees it: states in, outcomes of options out.
 
 Two kinds of env can be set to any state. A stateless one (``batch_locked=False``) keeps its state
-in the tensordict: all states of a wave are one call. If its type has ``step_async(td) -> ticket``
-and ``step_wait(ticket) -> next``, as that of :class:`AtariOptionPool`, it works on several waves
-beside the planner. One with a state of its own (e.g. TorchRL's
+in the tensordict: all states of a wave are one call. If its type has ``step_async(td) -> ticket``,
+``step_wait(ticket) -> next`` and ``step_abandon(ticket)``, as that of :class:`AtariOptionPool`, it
+works on several waves beside the planner. One with a state of its own (e.g. TorchRL's
 MuJoCo envs) is set by ``reset(td, set_state=True)`` and steps as many states at a time as its batch
 size holds.
 
@@ -22,6 +22,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
+
+_BESIDE = ("step_async", "step_wait", "step_abandon")
 
 
 class Simulator:
@@ -69,7 +71,7 @@ class Simulator:
             )
         self.env = env
         # Of the type: a TransformedEnv hands on attributes, which would go past its transforms.
-        self._works_beside = self.stateless and hasattr(type(env), "step_async")
+        self.works_beside = self.stateless and all(hasattr(type(env), name) for name in _BESIDE)
         self.option_key = env.action_keys[0]
         spec = env.full_action_spec[self.option_key]
         self._one_hot = isinstance(spec, OneHot)
@@ -155,14 +157,14 @@ class Simulator:
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
         """Begin what :meth:`step` does; :meth:`receive` returns what comes of it, in any order."""
-        if not self._works_beside:
+        if not self.works_beside:
             return self.step(states, options)
         self._choose(states, options)
         return states, self.env.step_async(states)
 
     def receive(self, sent: Any) -> TensorDictBase:
         """Wait for what :meth:`send` began; return what the env writes as next."""
-        if not self._works_beside:
+        if not self.works_beside:
             after: TensorDictBase = sent
             return after
         states, ticket = sent
@@ -170,7 +172,7 @@ class Simulator:
 
     def abandon(self, sent: Any) -> None:
         """Give up what :meth:`send` began and nobody will receive."""
-        if self._works_beside:
+        if self.works_beside:
             self.env.step_abandon(sent[1])
 
     def _choose(self, states: TensorDictBase, options: np.ndarray) -> None:

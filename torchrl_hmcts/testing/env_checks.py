@@ -98,7 +98,8 @@ def check_macro_env(
     All of :func:`check_env`, and: the action is one discrete option; a step takes at least one base
     step; some option may be taken wherever an episode goes on; set to the states of a rollout and
     stepped with its options the env gives what the unbroken rollout gave, for all of them at once
-    if it is stateless; a step leaves its input as it was.
+    if it is stateless; a step leaves its input as it was. With ``step_async``, ``step_wait`` and
+    ``step_abandon``: steps that are under way at the same time do not touch each other.
 
     Args:
         env (EnvBase): stateless, or with ``_supports_set_state = True``; e.g. any env under an
@@ -157,6 +158,8 @@ def check_macro_env(
             "terminated, or allow an option there.",
         )
     _check_set_state(env, simulator, data, deterministic, tolerance)
+    if simulator.works_beside and deterministic:
+        _check_beside(env, simulator, data, tolerance)
 
 
 def check_parallel_env(
@@ -383,6 +386,29 @@ def _check_partial_steps(env: EnvBase, seed: int, act: _Random) -> None:
             where is None,
             f"{name}: {where and where[0]!r} of elements that step depends on those beside them "
             "that do not.",
+        )
+
+
+def _check_beside(
+    env: EnvBase, simulator: Simulator, data: TensorDictBase, tolerance: float
+) -> None:
+    """Begun together and waited for in another order, steps give what they give one by one."""
+    name = _name(env)
+    steps = data.select(*simulator.root_keys, simulator.option_key).reshape(-1)
+    expected = data.get("next").reshape(-1)
+    with during(name, "with several steps under way"):
+        tickets = [env.step_async(steps[i : i + 1].clone()) for i in range(len(steps))]
+        env.step_abandon(env.step_async(steps.clone()))
+        found = [env.step_wait(ticket) for ticket in reversed(tickets)][::-1]
+    for i, after in enumerate(found):
+        outcome = expected[i : i + 1]
+        keys = sorted(set(leaves(outcome)) & set(leaves(after)), key=str)
+        where = different(outcome, after, keys, tolerance)
+        require(
+            where is None,
+            f"{name}: step {i} of {len(found)} under way gave {where and where[0]!r} = "
+            f"{where and row(after, *where)}, alone {where and row(outcome, *where)}. Keep apart "
+            "what belongs to each ticket of step_async.",
         )
 
 
