@@ -38,7 +38,7 @@ def table(head: Sequence[str], rows: Rows) -> str:
 
 
 def _is_figure(cell: str) -> bool:
-    return not cell or (cell[0].isdigit() and len(cell) <= 24)
+    return not cell or (cell.lstrip("-")[:1].isdigit() and len(cell) <= 24)
 
 
 def number(value: Any) -> str:

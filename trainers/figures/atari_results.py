@@ -259,7 +259,7 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
     groups = _by_source({protocol: rows for protocol, rows in groups.items() if rows})
     if not groups:
         raise figure.how_to_get_data(f"there is no run of {game} with its curves.")
-    shown = Figure(figsize=(10.0, 4.2), layout="constrained")
+    shown = Figure(figsize=(10.0, 4.6), layout="constrained")
     panels = shown.subplots(1, 2)
     colors = dict(zip(groups, itertools.cycle(GROUP_COLORS), strict=False))
     running = any(RUNNING in row["curves"] for rows in groups.values() for row in rows)
@@ -288,8 +288,14 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
     panels[0].axhline(
         baseline, color="#71717a", linestyle=":", linewidth=1.4, label=f"{algorithm} (Table A.1)"
     )
-    for axes in panels:
-        axes.legend(frameon=False, fontsize=9)
+    handles = {
+        label: handle
+        for axes in panels
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    shown.legend(
+        handles.values(), handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9
+    )
     panels[0].set_xlabel("emulated steps since the options were found" if running else all_steps)
     panels[1].set_xlabel(all_steps)
     shown.suptitle(game, fontsize=11, x=0.01, ha="left")
