@@ -9,7 +9,6 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -31,23 +30,17 @@ from torchrl_hmcts.envs.atari_ram import NO_OP_STARTS, atari_specs
 from torchrl_hmcts.envs.atari_workers import OptionWorker
 
 
-@dataclass
 class PendingStep:
     """A step of a pool that was begun: the ticket of :meth:`AtariOptionPool.step_async`."""
 
-    tensordict: TensorDictBase
-    slots: list[int] | None  # None once it was used
-    done: list[np.ndarray]  # outcomes of what the slots had no room for, before them
+    def __init__(self, pool: AtariOptionPool, tensordict: TensorDictBase) -> None:
+        self.pool, self.tensordict = pool, tensordict
+        self.slots: list[int] = []  # whose options are under way
+        self.done: list[np.ndarray] = []  # outcomes of those before them
+        self.used = False
 
-    def use(self) -> list[int]:
-        """Return the slots, once."""
-        if self.slots is None:
-            raise RuntimeError(
-                "This step was waited for before, and its outcome returned then. Call step_async "
-                "again to take another."
-            )
-        slots, self.slots = self.slots, None
-        return slots
+    def __reduce__(self) -> Any:
+        raise TypeError("A step that is under way can be neither copied nor sent.")
 
 
 class AtariOptionPool(EnvBase):
@@ -218,6 +211,7 @@ class AtariOptionPool(EnvBase):
         else:
             self._slots = np.zeros(NUM_SLOTS, slot_type(width, run))
         self._free = list(range(NUM_SLOTS))  # slots that no step under way uses
+        self._under_way: list[PendingStep] = []
         self.on_step: Callable[[TensorDictBase, TensorDictBase], object] | None = None
         """Called with what was stepped and what came of it, e.g. to keep what a search simulates
         (with ``record=True`` the steps inside the options, too)."""
@@ -298,7 +292,13 @@ class AtariOptionPool(EnvBase):
                 "tensordict has not. Pass what reset() or a step wrote."
             )
         # Rows of an AtariRAMEnv may hold its random generator, which is not a planner's to know.
-        rows = _array(row)[..., : self._emulator.states.width]
+        width = self._emulator.states.width
+        rows = _array(row)[..., :width]
+        if rows.shape[-1] != width:
+            raise ValueError(
+                f'A state of {self.game} under "emulator_state" has {width} bytes (or more, with a '
+                f"random generator); got {rows.shape[-1]}. Pass what reset() or a step wrote."
+            )
         return rows.reshape(-1, rows.shape[-1])
 
     def _begin(self, count: int) -> dict[str, np.ndarray]:
@@ -334,17 +334,17 @@ class AtariOptionPool(EnvBase):
     def step_async(self, tensordict: TensorDictBase) -> PendingStep:
         """Begin a step, on which the processes work while the caller goes on.
 
-        Several can be under way. With ``num_processes=0`` a step is done at once.
+        Several can be under way, of 512 options together; then the oldest are waited for, as the
+        first parts of a larger batch are. With ``num_processes=0`` a step is done at once.
 
         Args:
-            tensordict: what a step reads, of any batch shape.
+            tensordict: what a step reads, of any batch shape. ``on_step`` is given it, too.
 
         Returns:
-            A ticket for :meth:`step_wait`.
+            A ticket for :meth:`step_wait` or :meth:`step_abandon`.
 
         Raises:
             ValueError: if an option does not exist.
-            RuntimeError: if the steps under way take all the room there is.
         """
         rows = self._rows(tensordict)
         options = _array(tensordict.get("option")).reshape(-1)
@@ -358,23 +358,23 @@ class AtariOptionPool(EnvBase):
         if not self.determinised:
             seeds = (self._key + self._num_calls + np.arange(count)) & np.iinfo(np.int64).max
             self._num_calls += count
-        if count and not self._free:
-            raise RuntimeError(
-                f"All the {NUM_SLOTS} options that a pool has room for are under way. Call "
-                f"step_wait with the tickets of earlier steps first."
-            )
-        done, begin = [], 0
-        while True:
-            slots = self._free[: count - begin]
-            part = slice(begin, begin + len(slots))
-            del self._free[: len(slots)]
-            for field, values in (("state", rows), ("option", options), ("seed", seeds)):
-                self._slots[field][slots] = values[part]
-            self._submit(slots)
-            begin = part.stop
-            if begin == count:
-                return PendingStep(tensordict, slots, done)
-            done.append(self._collect(slots))  # more than there is room for: in several goes
+        ticket, begin = PendingStep(self, tensordict), 0
+        self._under_way.append(ticket)
+        try:
+            while begin < count:
+                self._make_room(min(count - begin, NUM_SLOTS))
+                slots = self._free[: count - begin]
+                part = slice(begin, begin + len(slots))
+                for field, values in (("state", rows), ("option", options), ("seed", seeds)):
+                    self._slots[field][slots] = values[part]
+                del self._free[: len(slots)]
+                ticket.slots = slots
+                self._submit(slots)
+                begin = part.stop
+        except BaseException:
+            self.step_abandon(ticket)
+            raise
+        return ticket
 
     def step_wait(self, ticket: PendingStep) -> TensorDictBase:
         """Wait for a step that was begun and return what it writes as next.
@@ -385,39 +385,63 @@ class AtariOptionPool(EnvBase):
         Raises:
             RuntimeError: if the worker raises an error, the processes were stopped meanwhile, or
                 the ticket was used before.
+            ValueError: if the ticket is of another pool.
         """
-        outcomes = [*ticket.done, self._collect(ticket.use())]
-        result = self._outcome(np.concatenate(outcomes), ticket.tensordict.batch_size)
+        if ticket.pool is not self:
+            raise ValueError(
+                "This step was begun by another pool; wait for it there, in ticket.pool."
+            )
+        if ticket.used:
+            raise RuntimeError(
+                "This step was waited for before, and its outcome returned then, or given up. Call "
+                "step_async again to take another."
+            )
+        try:
+            self._settle(ticket)
+        finally:
+            self._forget(ticket)
+        result = self._outcome(np.concatenate(ticket.done), ticket.tensordict.batch_size)
         if self.on_step is not None:
             self.on_step(ticket.tensordict, result)
         return result
 
     def step_abandon(self, ticket: PendingStep) -> None:
-        """Give up a step that was begun, for which nobody will wait."""
-        if ticket.slots is not None:
+        """Give up a step that was begun: its outcome, or error, is nobody's.
+
+        Blocks until its options have been run, unless the processes have been stopped.
+        """
+        if ticket.pool is self and not ticket.used:
             with contextlib.suppress(RuntimeError):
-                self._collect(ticket.use())
+                self._settle(ticket)
+            self._forget(ticket)
 
-    def _submit(self, slots: list[int]) -> None:
-        try:
-            if self._processes is not None:
-                self._processes.submit(slots)
-                return
-            for i in slots:
-                run_option(self._emulator, self.worker, self._run, self._slots, i, self._own_frames)
-        except BaseException:
-            self._free += slots
-            raise
+    def _make_room(self, count: int) -> None:
+        """Wait for the oldest steps until so many slots are free."""
+        for ticket in self._under_way:
+            if len(self._free) >= count:
+                break
+            self._settle(ticket)
 
-    def _collect(self, slots: list[int]) -> np.ndarray:
-        """Wait for the options in some slots, free these and return what they held."""
+    def _settle(self, ticket: PendingStep) -> None:
+        """Wait for the options of a ticket that are under way and take their outcomes."""
+        slots, ticket.slots = ticket.slots, []
         try:
-            if self._processes is not None:
+            if slots and self._processes is not None:
                 self._processes.wait(slots)
-            outcomes: np.ndarray = self._slots[slots]
-            return outcomes
+            ticket.done.append(self._slots[slots])
         finally:
             self._free += slots
+
+    def _forget(self, ticket: PendingStep) -> None:
+        ticket.used = True
+        self._under_way.remove(ticket)
+
+    def _submit(self, slots: list[int]) -> None:
+        if self._processes is not None:
+            self._processes.submit(slots)
+            return
+        for i in slots:
+            run_option(self._emulator, self.worker, self._run, self._slots, i, self._own_frames)
 
     def _outcome(self, used: np.ndarray, shape: torch.Size) -> TensorDict:
         """What a step writes, from slots whose options have been run."""

@@ -335,18 +335,20 @@ class EmulatorProcesses:
 
     def stop(self) -> None:
         """Stop the processes, which start again when needed; what is under way is lost."""
-        self._kill()
-        self._lost |= self._waiting
-        self._waiting.clear()
+        try:
+            self._kill()
+        finally:
+            self._lost |= self._waiting
+            self._waiting.clear()
 
     def _kill(self) -> None:
         """Stop the processes and take what they had finished."""
         running, self._running = self._running, None
         if running is None:
             return
-        running.jobs.close()
         for process in running.processes:
             process.kill()
+        running.jobs.close()
         for process in running.processes:
             process.join(5.0)
         while running.results.poll():

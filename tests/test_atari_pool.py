@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
 import threading
@@ -292,14 +293,48 @@ def test_a_ticket_counts_once_and_one_that_is_given_up_frees_its_room(pool):
     assert sorted(pool._free) == list(range(NUM_SLOTS))
 
 
-def test_when_all_room_is_taken_another_step_is_refused():
-    here = local(RepeatActions(2), max_steps=1)
-    td = here.reset()
-    tickets = [here.step_async(td.expand(NUM_SLOTS).clone().set("option", torch.ones(NUM_SLOTS)))]
-    with pytest.raises(RuntimeError, match=rf"{NUM_SLOTS} options.*step_wait"):
-        here.step_async(every_option(td, here))
-    here.step_wait(tickets[0])
-    assert here.step(every_option(td, here))["next", "done"].shape == (2, 1)
+def test_when_all_room_is_taken_the_oldest_steps_are_waited_for(pool, worker):
+    td = every_option(pool.reset(), pool)
+    expected = local(worker).step(td.clone())["next", "ram"]
+    dropped = pool.step_async(td.clone())  # which nobody waits for
+    large = pool.step_async(td.repeat(NUM_SLOTS // 3).clone())
+    small = [pool.step_async(td.clone()) for _ in range(4)]
+    assert len(pool._free) + sum(len(t.slots) for t in (large, *small)) == NUM_SLOTS
+    assert not dropped.slots
+    for ticket in small:
+        assert pool.step_wait(ticket)["ram"].equal(expected)
+    assert pool.step_wait(large)["ram"].equal(expected.repeat(NUM_SLOTS // 3, 1))
+    pool.step_abandon(dropped)
+    assert sorted(pool._free) == list(range(NUM_SLOTS))
+
+
+def test_planners_whose_waves_fill_the_room_search_all_the_same(worker):
+    here = local(worker, max_steps=1, frame_skip=1)
+    budget = SearchBudget(expansions=2, until_plan=False)
+    planner = MCTSPlanner(here, expand="all", waves_in_flight=3, budget=budget)
+    search = planner.search(here.reset().expand(300).clone())
+    assert (search.num_simulations >= 6).all()
+    assert sorted(here._free) == list(range(NUM_SLOTS))
+
+
+def test_a_ticket_is_of_one_pool_and_cannot_be_copied(pool, worker):
+    here = local(worker)
+    ticket = here.step_async(every_option(here.reset(), here))
+    with pytest.raises(ValueError, match="another pool"):
+        pool.step_wait(ticket)
+    with pytest.raises(TypeError, match="neither copied nor sent"):
+        copy.deepcopy(ticket)
+    pool.step_abandon(ticket)
+    assert here.step_wait(ticket)["ram"].shape == (3, 128)
+
+
+def test_a_state_of_another_width_costs_no_room(worker):
+    here = local(worker)
+    td = every_option(here.reset(), here)
+    td["emulator_state"] = td["emulator_state"][:, :-1]
+    with pytest.raises(ValueError, match=r"has \d+ bytes.*got \d+"):
+        here.step(td)
+    assert sorted(here._free) == list(range(NUM_SLOTS))
 
 
 def test_a_crash_while_steps_are_under_way_loses_none_of_them(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import random
 from typing import Any
 
@@ -21,6 +22,7 @@ from torchrl_hmcts.planners import (
     ProgressiveWidening,
     Search,
     SearchBudget,
+    SearchProgress,
     Transpositions,
     TreeRollout,
     WidthNovelty,
@@ -190,6 +192,96 @@ def test_an_error_of_the_progress_display_or_the_tree_policy_gives_up_what_is_un
         assert_nothing_in_flight(planner.last_search)
         assert not env.under_way
         assert env.events
+
+
+def test_a_copy_made_while_waves_are_in_flight_goes_on() -> None:
+    copies: list[Search] = []
+    env = Beside(MAZE)
+    planner = planner_of(
+        env,
+        waves_in_flight=3,
+        expand="one",
+        progress=lambda told: copies.append(pickle.loads(pickle.dumps(told.search))),
+    )
+    planner.search(env.reset())
+    copied = copies[10]
+    assert copied.tree.edges["in_flight"].any()
+    planner.progress = None
+    assert planner.resume(copied).num_simulations.tolist() == [60]
+    assert_nothing_in_flight(copied)
+
+
+def test_a_search_goes_on_after_an_interruption_between_selecting_and_sending() -> None:
+    env = Beside(MAZE)
+    planner = planner_of(env, waves_in_flight=2, expand="one")
+    search = planner.search(env.reset())
+    search.select(np.array([0]))  # a wave that never gets further
+    search.growing = True
+    assert planner.resume(search).num_simulations.tolist() == [60]
+    assert_nothing_in_flight(search)
+
+
+def test_a_search_that_was_interrupted_while_it_inserted_does_not_go_on() -> None:
+    env = TableEnv(MAZE)
+    planner = planner_of(env, expand="one")
+    search = planner.plant(env.reset())
+
+    def interrupted(*args: Any) -> None:
+        raise KeyboardInterrupt
+
+    whole, search.tree.set_states = search.tree.set_states, interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        planner.resume(search)
+    search.tree.set_states = whole  # type: ignore[method-assign]
+    with pytest.raises(RuntimeError, match=r"interrupted while outcomes were inserted.*anew"):
+        planner.resume(search)
+
+
+def test_the_number_of_waves_is_that_with_which_the_search_was_planted() -> None:
+    env = TableEnv(MAZE)
+    search = planner_of(env, expand="one").search(env.reset())
+    planner_of(env, expand="one", waves_in_flight=3).resume(search)
+    used = int(search.tree.num_nodes[0])
+    links = search.tree.nodes[["parent", "option"]][0, 1:used].tolist()
+    assert used == 121
+    assert len(set(links)) == 120
+
+
+def test_rollouts_do_not_take_an_option_that_is_in_flight() -> None:
+    # With chance a rollout may come to a node that is known, where another wave tries an option.
+    def check(told: SearchProgress) -> None:
+        edges = told.search.tree.edges
+        assert edges["in_flight"][edges["child"] < 0].max() <= 1
+
+    for seed in range(10):
+        planner = planner_of(
+            TableEnv(MAZE),
+            200,
+            expand="one",
+            chance=ProgressiveWidening(),
+            rollout=TreeRollout(6),
+            waves_in_flight=6,
+            progress=check,
+        )
+        search = planner.search(planner.simulator.env.reset(), seed=seed)
+        assert search.num_simulations.tolist() == [200]
+
+
+def test_an_evaluator_that_fails_is_heard_and_its_wave_is_not_given_up_twice() -> None:
+    class Strict(Beside):
+        def step_abandon(self, ticket: int) -> None:
+            del self.under_way[ticket]
+
+    def fails(td: TensorDictBase) -> torch.Tensor:
+        if len(td) and td["state"][0] != 0:
+            raise ZeroDivisionError("no value")
+        return torch.zeros(len(td))
+
+    env = Strict(MAZE)
+    planner = planner_of(env, expand="one", waves_in_flight=3, leaf_evaluator=fails)
+    with pytest.raises(ZeroDivisionError, match="no value"):
+        planner.search(env.reset())
+    assert not env.under_way
 
 
 def test_when_time_is_up_what_is_under_way_is_finished_and_kept() -> None:

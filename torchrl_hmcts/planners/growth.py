@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -68,13 +68,15 @@ class SearchProgress:
     search: Search
 
 
-class _UnderWay(NamedTuple):
+@dataclass
+class _UnderWay:
     """A wave that is being simulated."""
 
     wave: Wave
     sent: Any  # what the simulator gave for it
     roots: np.ndarray  # of the leaves from which its rollouts began
     depth: int  # options of the rollouts before this one
+    received: bool = False
 
 
 class Growth:
@@ -97,6 +99,7 @@ class Growth:
         """Grow the trees of the roots ``rows``; ``begin`` is the time at which that began."""
         search, budget = self.search, self.planner.budget
         search.begin(budget.simulations)
+        search.growing = True
         if isinstance(self.planner.tree_policy, Gumbel):
             assert budget.simulations is not None
             search.halve(budget.simulations)
@@ -107,8 +110,10 @@ class Growth:
         except BaseException:
             for begun in self._under_way:
                 search.cancel(begun.wave)
-                self.simulator.abandon(begun.sent)
+                if not begun.received:
+                    self.simulator.abandon(begun.sent)
             raise
+        search.growing = False
         for root in rows[search.exhausted(rows)]:
             search.solve(int(root))
         return search
@@ -120,14 +125,17 @@ class Growth:
         since = search.roots["revisits"].copy()  # at the last outcome of each root
         active = self._still_active(rows)
         while len(active) or under_way:
-            while len(active) and len(under_way) < self.planner.waves_in_flight:
+            while len(active) and len(under_way) < search.waves_in_flight:
                 wave = search.select(active)
                 if not len(wave):
                     break
-                self._send(wave, wave.roots)
+                self._send(wave)
             if under_way:
-                first = under_way.popleft()
-                self._receive(first)
+                first = under_way[0]  # taken out once it is in the tree
+                after = self.simulator.receive(first.sent)
+                first.received = True
+                self._insert(first.wave, after)
+                under_way.popleft()
                 if self._extend(first):
                     continue
                 since[first.roots] = search.roots["revisits"][first.roots]
@@ -178,10 +186,10 @@ class Growth:
 
     # ---------------------------------------------------------------- a wave
 
-    def _send(self, wave: Wave, roots: np.ndarray, depth: int = 0) -> None:
-        """Have a wave simulated."""
+    def _send(self, wave: Wave, begun: _UnderWay | None = None) -> None:
+        """Have a wave simulated: leaves, or one option more of the rollouts ``begun``."""
         search, simulator = self.search, self.simulator
-        if self.planner.waves_in_flight > 1:
+        if search.waves_in_flight > 1:
             wave = search.detach(wave)
         try:
             states = search.tree.get_states(wave.roots, wave.nodes, simulator.state_keys)
@@ -189,16 +197,8 @@ class Growth:
         except BaseException:
             search.cancel(wave)
             raise
+        roots, depth = (wave.roots, 0) if begun is None else (begun.roots, begun.depth + 1)
         self._under_way.append(_UnderWay(wave, sent, roots, depth))
-
-    def _receive(self, begun: _UnderWay) -> None:
-        """Wait for the outcomes of a wave and insert them."""
-        try:
-            self._insert(begun.wave, self.simulator.receive(begun.sent))
-        except BaseException:
-            self.search.cancel(begun.wave)
-            self.simulator.abandon(begun.sent)
-            raise
 
     def _extend(self, begun: _UnderWay) -> bool:
         """Have the rollouts of a wave that was inserted go on; return whether any does."""
@@ -207,7 +207,7 @@ class Growth:
             return False
         further = self.search.extend(begun.wave)
         if len(further):
-            self._send(further, begun.roots, begun.depth + 1)
+            self._send(further, begun)
         return len(further) > 0
 
     def _insert(self, wave: Wave, after: TensorDictBase) -> None:
@@ -234,8 +234,10 @@ class Growth:
         merges = None
         if planner.chance is not None:
             merges = self._find_merges(wave, after, done)
+        search.inserting = True
         nodes = search.insert(wave, outcomes, merges)
         search.tree.set_states(wave.roots, nodes, after)
+        search.inserting = False
 
     def _find_merges(self, wave: Wave, after: TensorDictBase, done: np.ndarray) -> np.ndarray:
         """Known outcomes of the same option with the same state, or -1, int64 ``[m]``."""

@@ -463,6 +463,11 @@ def _schedule(wave, i, b, n, a):
     wave[i]["option"] = a
 
 
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
+def _is_untried(edge):
+    return not edge["closed"] and edge["child"] < 0 and edge["in_flight"] == 0
+
+
 @numba.njit(cache=True, error_model="numpy", _nrt=False)
 def extend(nodes, edges, roots, settings, ended, draws, wave):
     """Schedule an option of each new node ``ended``, by its prior; return how many there are.
@@ -483,16 +488,16 @@ def extend(nodes, edges, roots, settings, ended, draws, wave):
             continue
         total = 0.0
         for a in range(edges.shape[-1]):
-            if not links[n, a]["closed"] and links[n, a]["child"] < 0:
+            if _is_untried(links[n, a]):
                 total += links[n, a]["prior"]
         left, chosen = draws[i] * total, -1
         for a in range(edges.shape[-1]):
-            if not links[n, a]["closed"] and links[n, a]["child"] < 0:
+            if _is_untried(links[n, a]):
                 chosen = a
                 left -= links[n, a]["prior"]
                 if left < 0.0:
                     break
-        if chosen < 0:  # an outcome that was known before, all of whose options have been tried
+        if chosen < 0:  # an outcome that was known before, none of whose options is untried
             continue
         if s["mark"]:
             links[n, chosen]["in_flight"] += 1

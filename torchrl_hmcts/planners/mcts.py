@@ -55,7 +55,8 @@ class MCTSPlanner(TensorDictModuleBase):
     are closed and never simulated again.
 
     Root ``b`` of a call with seed ``s`` draws its random numbers (root noise, Gumbel, rollouts,
-    sampled choices) from ``s + b``, so that it has the same tree whatever is searched beside it.
+    sampled choices) from ``s + b``, so that it has the same tree whatever is searched beside it
+    (with more than one wave in flight only where it is alone: waves are of all roots together).
 
     Args:
         env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or
@@ -92,8 +93,8 @@ class MCTSPlanner(TensorDictModuleBase):
             outcomes of those before it are known. For a simulator that works beside the planner,
             such as :class:`AtariOptionPool` with processes: with 2 it has work while the planner
             inserts and selects. Outcomes are inserted in the order of the waves, whichever is
-            ready first, so that the tree is the same each time, and on every simulator. Times
-            ``leaves_per_wave`` at most 255; default 1.
+            ready first, so that the tree is the same each time (but for a budget of seconds) and
+            on every simulator. Times ``leaves_per_wave`` at most 255; default 1.
         exhausted: what a descent does with an option behind which nothing is left to simulate:
             ``"skip"`` it (default: every simulation finds something new), or ``"revisit"`` it and
             back its known value up once more, at no simulator's cost, so that visits and mean
@@ -303,7 +304,7 @@ class MCTSPlanner(TensorDictModuleBase):
         """Nodes to make room for at once: all that the budget allows, if that is not very many."""
         budget = self.budget
         limits = [x for x in (budget.simulations, budget.nodes) if x is not None]
-        per_wave = self.leaves_per_wave * self.num_options
+        per_wave = self.leaves_per_wave * self.waves_in_flight * self.num_options
         if not limits or num_roots * min(limits) > 2**20:
             return 64
         return min(limits) + per_wave + 1

@@ -38,9 +38,9 @@ class Wave:
     def __init__(self, records: np.ndarray, *, detached: bool = False) -> None:
         self.records = records  # [m] of tree.WAVE
         self.detached = detached  # others may be selected before it is inserted
-        self.roots = np.ascontiguousarray(records["root"])  # [m] int64
-        self.nodes = np.ascontiguousarray(records["node"])  # [m] int64
-        self.options = np.ascontiguousarray(records["option"])  # [m] int64
+        self.roots = records["root"].copy()  # [m] int64
+        self.nodes = records["node"].copy()  # [m] int64
+        self.options = records["option"].copy()  # [m] int64
 
     def __len__(self) -> int:
         return len(self.records)
@@ -172,6 +172,9 @@ class Search:
         self.num_roots = num_roots
         self.expand_all = expand == "all"
         self.leaves_per_wave = leaves_per_wave
+        self.waves_in_flight = waves_in_flight
+        self.growing = False  # also after an interruption: some of it may have been in flight
+        self.inserting = False  # also after an interruption: nodes may be there without a state
         self.stochastic = chance is not None
         self.max_backup = isinstance(backup, MaxBackup)
         self.settings = np.zeros(1, kernels.SETTINGS)
@@ -270,7 +273,24 @@ class Search:
     # ------------------------------------------------------------------ growing
 
     def begin(self, max_simulations: int | None = None) -> None:
-        """Count simulations, expansions and base steps from 0, up to a number of simulations."""
+        """Count simulations, expansions and base steps from 0, up to a number of simulations.
+
+        What an interruption left in flight is forgotten.
+
+        Raises:
+            RuntimeError: if the interruption came while outcomes were inserted.
+        """
+        if self.inserting:
+            raise RuntimeError(
+                "This search was interrupted while outcomes were inserted: it may have nodes "
+                "without a state, and cannot go on. Its plans and values can be read; search anew "
+                "to go on."
+            )
+        if self.growing:
+            self.tree.edges["in_flight"] = 0
+            self.tree.nodes["flags"] &= ~PENDING
+            self.roots["scheduled"] = 0
+            self.growing = False
         limit = NO_LIMIT if max_simulations is None else max_simulations
         self._kernels.begin(self.tree.roots, limit)
 
