@@ -170,7 +170,7 @@ def main() -> None:
     parser.add_argument("--options", type=int, default=3)
     parser.add_argument("--steps", type=int, default=10, help="steps of an option")
     parser.add_argument("--leaves", type=int, default=8, help="leaves per wave")
-    parser.add_argument("--waves", type=int, default=2, help="waves in flight")
+    parser.add_argument("--waves", type=int, default=3, help="waves in flight")
     parser.add_argument("--ratio", type=float, default=25.0, help="simulated steps per real one")
     parser.add_argument("--frames", type=int, default=40_000, help="of one side of a round")
     parser.add_argument("--rounds", type=int, default=8)
