@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,6 +167,8 @@ def human_normalised(row: Mapping[str, Any], key: str) -> float:
 def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
     """Return the interquartile mean over games and seeds with its stratified 95 % interval.
 
+    Each game counts as much as another, however many seeds it has.
+
     Args:
         scores: human-normalised, of the seeds of each game.
         draws: resamples of the seeds within each game, from a fixed seed.
@@ -177,11 +180,18 @@ def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[fl
     Example:
         >>> aggregate([[1.0], [2.0], [3.0], [10.0]])
         (2.5, 2.5, 2.5)
+        >>> aggregate([[1.0, 1.0, 1.0], [2.0], [3.0], [10.0]])
+        (2.5, 2.5, 2.5)
     """
     generator = np.random.default_rng(0)
-    drawn = [generator.choice(np.array(g), size=(draws, len(g))) for g in scores]
-    means = interquartile_mean(np.concatenate(drawn, -1))
-    middle = float(interquartile_mean(np.concatenate([np.array(g) for g in scores])))
+    often = math.lcm(*map(len, scores))
+
+    def mean(samples: Sequence[np.ndarray]) -> Any:
+        equal = [game.repeat(often // game.shape[-1], -1) for game in samples]
+        return interquartile_mean(np.concatenate(equal, -1))
+
+    means = mean([generator.choice(np.array(g), size=(draws, len(g))) for g in scores])
+    middle = float(mean([np.array(g) for g in scores]))
     low, high = np.percentile(means, [2.5, 97.5])
     return middle, float(low), float(high)
 
