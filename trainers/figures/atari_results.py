@@ -224,23 +224,27 @@ def over_seeds(
 
     Args:
         curves: one per seed, S of them.
-        from_start: count steps from the first of each curve.
+        from_start: count steps from the first of each curve, and a seed only as long as it goes.
 
     Returns:
-        Steps ``[G]`` and values ``[S, G]``, NaN before a curve begins.
+        Steps ``[G]`` and values ``[S, G]``, NaN where a seed does not count.
 
     Example:
         >>> one = RunCurve("x", [0, 10, 20], [0, 1, 2], "steps")
         >>> two = RunCurve("x", [10, 30], [1, 3], "steps")
         >>> over_seeds([one, two])[1].tolist()
         [[0.0, 1.0, 2.0, 2.0], [nan, 1.0, 2.0, 3.0]]
+        >>> over_seeds([one, RunCurve("x", [5, 15], [7, 8], "steps")], from_start=True)[1].tolist()
+        [[0.0, 1.0, 2.0], [7.0, 8.0, nan]]
     """
     own = [np.asarray(curve.steps, float) for curve in curves]
     if from_start:
         own = [steps - steps[0] for steps in own]
     steps = np.unique(np.concatenate(own))
     rows = zip(own, curves, strict=True)
-    return steps, np.stack([np.interp(steps, x, c.values, left=np.nan) for x, c in rows])
+    after = np.nan if from_start else None
+    values = [np.interp(steps, x, c.values, left=np.nan, right=after) for x, c in rows]
+    return steps, np.stack(values)
 
 
 def draw_game(sources: Sources, path: Path, name: str) -> str:
@@ -311,8 +315,8 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
     shown.suptitle(game, fontsize=11, x=0.01, ha="left")
     shown.savefig(path, dpi=_DPI)
     return (
-        f"{game}: mean, least and largest over the seeds that have found their options, against "
-        "emulated steps."
+        f"{game}: mean, least and largest over the seeds that play (left) or have a score (right), "
+        "against emulated steps."
     )
 
 
