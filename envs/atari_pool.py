@@ -36,7 +36,7 @@ class PendingStep:
     def __init__(self, pool: AtariOptionPool, tensordict: TensorDictBase) -> None:
         self.pool, self.tensordict = pool, tensordict
         self.slots: list[int] = []  # whose options are under way
-        self.done: list[np.ndarray] = []  # outcomes of those before them
+        self.done: list[np.ndarray] = []  # each [k] of slot_type: outcomes of those before them
         self.used = False
 
     def __reduce__(self) -> Any:
@@ -400,7 +400,8 @@ class AtariOptionPool(EnvBase):
             self._settle(ticket)
         finally:
             self._forget(ticket)
-        result = self._outcome(np.concatenate(ticket.done), ticket.tensordict.batch_size)
+        used = ticket.done[0] if len(ticket.done) == 1 else np.concatenate(ticket.done)
+        result = self._outcome(used, ticket.tensordict.batch_size)
         if self.on_step is not None:
             self.on_step(ticket.tensordict, result)
         return result

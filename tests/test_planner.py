@@ -300,13 +300,16 @@ def test_the_mask_may_have_another_name() -> None:
     assert plan.options.tolist() == [1, 1]
 
 
-def test_a_dead_end_below_the_root_is_closed() -> None:
-    class DeadEnd(TableEnv):
-        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-            after = super()._step(tensordict)
-            after["action_mask"][after["state"] == 1] = False
-            return after
+class DeadEnd(CountingEnv):
+    """No action may be taken in state 1."""
 
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        after = super()._step(tensordict)
+        after["action_mask"][after["state"] == 1] = False
+        return after
+
+
+def test_a_dead_end_below_the_root_is_closed() -> None:
     table = {(0, 0): (1, 0.5, 1), (0, 1): (2, 0.0, 1), (1, 0): (1, 9.0, 1), (2, 0): (3, 1.0, 1)}
     env = DeadEnd(table, terminal=[3])
     planner = MCTSPlanner(env, gamma=1.0, budget=FOREVER)
@@ -316,12 +319,6 @@ def test_a_dead_end_below_the_root_is_closed() -> None:
 
 
 def test_a_python_policy_takes_no_option_of_a_dead_end_that_others_pass_by() -> None:
-    class DeadEnd(CountingEnv):
-        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-            after = super()._step(tensordict)
-            after["action_mask"][after["state"] == 1] = False
-            return after
-
     # Root 0 revisits the dead end 1 while root 1 goes round and round between 2 and 3.
     table = {(0, 0): (1, 0.5, 1), (0, 1): (2, 0.0, 1), (1, 0): (1, 9.0, 1)}
     table |= {(2, 0): (3, 0.0, 1), (3, 0): (2, 0.0, 1)}

@@ -96,7 +96,15 @@ class Growth:
 
     @torch.no_grad()
     def run(self, begin: float, rows: np.ndarray) -> Search:
-        """Grow the trees of the roots ``rows``; ``begin`` is the time at which that began."""
+        """Grow trees and return the search.
+
+        Args:
+            begin: when the call began, in seconds of ``time.perf_counter()``.
+            rows: the roots whose trees grow, int64.
+
+        Raises:
+            RuntimeError: if an earlier run was interrupted while it inserted outcomes.
+        """
         search, budget = self.search, self.planner.budget
         search.begin(budget.simulations)
         search.growing = True

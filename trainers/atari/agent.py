@@ -36,7 +36,8 @@ class AtariSearch:
 
     Attributes:
         ratio: simulated base steps per base step of an option, after which no new leaf is selected;
-            ρ. The leaves and rollouts under way are finished: with 4 leaves and 25, about 38.
+            ρ. The leaves and rollouts under way are finished: with 4 leaves and 25, about 38
+            in Breakout.
         tree_policy: ``"puct"`` with a max backup over values scaled to [0, 1], or ``"uct"`` with a
             mean backup, its c times the greatest reward seen.
         c: weight of exploration.
