@@ -68,7 +68,7 @@ class SearchProgress:
     search: Search
 
 
-@dataclass
+@dataclass(slots=True)
 class _UnderWay:
     """A wave that is being simulated."""
 
@@ -92,6 +92,7 @@ class Growth:
 
     def __init__(self, planner: MCTSPlanner, search: Search) -> None:
         self.planner, self.search, self.simulator = planner, search, planner.simulator
+        self._rollout_options = 0 if planner.rollout is None else planner.rollout.max_options
         self._under_way: deque[_UnderWay] = deque()
 
     @torch.no_grad()
@@ -144,9 +145,10 @@ class Growth:
                 first.received = True
                 self._insert(first.wave, after)
                 under_way.popleft()
-                if self._extend(first):
+                if first.depth < self._rollout_options and self._extend(first):
                     continue
-                since[first.roots] = search.roots["revisits"][first.roots]
+                if endless:
+                    since[first.roots] = search.roots["revisits"][first.roots]
             seconds = time.perf_counter() - begin
             if self.planner.progress is not None:
                 self.planner.progress(self._progress(len(active), seconds))
@@ -210,9 +212,6 @@ class Growth:
 
     def _extend(self, begun: _UnderWay) -> bool:
         """Have the rollouts of a wave that was inserted go on; return whether any does."""
-        rollout = self.planner.rollout
-        if rollout is None or begun.depth == rollout.max_options:
-            return False
         further = self.search.extend(begun.wave)
         if len(further):
             self._send(further, begun)
