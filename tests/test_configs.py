@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 from collections.abc import Iterator
 from typing import Any
@@ -23,12 +22,10 @@ import torchrl_hmcts.planners
 import torchrl_hmcts.transforms
 from torchrl_hmcts.planners import PUCT, UCT, Gumbel, MaxBackup, RadiusNovelty
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.configs import GROUPS, to_yaml
-from torchrl_hmcts.trainers.configs.base import named
+from torchrl_hmcts.trainers.configs import COMPONENTS, argument_docs, config_of, named, to_yaml
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS
-from torchrl_hmcts.trainers.experiments.registry import field_docs
 
-CONFIGS = [(f"{g}={n}", config) for g, names in GROUPS.items() for n, config in names.items()]
+CONFIGS = [(f"{g}={n}", named(p)) for g, names in COMPONENTS.items() for n, p in names.items()]
 INTERNAL = {"_target_", "_component_", "_partial_"}
 
 
@@ -46,16 +43,6 @@ def keywords(component: type) -> dict[str, inspect.Parameter]:
     return {n: p for n, p in parameters.items() if n != "self" and p.kind not in variable}
 
 
-def default_of(field: dataclasses.Field) -> Any:
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return field.default
-
-
-def component_of(config: type) -> type:
-    return named({f.name: f for f in dataclasses.fields(config)}["_component_"].default)
-
-
 def as_written(value: Any) -> Any:
     """A class's default as a config can hold it."""
     if isinstance(value, tuple | list | range):
@@ -65,31 +52,30 @@ def as_written(value: Any) -> Any:
     return value
 
 
-@pytest.mark.parametrize(("name", "config"), CONFIGS, ids=[name for name, _ in CONFIGS])
-def test_a_config_has_the_keywords_and_defaults_of_its_class(name: str, config: type) -> None:
-    parameters = keywords(component_of(config))
-    own = {f.name: f for f in dataclasses.fields(config) if f.name not in INTERNAL}
-    assert sorted(own) == sorted(parameters)
+@pytest.mark.parametrize(("name", "component"), CONFIGS, ids=[name for name, _ in CONFIGS])
+def test_a_config_has_the_keywords_and_defaults_of_its_class(name: str, component: type) -> None:
+    parameters = keywords(component)
+    config = {k: v for k, v in vars(config_of(component)()).items() if k not in INTERNAL}
+    assert sorted(config) == sorted(parameters)
     for key, parameter in parameters.items():
-        default = default_of(own[key])
         if parameter.default is inspect.Parameter.empty:
-            assert default == MISSING, key
-        elif callable(parameter.default):
-            assert named(default) is parameter.default, key
+            assert config[key] == MISSING, key
+        elif callable(parameter.default) or isinstance(parameter.default, torch.dtype):
+            assert named(config[key]) is parameter.default, key
         else:
-            assert default == as_written(parameter.default), key
+            assert config[key] == as_written(parameter.default), key
 
 
-@pytest.mark.parametrize(("name", "config"), CONFIGS, ids=[name for name, _ in CONFIGS])
-def test_every_key_has_a_sentence_and_the_yaml_shows_it(name: str, config: type) -> None:
-    meanings = field_docs(config)
-    written = to_yaml(config)
-    for field in dataclasses.fields(config):
-        if field.name not in INTERNAL:
-            assert meanings[field.name].endswith("."), field.name
-            assert len(meanings[field.name]) > 8, field.name
-            assert f"\n{field.name}:" in f"\n{written}"
-    assert set(OmegaConf.create(written)) == {f.name for f in dataclasses.fields(config)}
+@pytest.mark.parametrize(("name", "component"), CONFIGS, ids=[name for name, _ in CONFIGS])
+def test_the_yaml_explains_every_key_in_the_words_of_the_docstring(
+    name: str, component: type
+) -> None:
+    written = to_yaml(component)
+    assert set(OmegaConf.create(written)) == {*keywords(component), "_target_", "_component_"}
+    if component.__module__.startswith("torchrl_hmcts"):
+        assert set(argument_docs(component)) >= set(keywords(component))
+        comments = sum(line.startswith("# ") for line in written.splitlines())
+        assert comments >= len(keywords(component))
 
 
 # Built by others, or no part that one would choose in a config.
@@ -111,7 +97,7 @@ def test_every_class_that_can_be_swapped_has_a_config(package: str) -> None:
     public = {n for n in module.__all__ if inspect.isclass(getattr(module, n))}
     if package.endswith(".envs"):
         public = {n for n in public if issubclass(getattr(module, n), EnvBase)}
-    configured = {component_of(config).__name__ for _, config in CONFIGS}
+    configured = {component.__name__ for _, component in CONFIGS}
     missing = public - configured - NOT_CONFIGURED[package]
     assert not missing, f"without a config in trainers/configs: {sorted(missing)}"
 
@@ -252,6 +238,63 @@ def test_diayn_composes_with_torchrls_env_collector_and_optimizer() -> None:
     assert values["loss_discriminator"].isfinite()
     assert any((a != b).any() for a, b in zip(before, loss.parameters(), strict=True))
     collector.shutdown()
+
+
+@pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")
+@pytest.mark.filterwarnings("ignore:The .* hook stage will be replaced:FutureWarning")
+def test_torchrls_sac_trainer_trains_skills_from_configs_alone() -> None:
+    networks = [
+        *(f"+model@{n}=skill_{n}" for n in ("actor", "critic", "discriminator")),
+        *(f"{n}.num_skills=3" for n in ("actor", "critic", "discriminator")),
+        *(f"{n}.in_features=2" for n in ("actor", "critic", "discriminator")),
+        *(f"{n}.in_keys=[velocity]" for n in ("actor", "critic")),
+        "critic.num_actions=4",
+        "+action_spec@actor.action_spec=categorical",
+        "actor.action_spec.n=4",
+    ]
+    overrides = [
+        *waterworld_with_skills(),
+        *networks,
+        "+trainer=sac",
+        "+collector@trainer.collector=sync",
+        "trainer.collector.create_env_fn=${env}",
+        "trainer.collector.policy=${actor}",
+        "trainer.collector.frames_per_batch=32",
+        "trainer.collector.total_frames=64",
+        "trainer.collector.auto_register_policy_transforms=false",
+        "trainer.collector._partial_=false",
+        "+loss@trainer.loss_module=diayn",
+        "trainer.loss_module._partial_=true",
+        "trainer.loss_module.action_space=categorical",
+        "trainer.loss_module.discriminator=${discriminator}",
+        "+replay_buffer@trainer.replay_buffer=base",
+        "trainer.replay_buffer.batch_size=16",
+        "+storage@trainer.replay_buffer.storage=lazy_tensor",
+        "trainer.replay_buffer.storage.max_size=64",
+        "+target_net_updater@trainer.target_net_updater=soft",
+        "trainer.target_net_updater.tau=0.5",
+        "+optimizer@trainer.optimizer=adam",
+        "trainer.optimizer.lr=0.01",
+        "trainer.actor_network=${actor}",
+        "trainer.critic_network=${critic}",
+        "trainer.total_frames=64",
+        "trainer.optim_steps_per_batch=1",
+        "trainer.logger=null",
+        "trainer.save_trainer_file=null",
+        "trainer.progress_bar=false",
+        "trainer.enable_logging=false",
+        "+hook@reward=skill_reward",
+        "trainer.hooks=[${reward}]",
+    ]
+    trainer = instantiate(compose(overrides=overrides).trainer)
+    before = {name: p.clone() for name, p in trainer.loss_module.named_parameters()}
+    trainer.train()
+    after = dict(trainer.loss_module.named_parameters())
+    for part in ("actor_network", "qvalue_network", "discriminator"):
+        assert any((after[n] != p).any() for n, p in before.items() if part in n), part
+    sampled = trainer.replay_buffer.sample()
+    reward = trainer.loss_module.objective.reward(sampled)
+    torch.testing.assert_close(sampled["next", "reward"], reward)
 
 
 def test_an_objective_goes_into_the_skill_loss() -> None:

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.skills.coverage import StateCoverage
     from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
     from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
+    from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
     from torchrl_hmcts.trainers.skills.termination import (
         TerminationConfig,
         TerminationResult,
@@ -118,6 +119,7 @@ __all__ = [
     "SearchCoverage",
     "SharedAdam",
     "SharedRMSprop",
+    "SkillRewardHook",
     "StateCoverage",
     "TerminationConfig",
     "TerminationResult",
@@ -182,6 +184,7 @@ _MODULES = {
     "SearchCoverage": "skills.growing",
     "SharedAdam": "asynchronous.shared_optimizers",
     "SharedRMSprop": "asynchronous.shared_optimizers",
+    "SkillRewardHook": "skills.reward_hook",
     "StateCoverage": "skills.coverage",
     "TerminationConfig": "skills.termination",
     "TerminationResult": "skills.termination",
