@@ -96,7 +96,7 @@ $(TRAIN_STAMP): pyproject.toml $(VENV)/pyvenv.cfg $(call stale,$(TRAIN_STAMP))
 	@echo '$(HERE)' > $@
 
 $(DEV_STAMP): pyproject.toml $(VENV)/pyvenv.cfg $(call stale,$(DEV_STAMP))
-	$(BIN)/python -m pip install --disable-pip-version-check -e '.[train,dev]'
+	$(BIN)/python -m pip install --disable-pip-version-check -e '.[train,dev,gym]'
 	@echo '$(HERE)' > $@
 	@echo '$(HERE)' > $(TRAIN_STAMP)
 

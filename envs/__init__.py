@@ -14,6 +14,13 @@ from torchrl_hmcts.envs.atari_ram import AtariRAMEnv
 from torchrl_hmcts.envs.atari_workers import OptionWorker, RepeatActions, SharedMLP
 from torchrl_hmcts.envs.deepmind_lab import DeepMindLabEnv
 from torchrl_hmcts.envs.gridworld import GridworldMazeEnv
+from torchrl_hmcts.envs.gym.settable import SettableGymEnv
+from torchrl_hmcts.envs.gym.snapshots import (
+    AttributeSnapshot,
+    ReplaySnapshot,
+    Snapshot,
+    SnapshotError,
+)
 from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
 from torchrl_hmcts.envs.lab_actions import LAB_ACTIONS
 from torchrl_hmcts.envs.lab_first_person import draw_first_person
@@ -37,6 +44,7 @@ from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 __all__ = [
     "AtariOptionPool",
     "AtariRAMEnv",
+    "AttributeSnapshot",
     "ByteGoal",
     "DeepMindLabEnv",
     "FollowGoals",
@@ -47,7 +55,11 @@ __all__ = [
     "OccasionalAction",
     "OptionWorker",
     "RepeatActions",
+    "ReplaySnapshot",
+    "SettableGymEnv",
     "SharedMLP",
+    "Snapshot",
+    "SnapshotError",
     "TorchRLGymnasiumEnv",
     "WaterworldMazeEnv",
     "check_mazes",

@@ -151,7 +151,7 @@ def test_a_module_imports_only_what_its_layer_may(module: str) -> None:
 @pytest.mark.parametrize("module", modules())
 def test_every_third_party_import_is_declared(module: str) -> None:
     path = modules()[module]
-    extras = {"trainers": ("train", "atari", "scale", "wandb"), "envs": ("atari",)}.get(
+    extras = {"trainers": ("train", "atari", "scale", "wandb"), "envs": ("atari", "gym")}.get(
         layer(module), ()
     )
     if OPTIONAL.get(module) == "matplotlib":

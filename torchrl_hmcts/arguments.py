@@ -136,6 +136,8 @@ def _explain(
     error: Exception,
 ) -> Exception | None:
     """Returns a better error, or None if this one will do."""
+    if type(error).__module__.startswith("torchrl_hmcts"):  # an error of our own says it all
+        return None
     outward = isinstance(error, (TypeError, ValueError))
     if not outward and type(error) not in _INNER:
         return None

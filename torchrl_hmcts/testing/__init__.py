@@ -15,6 +15,7 @@ from torchrl_hmcts.testing.search_checks import (
     check_planner,
     check_tree_policy,
 )
+from torchrl_hmcts.testing.settable_checks import check_settable
 from torchrl_hmcts.testing.skill_checks import check_skill_objective, check_skill_prior
 from torchrl_hmcts.testing.solvable_envs import ChainEnv, PointMassEnv, TableEnv
 from torchrl_hmcts.testing.transform_checks import TRANSFORM_CHECKS, check_transform
@@ -35,6 +36,7 @@ __all__ = [
     "check_option_prior",
     "check_parallel_env",
     "check_planner",
+    "check_settable",
     "check_skill_objective",
     "check_skill_prior",
     "check_termination",

@@ -1,0 +1,191 @@
+"""Snapshots of envs whose physics is MuJoCo: Gymnasium's, gymnasium-robotics', OGBench's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from torchrl_hmcts.envs.gym.snapshots import AttributeSnapshot, SnapshotError, env_layers
+
+# What envs read of the last step before they take the next one: it lags behind the positions.
+_DERIVED = (
+    "xpos", "xquat", "xmat", "xipos", "site_xpos", "site_xmat", "geom_xpos", "cfrc_ext", "cinert",
+    "cvel", "qfrc_actuator", "sensordata", "actuator_force", "subtree_com", "qacc", "ten_length",
+    "actuator_length", "actuator_velocity",
+)  # fmt: skip
+_PROBE_STEPS = 12
+_NO_STATE = frozenset({"MujocoRenderer", "MujocoModelNames", "Maze"})  # names and maps of a model
+
+
+class MujocoSnapshot(AttributeSnapshot):
+    """Stores MuJoCo's integration state, and the attributes of the env.
+
+    Positions and velocities alone are not the state: the solver's warm start, controls and applied
+    forces belong to it (``mjSTATE_INTEGRATION``). Some models also need a forward pass before the
+    state is set, and some rewards read derived quantities of the step before. A short probe finds
+    out what of both this env needs, and fields of the model that a reset changes (goal sites).
+
+    Args:
+        env (gymnasium.Env): an env with a MuJoCo ``model`` and ``data``.
+        cap (int): bytes of a row at most. Default 65,536.
+
+    Attributes:
+        forward (bool): whether restoring takes a forward pass.
+        derived (tuple of str): fields of ``MjData`` stored beside the state.
+
+    Raises:
+        SnapshotError: if the env is not deterministic, or an attribute cannot be stored.
+
+    Reference:
+        MuJoCo documentation, "Simulation: state and control".
+    """
+
+    plain_types = AttributeSnapshot.plain_types | {np.ndarray}
+
+    def __init__(self, env: gymnasium.Env, *, cap: int = 1 << 16) -> None:
+        import mujoco
+
+        self._mj = mujoco
+        self.model, self.data = find_physics(env)
+        self._spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        self._numbers = mujoco.mj_stateSize(self.model, self._spec)
+        self._state = np.empty(self._numbers)
+        self.forward = False
+        self.derived: tuple[str, ...] = ()
+        self._model_fields: tuple[str, ...] = ()
+        self._attributes = 0
+        self._set_views()
+        super().__init__(env, cap=cap)
+        self._attributes = self.width
+        self._choose(env)
+
+    @classmethod
+    def fits(cls, env: gymnasium.Env) -> bool:
+        return any(_physics_of(layer) is not None for layer in env_layers(env))
+
+    def is_fixed(self, value: Any) -> bool:
+        module = type(value).__module__
+        return (
+            module.startswith(("mujoco", "dm_control"))
+            or type(value).__name__ in _NO_STATE
+            or super().is_fixed(value)
+        )
+
+    def read(self) -> np.ndarray:
+        row = np.zeros(self.width, np.uint8)
+        native = row[: self._native].view(np.float64)
+        self._mj.mj_getState(self.model, self.data, native[: self._numbers], self._spec)
+        at = self._numbers
+        for view in self._views:
+            native[at : at + view.size] = view.ravel()
+            at += view.size
+        self._write(row[self._native :])
+        return row
+
+    def restore(self, row: np.ndarray) -> None:
+        native = row[: self._native].view(np.float64)
+        at = self._numbers
+        state = native[:at]
+        for view in self._views[: len(self._model_fields)]:
+            view[...] = native[at : at + view.size].reshape(view.shape)
+            at += view.size
+        self._mj.mj_setState(self.model, self.data, state, self._spec)
+        if self.forward:
+            self._mj.mj_forward(self.model, self.data)
+            self._mj.mj_setState(self.model, self.data, state, self._spec)
+        for view in self._views[len(self._model_fields) :]:
+            view[...] = native[at : at + view.size].reshape(view.shape)
+            at += view.size
+        self._load(row[self._native :])
+
+    # ------------------------------------------------------------------ what an env needs
+
+    def _set_views(self) -> None:
+        fields = [getattr(self.model, name) for name in self._model_fields]
+        fields += [getattr(self.data, name) for name in self.derived]
+        self._views = [field for field in fields if field.size]
+        self._native = 8 * (self._numbers + sum(view.size for view in self._views))
+        self.width = self._native + self._attributes
+
+    def _choose(self, env: gymnasium.Env) -> None:
+        """Takes the cheapest way of restoring after which the env repeats its steps to the bit."""
+        models = []
+        for seed in range(3):
+            env.reset(seed=seed)
+            models.append({n: np.array(getattr(self.model, n)) for n in ("site_pos", "body_pos")})
+        changed = [n for n in models[0] if any((m[n] != models[0][n]).any() for m in models[1:])]
+        self._model_fields = tuple(changed)
+        env.action_space.seed(0)
+        actions = [env.action_space.sample() for _ in range(3 * _PROBE_STEPS)]
+        for derived, forward in (((), False), (_DERIVED, False), ((), True), (_DERIVED, True)):
+            self.derived = tuple(name for name in derived if hasattr(self.data, name))
+            self.forward = forward
+            self._set_views()
+            env.reset(seed=0)
+            if self._repeats(env, actions):
+                break
+        else:
+            raise SnapshotError(
+                f"{env} does not repeat its steps after its state was restored. It is not "
+                "deterministic, or has a state that no attribute shows. Pass snapshot=(read, "
+                "restore) of your own."
+            )
+
+    def _repeats(self, env: gymnasium.Env, actions: list[Any]) -> bool:
+        first, rest, other = (actions[i::3] for i in range(3))
+        for action in first:
+            env.step(action)
+            self.note_step(action)
+        row = self.read()
+        rows = []
+        for path in (rest, other, rest):
+            self.restore(row)
+            self.note_step(path[0])
+            rows.append([repr_of(env.step(action)) for action in path])
+        return rows[0] == rows[2]
+
+
+def find_physics(env: gymnasium.Env) -> tuple[Any, Any]:
+    """Return MuJoCo's model and data of an env.
+
+    Args:
+        env (gymnasium.Env): with its wrappers.
+
+    Raises:
+        SnapshotError: if there is none.
+    """
+    for layer in env_layers(env):
+        physics = _physics_of(layer)
+        if physics is not None:
+            return physics
+    raise SnapshotError(f"{env} has no MuJoCo model and data.")
+
+
+def _physics_of(layer: gymnasium.Env) -> tuple[Any, Any] | None:
+    own = vars(layer)
+    for model, data in (("model", "data"), ("_model", "_data")):
+        if type(own.get(data)).__name__ == "MjData":
+            return own[model], own[data]
+    return None
+
+
+def repr_of(outcome: tuple[Any, ...]) -> bytes:
+    """Return a step's observation, reward and ends as bytes, to be compared to the bit.
+
+    Args:
+        outcome: of ``env.step``; the info is left out.
+    """
+    observation, reward, terminated, truncated = outcome[:4]
+    parts = [np.asarray(x) for x in _leaves(observation)]
+    parts += [np.asarray(float(reward)), np.asarray([terminated, truncated])]
+    return b"".join(part.tobytes() for part in parts)
+
+
+def _leaves(observation: Any) -> list[Any]:
+    if isinstance(observation, dict):
+        return [leaf for key in sorted(observation) for leaf in _leaves(observation[key])]
+    if isinstance(observation, tuple):
+        return [leaf for item in observation for leaf in _leaves(item)]
+    return [observation]

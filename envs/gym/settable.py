@@ -1,0 +1,273 @@
+"""Any Gymnasium env as a TorchRL env that can be set to a state."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import pickle
+import random
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import gymnasium.wrappers
+import numpy as np
+import torch
+from gymnasium import spaces
+from tensordict import TensorDictBase
+from torchrl.data import Unbounded
+from torchrl.envs import GymWrapper
+
+from torchrl_hmcts.envs.gym.snapshots import DEFAULT_CAP, Snapshot, SnapshotError, snapshot_of
+
+# Packages that register their envs when they are imported, and the extra that installs them.
+_PACKAGES = ("gymnasium_robotics", "minigrid", "ogbench", "ale_py")
+_KEY = "snapshot"
+
+
+class PrivateRandom(gymnasium.Wrapper):
+    """Gives an env that draws from the global generators of NumPy and Python states of its own.
+
+    Such an env is neither fixed by ``reset(seed=...)``, nor independent of what else draws. Under
+    this wrapper the global generators are as they were after every reset and step.
+
+    Args:
+        env (gymnasium.Env): e.g. OGBench's mazes, which draw starts, goals and teleports so.
+    """
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self._states = _seeded_states(0)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset the env; a seed also seeds its own states of the global generators."""
+        if seed is not None:
+            self._states = _seeded_states(seed)
+        return self._inside(lambda: self.env.reset(seed=seed, options=options))
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        return self._inside(lambda: self.env.step(action))
+
+    def _inside(self, call: Callable[[], Any]) -> Any:
+        before = _global_states()
+        _set_global_states(self._states)
+        try:
+            return call()
+        finally:
+            self._states = _global_states()
+            _set_global_states(before)
+
+
+def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords: Any) -> Any:
+    """Make a Gymnasium env whose draws are its own.
+
+    Args:
+        env (str, gymnasium.Env or callable): an id, an env, or a function that makes one. Packages
+            that are known to register envs are imported where Gymnasium does not know the id.
+        **keywords: of ``gymnasium.make``.
+
+    Returns:
+        gymnasium.Env: the env, under :class:`PrivateRandom` if it draws from global generators.
+
+    Raises:
+        ValueError: if no package has the id; the nearest ids are named.
+        ImportError: if the env needs a package that is not installed.
+
+    Example:
+        >>> make_gym("CartPole-v1").spec.id
+        'CartPole-v1'
+    """
+    made = _make_id(env, keywords) if isinstance(env, str) else env
+    if callable(made) and not isinstance(made, gymnasium.Env):
+        made = made(**keywords)
+    if not isinstance(made, gymnasium.Env):
+        raise TypeError(
+            f"An id such as 'CartPole-v1', a gymnasium.Env or a function that makes one is needed; "
+            f"got a {type(made).__name__}."
+        )
+    made = _without_texts(made)
+    return PrivateRandom(made) if _draws_globally(made) else made
+
+
+def _without_texts(env: gymnasium.Env) -> gymnasium.Env:
+    """Leaves out observations that are no arrays, e.g. MiniGrid's mission, which is a text."""
+    space = env.observation_space
+    if not isinstance(space, spaces.Dict):
+        return env
+    arrays = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete, spaces.Dict)
+    kept = [name for name, part in space.spaces.items() if isinstance(part, arrays)]
+    if len(kept) == len(space.spaces):
+        return env
+    return gymnasium.wrappers.FilterObservation(env, kept)
+
+
+def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
+    for package in _PACKAGES:
+        try:
+            gymnasium.spec(name)
+            break
+        except gymnasium.error.Error:
+            try:
+                gymnasium.register_envs(importlib.import_module(package))
+            except Exception:
+                continue
+    try:
+        return gymnasium.make(name, disable_env_checker=True, **keywords)
+    except gymnasium.error.UnregisteredEnv:
+        near = difflib.get_close_matches(name, list(gymnasium.registry), n=3, cutoff=0.5)
+        hint = f"Nearest: {', '.join(near)}." if near else "gymnasium.pprint_registry() lists all."
+        raise ValueError(
+            f"No env has the id {name!r}. {hint} MuJoCo's robots, MiniGrid and OGBench come with "
+            "pip install 'torchrl_hmcts[gym]', Atari with 'torchrl_hmcts[atari]'."
+        ) from None
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise ImportError(
+            f"{name} needs a package that is not installed ({error}). MuJoCo's, MiniGrid's and "
+            "OGBench's come with pip install 'torchrl_hmcts[gym]', Atari's with "
+            "'torchrl_hmcts[atari]'."
+        ) from error
+
+
+def _draws_globally(env: gymnasium.Env) -> bool:
+    """Whether a reset or a few steps draw from a global generator."""
+    before = _global_states()
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(3):
+        if any(env.step(env.action_space.sample())[2:4]):
+            env.reset(seed=0)
+    after = _global_states()
+    _set_global_states(before)
+    return pickle.dumps(before) != pickle.dumps(after)
+
+
+def _global_states() -> tuple[Any, Any]:
+    """The states of NumPy's and Python's global generators."""
+    return np.random.get_state(), random.getstate()
+
+
+def _set_global_states(states: tuple[Any, Any]) -> None:
+    np.random.set_state(states[0])
+    random.setstate(states[1])
+
+
+def _seeded_states(seed: int) -> tuple[Any, Any]:
+    return np.random.RandomState(seed % 2**32).get_state(), random.Random(seed).getstate()
+
+
+class SettableGymEnv(GymWrapper):
+    """A Gymnasium env that a planner can set to any state, right to the bit.
+
+    Its state is the entry ``"snapshot"``, uint8 ``[width]``, beside its observations. Any transform
+    of TorchRL goes on top of it, an :class:`~torchrl_hmcts.transforms.OptionTransform` too.
+
+    Args:
+        env (str, gymnasium.Env or callable): an id, an env, or a function that makes one. It is
+            reset.
+        snapshot (type, tuple of two functions, or callable, optional): how its state is stored,
+            see :func:`~torchrl_hmcts.envs.gym.snapshots.snapshot_of`. Default: found by itself, and
+            named in the ``repr``.
+        cap (int): bytes of the attributes in a row at most. Default 65,536.
+        seed (int, optional): of the starts of its episodes. Default: drawn from torch's global
+            generator.
+        device (optional): of the tensors.
+        **keywords: of ``gymnasium.make``.
+
+    Raises:
+        ValueError: if the id is unknown, or the state cannot be stored.
+        ImportError: if a package is missing; the extra that has it is named.
+
+    Example:
+        >>> from torchrl_hmcts.envs import SettableGymEnv
+        >>> env = SettableGymEnv("CartPole-v1", seed=0)
+        >>> start = env.reset()
+        >>> first = env.step(env.rand_action(start.clone()))["next", "observation"]
+        >>> _ = env.reset(start, set_state=True)
+        >>> env
+        SettableGymEnv(CartPole-v1, snapshot=AttributeSnapshot, ... bytes)
+
+    Reference:
+        Towers et al., "Gymnasium: A Standard Interface for Reinforcement Learning Environments",
+        2024, arXiv 2407.17032.
+    """
+
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        env: str | gymnasium.Env | Callable[[], gymnasium.Env],
+        *,
+        snapshot: Any = None,
+        cap: int = DEFAULT_CAP,
+        seed: int | None = None,
+        device: Any = None,
+        **keywords: Any,
+    ) -> None:
+        # TorchRL's metaclass adds a keyword of its own, which is no keyword of gymnasium.make.
+        theirs = {
+            name: keywords.pop(name) for name in list(keywords) if name.startswith("_torchrl")
+        }
+        made = make_gym(env, **keywords)
+        stored = snapshot_of(made, snapshot, cap=cap)
+        self.__dict__["_snapshot"] = stored
+        super().__init__(made, categorical_action_encoding=True, device=device, **theirs)
+        row = Unbounded((stored.width,), dtype=torch.uint8, device=device)
+        self.observation_spec[_KEY] = row
+        self.state_spec = self.observation_spec.clone()
+        self._generator = torch.Generator()
+        self._generator.manual_seed(
+            int(torch.randint(2**31, ())) if seed is None else _checked_seed(seed)
+        )
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The snapshot that reads and restores the state."""
+        stored: Snapshot = self.__dict__["_snapshot"]
+        return stored
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._generator.manual_seed(_checked_seed(seed))
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any
+    ) -> TensorDictBase:
+        if set_state:
+            return self._restored(tensordict)
+        seed = int(torch.randint(2**31, (), generator=self._generator))
+        self.snapshot.note_reset(seed)
+        return self._with_row(super()._reset(tensordict, seed=seed, **kwargs))
+
+    def _restored(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+        keys = list(self.observation_spec.keys(True, True))
+        given = tensordict is not None and [k for k in keys if tensordict.get(k, None) is None]
+        if tensordict is None or given:
+            raise SnapshotError(
+                "reset(td, set_state=True) needs the entries that the env wrote: "
+                f"{sorted(map(str, keys))}; missing: {given or 'all'}."
+            )
+        self.snapshot.restore(tensordict.get(_KEY).cpu().numpy())
+        return tensordict.select(*keys)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.snapshot.note_step(self.read_action(tensordict.get(self.action_key)))
+        return self._with_row(super()._step(tensordict))
+
+    def _with_row(self, td: TensorDictBase) -> TensorDictBase:
+        row = torch.from_numpy(self.snapshot.read())
+        return td.set(_KEY, row if self.device is None else row.to(self.device))
+
+    def __repr__(self) -> str:
+        spec = self._env.spec
+        name = spec.id if spec is not None else type(self._env.unwrapped).__name__
+        kind = type(self.snapshot).__name__
+        return f"{type(self).__name__}({name}, snapshot={kind}, {self.snapshot.width:,} bytes)"
+
+
+def _checked_seed(seed: int) -> int:
+    if not 0 <= int(seed) < 2**63:
+        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}.")
+    return int(seed)

@@ -1,0 +1,228 @@
+"""Gymnasium envs that are set to a state: every family, to the bit, and what cannot be stored."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_hmcts.envs import AttributeSnapshot, ReplaySnapshot, SettableGymEnv, SnapshotError
+from torchrl_hmcts.envs.gym.settable import PrivateRandom
+from torchrl_hmcts.envs.gym.snapshots import snapshot_of
+from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
+from torchrl_hmcts.testing import ContractError, check_settable
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::UserWarning"),
+]
+FAMILIES = [
+    ("CartPole-v1", "AttributeSnapshot", None, {}),
+    ("Pendulum-v1", "AttributeSnapshot", None, {}),
+    ("FrozenLake-v1", "ToyTextSnapshot", None, {}),  # slips: its generator is part of the state
+    ("Taxi-v4", "ToyTextSnapshot", None, {}),
+    ("LunarLander-v3", "Box2DSnapshot", "Box2D", {}),
+    ("MiniGrid-KeyCorridorS3R3-v0", "MiniGridSnapshot", "minigrid", {}),
+    ("MiniGrid-Dynamic-Obstacles-6x6-v0", "MiniGridSnapshot", "minigrid", {}),
+    ("BabyAI-GoToLocal-v0", "MiniGridSnapshot", "minigrid", {}),
+    ("HalfCheetah-v5", "MujocoSnapshot", "mujoco", {}),
+    ("Ant-v5", "MujocoSnapshot", "mujoco", {}),  # its reward reads where the body was before
+    ("PointMaze_UMaze-v3", "MujocoSnapshot", "gymnasium_robotics", {}),
+    ("pointmaze-teleport-v0", "MujocoSnapshot", "ogbench", {}),  # draws from np.random
+    (
+        "ALE/Breakout-v5",
+        "ALESnapshot",
+        "ale_py",
+        {"repeat_action_probability": 0.0, "obs_type": "ram"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "package", "keywords"), FAMILIES)
+def test_steps_after_a_restored_state_are_those_of_the_unbroken_run(
+    name: str, kind: str, package: str | None, keywords: dict[str, Any]
+) -> None:
+    if package is not None:
+        pytest.importorskip(package, exc_type=ImportError)
+    make = functools.partial(SettableGymEnv, name, **keywords)
+    env = make(seed=0)
+    assert kind in repr(env)
+    check_env_specs(env)
+    check_settable(make, num_states=6, num_steps=40, other_process=False)
+
+
+def test_a_row_fits_another_process() -> None:
+    make = functools.partial(SettableGymEnv, "FrozenLake-v1")
+    check_settable(make, num_states=3, num_steps=20)
+
+
+def test_the_time_limit_counts_from_the_restored_step() -> None:
+    env = SettableGymEnv("CartPole-v1", max_episode_steps=5, seed=0)
+    td = env.reset()
+    for _ in range(3):
+        td = env.step(td.set("action", torch.tensor(0)))["next"].exclude("reward")
+    row = td.clone()
+    env.reset()
+    td = env.reset(row, set_state=True)
+    ends = []
+    for _ in range(2):
+        td = env.step(td.set("action", torch.tensor(1)))["next"].exclude("reward")
+        ends.append(bool(td["truncated"]))
+    assert ends == [False, True]
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "FrozenLake-v1"])
+def test_replaying_reaches_a_state_as_its_bytes_do(name: str) -> None:
+    make = functools.partial(SettableGymEnv, name, snapshot=ReplaySnapshot)
+    assert "ReplaySnapshot" in repr(make())
+    check_settable(make, num_states=4, num_steps=20, other_process=False, unread_keys=())
+
+
+def test_a_state_is_stored_by_two_functions_of_the_user() -> None:
+    def read(env: gymnasium.Env) -> bytes:
+        return np.asarray(env.unwrapped.state, np.float64).tobytes()  # type: ignore[attr-defined]
+
+    def restore(env: gymnasium.Env, row: np.ndarray) -> None:
+        env.unwrapped.state = row.view(np.float64).copy()  # type: ignore[attr-defined]
+
+    env = SettableGymEnv("Acrobot-v1", snapshot=(read, restore), seed=0)
+    assert env.snapshot.width == 4 * 8
+    start = env.reset()
+    first = env.step(start.clone().set("action", torch.tensor(2)))["next", "observation"]
+    env.reset(start, set_state=True)
+    again = env.step(start.clone().set("action", torch.tensor(2)))["next", "observation"]
+    assert torch.equal(first, again)
+
+
+class Drifting(gymnasium.Env):
+    """Forgets nothing, but draws each step from a generator that no seed reaches."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, hidden: Any = None) -> None:
+        self.hidden = hidden
+        self.x = 0.0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.x = 0.0
+        return np.array([self.x]), {}
+
+    def step(self, action: int) -> Any:
+        self.x += action + (next(self.hidden) if self.hidden is not None else 0.0)
+        return np.array([self.x]), 0.0, False, self.x > 20, {}
+
+
+def test_an_env_that_is_not_deterministic_is_told_from_one_whose_state_is_not_stored() -> None:
+    class Device(gymnasium.Wrapper):
+        def step(self, action: int) -> Any:
+            observation, *rest = self.env.step(action)
+            return observation + np.random.default_rng().normal(), *rest
+
+    make = functools.partial(SettableGymEnv, lambda: Device(Drifting()))
+    with pytest.raises(ContractError, match="not deterministic.*chance"):
+        check_settable(make, num_states=2, num_steps=5, other_process=False)
+    counted = [0]
+
+    def slip(observation: np.ndarray) -> np.ndarray:
+        counted[0] += 1
+        return observation + counted[0] % 3
+
+    def make_leaky() -> SettableGymEnv:
+        counted[0] = 0
+        wrapper = gymnasium.wrappers.TransformObservation
+        return SettableGymEnv(lambda: wrapper(Drifting(), slip, None))
+
+    with pytest.raises(ContractError, match="in the same instance"):
+        check_settable(make_leaky, num_states=4, num_steps=7, other_process=False)
+
+
+def test_an_attribute_that_cannot_be_stored_is_named() -> None:
+    with pytest.raises(SnapshotError, match=r"Drifting\.hidden is a generator.*snapshot="):
+        SettableGymEnv(lambda: Drifting(x for x in iter(int, 1)))
+
+
+def test_a_state_wider_than_the_cap_is_refused() -> None:
+    with pytest.raises(SnapshotError, match=r"cap=64\..*larger cap"):
+        SettableGymEnv("CartPole-v1", cap=64)
+
+
+@pytest.mark.parametrize(
+    ("env", "error", "words"),
+    [
+        ("CartPol-v1", ValueError, "Nearest: CartPole-v1"),
+        (3, TypeError, "got a int"),
+        (lambda: "CartPole-v1", TypeError, "got a str"),
+    ],
+)
+def test_what_is_no_env_is_refused_with_the_way_out(env: Any, error: type, words: str) -> None:
+    with pytest.raises(error, match=words):
+        SettableGymEnv(env)
+
+
+def test_something_else_than_a_snapshot_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"\(read, restore\)"):
+        snapshot_of(gymnasium.make("CartPole-v1"), "mujoco")
+
+
+def test_sticky_atari_is_refused_since_the_held_action_is_hidden() -> None:
+    pytest.importorskip("ale_py")
+    with pytest.raises(SnapshotError, match="sticky.*AtariRAMEnv"):
+        SettableGymEnv("ALE/Pong-v5")
+
+
+def test_global_generators_are_as_they_were_after_a_step() -> None:
+    class Global(Drifting):
+        def step(self, action: int) -> Any:
+            self.x += np.random.random()
+            return np.array([self.x]), 0.0, False, False, {}
+
+    env = SettableGymEnv(Global, seed=0)
+    assert isinstance(env._env, PrivateRandom)
+    np.random.seed(7)
+    run = env.rollout(4)
+    drawn = np.random.random()
+    np.random.seed(7)
+    assert drawn == np.random.random()
+    td = env.reset(run[1].exclude("next", "action"), set_state=True)
+    after = env.step(td.set("action", run[1]["action"]))["next", "observation"]
+    assert torch.equal(after, run[1]["next", "observation"])
+
+
+def test_the_same_seed_gives_the_same_episodes() -> None:
+    one, other = (SettableGymEnv("CartPole-v1", seed=3) for _ in range(2))
+    starts = [env.reset()["observation"] for env in (one, other)]
+    assert torch.equal(*starts)
+    assert not torch.equal(starts[0], one.reset()["observation"])
+
+
+def test_a_planner_finds_the_way_over_the_ice_and_leaves_the_real_env_alone() -> None:
+    make = functools.partial(SettableGymEnv, "FrozenLake-v1", is_slippery=False)
+    real = make(seed=0)
+    planner = MCTSPlanner(make(), budget=SearchBudget(expansions=2_000), seed=0)
+    plan = planner.plan(real.reset())
+    assert bool(plan.found)
+    assert int(plan.lengths) >= 6  # 3 steps down and 3 to the right
+    td = real.reset()
+    for action in plan.options[: int(plan.lengths)]:
+        td = real.step(td.set("action", action))["next"].exclude("reward")
+    assert bool(td["terminated"])
+    assert int(td["observation"]) == 15
+
+
+def test_attributes_that_the_restored_state_lacks_are_removed() -> None:
+    env = gymnasium.make("FrozenLake-v1")
+    snapshot = AttributeSnapshot(env)
+    env.reset(seed=1)
+    row = snapshot.read()
+    env.step(0)
+    env.unwrapped.later = [1, 2]  # type: ignore[attr-defined]
+    snapshot.note_step(0)
+    snapshot.restore(row)
+    assert not hasattr(env.unwrapped, "later")
