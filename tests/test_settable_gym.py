@@ -26,6 +26,7 @@ FAMILIES = [
     ("Pendulum-v1", "AttributeSnapshot", None, {}),
     ("FrozenLake-v1", "ToyTextSnapshot", None, {}),  # slips: its generator is part of the state
     ("Taxi-v4", "ToyTextSnapshot", None, {}),
+    ("Blackjack-v1", "ToyTextSnapshot", None, {}),  # observes a tuple
     ("LunarLander-v3", "Box2DSnapshot", "Box2D", {}),
     ("MiniGrid-KeyCorridorS3R3-v0", "MiniGridSnapshot", "minigrid", {}),
     ("MiniGrid-Dynamic-Obstacles-6x6-v0", "MiniGridSnapshot", "minigrid", {}),

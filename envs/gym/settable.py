@@ -88,13 +88,15 @@ def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords:
             f"An id such as 'CartPole-v1', a gymnasium.Env or a function that makes one is needed; "
             f"got a {type(made).__name__}."
         )
-    made = _without_texts(made)
+    made = _with_arrays(made)
     return PrivateRandom(made) if _draws_globally(made) else made
 
 
-def _without_texts(env: gymnasium.Env) -> gymnasium.Env:
-    """Leaves out observations that are no arrays, e.g. MiniGrid's mission, which is a text."""
+def _with_arrays(env: gymnasium.Env) -> gymnasium.Env:
+    """Leaves out observations that are no arrays, as MiniGrid's mission, and flattens tuples."""
     space = env.observation_space
+    if isinstance(space, spaces.Tuple):
+        return gymnasium.wrappers.FlattenObservation(env)
     if not isinstance(space, spaces.Dict):
         return env
     arrays = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete, spaces.Dict)

@@ -6,6 +6,7 @@ Letters: T steps of an episode.
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -132,7 +133,9 @@ def _elsewhere(make_env: Callable[[], EnvBase], *work: Any) -> tuple[NestedKey, 
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(
-        target=_replay_there, args=(theirs, CloudpickleWrapper(make_env), work), daemon=True
+        target=_replay_there,
+        args=(theirs, CloudpickleWrapper(make_env), pickle.dumps(work)),  # no shared memory
+        daemon=True,
     )
     process.start()
     theirs.close()
@@ -147,9 +150,9 @@ def _elsewhere(make_env: Callable[[], EnvBase], *work: Any) -> tuple[NestedKey, 
     return answer  # type: ignore[no-any-return]
 
 
-def _replay_there(connection: Any, make_env: Callable[[], EnvBase], work: Any) -> None:
+def _replay_there(connection: Any, make_env: Callable[[], EnvBase], work: bytes) -> None:
     try:
-        connection.send(_replay(make_env(), *work))
+        connection.send(_replay(make_env(), *pickle.loads(work)))
     except Exception as error:
         connection.send(error)
 
