@@ -17,13 +17,13 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.figures.animation import write_episode_gif
 from torchrl_hmcts.trainers.figures.plots import plot_losses, plot_search, plot_skill_fan
 from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.files import write_json
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from torchrl_hmcts.envs import AtariOptionPool, OptionWorker
 from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariSearch
 from torchrl_hmcts.trainers.atari.options import plain_worker
-from torchrl_hmcts.trainers.checkpoints import write_json
+from torchrl_hmcts.trainers.files import write_json
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,9 @@ class A3CTrainerConfig(ComponentConfig):
     """Frames between checkpoints, besides the one at the end."""
     keep_last: int = 2
     """Checkpoints kept."""
+    overwrite: bool = False
+    """Replace the checkpoints of another run in save_dir; they are removed once this run has
+    written one."""
     progress: Any = None
     """Called with total=total_frames it returns a progress bar, e.g. tqdm.tqdm."""
     seed: int = 0

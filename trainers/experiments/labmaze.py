@@ -17,7 +17,6 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import draw_first_person
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.figures.lab_figures import (
@@ -30,6 +29,7 @@ from torchrl_hmcts.trainers.figures.lab_figures import (
 )
 from torchrl_hmcts.trainers.figures.plots import plot_losses
 from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.files import write_json
 from torchrl_hmcts.trainers.lab.evaluation import (
     make_maze_env,
     make_planner,

@@ -20,7 +20,6 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.trainers.a3c import A3CTrainer
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.experiments.waterworld_config import (
@@ -30,6 +29,7 @@ from torchrl_hmcts.trainers.experiments.waterworld_config import (
 from torchrl_hmcts.trainers.figures.goal_figures import plot_goals, plot_tile_search, write_goal_gif
 from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
 from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.files import write_json
 from torchrl_hmcts.trainers.waterworld.agents import make_maze_networks, play_mazes
 from torchrl_hmcts.trainers.waterworld.goal_episodes import run_goal_episodes
 from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env

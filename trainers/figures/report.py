@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts import __version__
-from torchrl_hmcts.trainers.checkpoints import write_text
 from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
+from torchrl_hmcts.trainers.files import write_text
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "numpy")
 
