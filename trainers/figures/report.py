@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts import __version__
 from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
-from torchrl_hmcts.trainers.files import write_text
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.files import left_out, write_json, write_text
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "numpy")
 
@@ -44,6 +46,34 @@ def machine() -> dict[str, Any]:
     }
 
 
+@contextlib.contextmanager
+def finish(out: Path, title: str, metrics: Mapping[str, Any]) -> Iterator[Pictures]:
+    """Write what a run leaves: ``metrics.json`` first, then pictures, then the page.
+
+    What cannot be drawn or written is left out, with a line on stderr; the figures are printed
+    where ``metrics.json`` cannot be written, e.g. to a full disk.
+
+    Args:
+        out: folder of the run.
+        title: heading of the page.
+        metrics: figures by name.
+
+    Yields:
+        The pictures to draw.
+    """
+    written = False
+    with left_out("metrics.json"):
+        write_json(out / "metrics.json", metrics)
+        written = True
+    if not written:
+        print(json.dumps(metrics, indent=1, default=str))
+    pictures = Pictures(out)
+    with left_out("what was still to be drawn"):
+        yield pictures
+    with left_out("index.html"):
+        write_page(out / "index.html", title=title, metrics=metrics, pictures=pictures.captions)
+
+
 def write_page(
     path: Path, *, title: str, metrics: Mapping[str, Any], pictures: Mapping[str, str]
 ) -> None:
@@ -56,8 +86,7 @@ def write_page(
             ``"config"`` and ``"versions"`` are shown where there is no ``run.json``.
         pictures: caption of each picture file.
     """
-    content = {"title": title, "pictures": dict(pictures)}
-    write_text(path.parent / "page.json", json.dumps(content, indent=1) + "\n")
+    write_json(path.parent / "page.json", {"title": title, "pictures": dict(pictures)})
     run = RunFolder(path.parent)
     if any((path.parent / name).is_file() for name in ("run.json", "metrics.json")):
         run = read_run(path.parent)
