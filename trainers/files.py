@@ -149,7 +149,7 @@ def left_out(name: str) -> Iterator[None]:
         name (str): of the picture, video or page.
 
     Example:
-        >>> with left_out("episode.mp4"):  # stderr: episode.mp4 is left out: no ffmpeg
+        >>> with left_out("episode.mp4"):  # stderr: Left out episode.mp4: no ffmpeg
         ...     raise RuntimeError("no ffmpeg")
     """
     try:
@@ -157,7 +157,7 @@ def left_out(name: str) -> Iterator[None]:
     except Exception as error:
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         with contextlib.suppress(OSError):  # of a stderr on the same full disk
-            print(f"{name} is left out: {reason}", file=sys.stderr, flush=True)
+            print(f"Left out {name}: {reason}", file=sys.stderr, flush=True)
 
 
 def remove(path: Path) -> None:

@@ -296,6 +296,7 @@ class ResumableTrainer(Trainer):
         super().__init__(**trainer_kwargs)
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
         self._last_log: dict[str, Any] = {}
+        self._saved_frames = -1  # base steps at the newest checkpoint
         if self.checkpoint is not None and "rng" not in self.checkpoint:
             self.checkpoint.register("rng", GlobalRNGState())
         collector = self.collector
@@ -321,6 +322,16 @@ class ResumableTrainer(Trainer):
         if isinstance(self.checkpoint_rotation, DurableRotation):
             self.checkpoint_rotation.begin()
         super().train()
+
+    def _save_trainer(self) -> None:
+        super()._save_trainer()
+        self._saved_frames = self.collected_frames
+
+    def _shutdown_hook(self) -> None:
+        # A collector that ends by itself leaves TorchRL's loop without the checkpoint of the end.
+        if self.checkpoint_rotation is not None and self._saved_frames != self.collected_frames:
+            self.save_trainer(force_save=True)
+        super()._shutdown_hook()
 
     def load(self, path: str | Path, *, new_episodes: bool | None = None) -> ResumableTrainer:
         """Continues from a checkpoint; call it before ``train()``.
