@@ -215,9 +215,31 @@ def run_record(folder: Path) -> Kind:
     return folder / "run.json", lambda: vars(load_config(read_run(folder))[1])
 
 
+def sweep_journal(folder: Path) -> Kind:
+    journal = pytest.importorskip("torchrl_hmcts.trainers.experiments.journal")
+    folder.mkdir(parents=True)
+    path = folder / "journal.log"
+    for i in range(20):
+        journal.CheckedJournal(path).append_logs([{"op_code": i, "trial": 0.5 * i}])
+
+    def read() -> list[Any]:  # the entries that Optuna reads; a checksum's name may be damaged
+        logs = journal.CheckedJournal(path).read_logs(0)
+        return [{name: log.get(name) for name in ("op_code", "trial")} for log in logs]
+
+    whole = read()
+
+    def load() -> Any:
+        logs = read()
+        if len(logs) < len(whole) and logs == whole[: len(logs)]:
+            raise ValueError("It continues where it was after some trials fewer.")
+        return logs
+
+    return path, load
+
+
 KINDS = [
     diayn, hmcts, a3c, expert_iteration, demo, labmaze, atari_run, atari_run_of_older_versions,
-    atari_trials, run_record,
+    atari_trials, run_record, sweep_journal,
 ]  # fmt: skip
 
 

@@ -92,7 +92,7 @@ def write_json(path: str | Path, content: Any, *, checksum: bool = False) -> Non
     """
     content = _finite(content)
     if checksum:
-        content = {**content, _CHECKSUM: _digest(content)}
+        content = {**content, _CHECKSUM: digest(content)}
     write_text(path, json.dumps(content, indent=2) + "\n")
 
 
@@ -117,9 +117,23 @@ def read_json(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path} cannot be read: {error}.") from None
     if not isinstance(content, dict):
         raise ValueError(f"{path} cannot be read: it holds no JSON object.")
-    if _CHECKSUM in content and content.pop(_CHECKSUM) != _digest(content):
+    if _CHECKSUM in content and content.pop(_CHECKSUM) != digest(content):
         raise ValueError(f"{path} cannot be read: it differs from its checksum.")
     return content
+
+
+def digest(content: Any) -> str:
+    """Return the SHA-256 of numbers and texts as they come back from JSON, in any layout.
+
+    Args:
+        content: dicts, lists, texts and numbers.
+
+    Example:
+        >>> digest({"a": 1, "b": (2,)}) == digest({"b": [2], "a": 1})
+        True
+    """
+    plain = json.loads(json.dumps(content))
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -192,12 +206,6 @@ def _finite(content: Any) -> Any:
     if isinstance(content, list | tuple):
         return [_finite(value) for value in content]
     return None if isinstance(content, float) and not math.isfinite(content) else content
-
-
-def _digest(content: Any) -> str:
-    """Of the content as it comes back from JSON, in any layout."""
-    plain = json.loads(json.dumps(content))
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 def _sync(path: Path) -> None:

@@ -133,7 +133,7 @@ def read_run(path: str | Path) -> RunFolder:
     try:
         curves = read_curves(path)
     except (ValueError, csv.Error, OSError, KeyError, TypeError) as error:
-        damage.append(f"{path / 'curves.csv'} cannot be read: {error}.")
+        damage.append(f"{path.resolve().name}/curves.csv cannot be read: {error}.")
     return RunFolder(
         path,
         record,
@@ -320,5 +320,6 @@ def _json(path: Path, damage: list[str], **kinds: type) -> dict[str, Any]:
                 raise ValueError(f"{path} cannot be read: {name} is {content[name]!r}.")
         return content
     except (ValueError, OSError) as error:
-        damage.append(" ".join(str(error).split()))
+        said = " ".join(str(error).split())
+        damage.append(said.replace(str(path), f"{path.parent.resolve().name}/{path.name}"))
         return {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,8 @@ from torchrl_hmcts.trainers.files import left_out, replacing
 if TYPE_CHECKING:
     from torchrl_hmcts.envs import WaterworldMazeEnv
     from torchrl_hmcts.trainers.demo import Episode
+
+_VIDEO_SECONDS = 300  # after which ffmpeg is given up
 
 
 def write_episode_gif(
@@ -97,20 +100,18 @@ def _write_video(frames: Sequence[np.ndarray], path: Path, milliseconds: float) 
     height, width = frames[0].shape[:2]
     room = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 halves the colours' resolution
     shown = [np.pad(frame, room, mode="edge") for frame in frames]
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (width + width % 2, height + height % 2),
-        fps=1000.0 / milliseconds,
-        codec="libx264",
-        macro_block_size=2,
-        ffmpeg_log_level="error",
+    size = f"{width + width % 2}x{height + height % 2}"
+    pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{1000.0 / milliseconds}"]
+    h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "25", "-v", "error"]
+    done = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *pictures, "-i", "-", "-an", *h264, str(path)],
+        input=b"".join(np.ascontiguousarray(frame).tobytes() for frame in shown),
+        capture_output=True,
+        timeout=_VIDEO_SECONDS,
     )
-    writer.send(None)
-    try:
-        for frame in shown:
-            writer.send(np.ascontiguousarray(frame))
-    finally:
-        writer.close()
+    if done.returncode:
+        words = done.stderr.decode(errors="replace").split()
+        raise RuntimeError(f"ffmpeg ended with {done.returncode}: {' '.join(words)}")
 
 
 def _pale(color: tuple[int, int, int]) -> tuple[int, int, int]:

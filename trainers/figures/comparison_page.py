@@ -26,6 +26,7 @@ from torchrl_hmcts.trainers.figures.page_parts import (
     table,
     text,
 )
+from torchrl_hmcts.trainers.figures.report import say_damage
 from torchrl_hmcts.trainers.figures.run_page import config_table, damage_of, flatten
 from torchrl_hmcts.trainers.files import left_out, write_text
 
@@ -115,7 +116,9 @@ def write_comparison(folders: Sequence[str | Path], out: str | Path) -> Path:
     if file.suffix.lower() not in (".html", ".htm"):
         file = file / "index.html"
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_text(file, comparison_page(group_runs([read_run(path) for path in paths])))
+    runs = [read_run(path) for path in paths]
+    say_damage(*runs)
+    write_text(file, comparison_page(group_runs(runs)))
     return file
 
 

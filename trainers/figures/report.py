@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import platform
+import sys
 from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -112,10 +113,18 @@ def write_run_page(path: str | Path, out: str | Path | None = None) -> Path:
         ValueError: if it is no folder of a run.
     """
     run = read_run(path)
+    say_damage(run)
     file = run.path / "index.html" if out is None else Path(out)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_text(file, render_run(run, embed=out is not None))
     return file
+
+
+def say_damage(*runs: RunFolder) -> None:
+    """Say on stderr which files of runs cannot be read; their pages say so too."""
+    for run in runs:
+        for sentence in run.damage:
+            print(sentence, file=sys.stderr)
 
 
 def render_run(run: RunFolder, *, embed: bool = False) -> str:
