@@ -92,7 +92,6 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
         _draw_episode(pictures, planner, real.base_env, starts[shown], episodes[shown])
         _draw_worker(pictures, config, trainer, loss, maze)
     print(format_table(metrics))
-    print(f"Pictures and figures: {out / 'index.html'}")
     return metrics
 
 

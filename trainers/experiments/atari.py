@@ -116,8 +116,7 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
         draw(run, pictures)
     print(
         f"{config.game}: {len(run.scores)} episodes, best {metrics['score_max']:g}, last "
-        f"{metrics['score_final']:g}, {run.num_frames:,} frames. "
-        f"Pictures and figures: {out / 'index.html'}"
+        f"{metrics['score_final']:g}, {run.num_frames:,} frames."
     )
     return metrics
 

@@ -123,7 +123,7 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     print(
         f"{test['solved']} of {test['mazes']} mazes solved at the first trial, in "
         f"{test['frames']['mean']:.0f} frames (a script on the shortest path: "
-        f"{test['script_frames']['mean']:.0f}). Pictures and figures: {out / 'index.html'}"
+        f"{test['script_frames']['mean']:.0f})."
     )
     return metrics
 
@@ -189,7 +189,8 @@ def draw(
     with _picture(pictures, "view.png") as path, replacing(path) as temporary:
         import imageio.v3 as iio
 
-        iio.imwrite(temporary, draw_first_person(env, states[0], width=640, height=480))
+        view = draw_first_person(env, states[0], width=640, height=480)
+        temporary.write_bytes(iio.imwrite("<bytes>", view, extension=".png"))
 
 
 def _picture(pictures: Pictures, name: str) -> AbstractContextManager[Path]:

@@ -178,7 +178,6 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
         if with_goals:
             draw_episode(policy, tests, starts, greedy.base_steps, pictures)
     print(json.dumps({k: metrics[k] for k in ("train_seconds", "test", "test_greedy")}, indent=1))
-    print(f"Pictures and figures: {out / 'index.html'}")
     return metrics
 
 

@@ -84,8 +84,9 @@ def write_gif(
     shown: float | list[float] = durations if len(kept) > 1 else durations[0]
     import imageio.v3 as iio  # here, so that a run without it loses no more than the picture
 
-    with replacing(path) as temporary:
-        iio.imwrite(temporary, np.stack(kept), extension=".gif", duration=shown, loop=0)
+    with replacing(path) as temporary:  # written here: after an error imageio would try again
+        content = iio.imwrite("<bytes>", np.stack(kept), extension=".gif", duration=shown, loop=0)
+        temporary.write_bytes(content)
     still = 0 if last is None else round(last / milliseconds) - 1
     video = Path(path).with_suffix(".mp4")
     video.unlink(missing_ok=True)  # of an older episode

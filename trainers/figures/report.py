@@ -73,6 +73,7 @@ def finish(out: Path, title: str, metrics: Mapping[str, Any]) -> Iterator[Pictur
         yield pictures
     with left_out("index.html"):
         write_page(out / "index.html", title=title, metrics=metrics, pictures=pictures.captions)
+        print(f"Pictures and figures: {out / 'index.html'}")
 
 
 def write_page(
