@@ -76,14 +76,16 @@ def _page(plan: object, study: object, command: str) -> str:
     content = {"objective": plan.objective, "trials": rows, "importances": shares}
     with left_out("sweep.json"):
         write_json(plan.folder / "sweep.json", content)
-    page = write_sweep_page(
-        plan.folder,
-        experiment=plan.experiment.name,
-        objective=plan.objective,
-        rows=rows,
-        importances=shares,
-        command=command,
-    )
+    page = plan.folder / "index.html"
+    with left_out("index.html"):
+        write_sweep_page(
+            plan.folder,
+            experiment=plan.experiment.name,
+            objective=plan.objective,
+            rows=rows,
+            importances=shares,
+            command=command,
+        )
     best = next((row for row in rows if row["value"] is not None), None)
     if best is None:
         return f"No trial has finished. Page: {page}"
