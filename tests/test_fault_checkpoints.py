@@ -471,6 +471,38 @@ class TestForeign:
         with pytest.raises(CheckpointError, match="loss_module was 'DIAYNLoss' and is 'METRALoss'"):
             other.load(tmp_path / "run")
 
+    @pytest.mark.parametrize("frames", [float("nan"), -16, "16", None])
+    def test_base_steps_that_are_no_count_are_refused(
+        self, frames: Any, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+    ) -> None:
+        one = trainer(folder=None)
+        one.collected_frames = frames
+        path = one._sync_checkpoint_components(one.checkpoint).save(tmp_path / "c")
+        with pytest.raises(CheckpointError, match=f"has {frames!r} base steps"):
+            trainer(folder=None).load(path)
+
+    def test_a_checkpoint_without_a_component_is_refused(
+        self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+    ) -> None:
+        one = trainer(folder=None)
+        path = plain_checkpoint(loss_module=one.loss_module).save(tmp_path / "c")
+        with pytest.raises(CheckpointError, match="missing=.*'optimizer'"):
+            one.load(path)
+
+    @pytest.mark.parametrize("what", ["shape", "dtype", "short"])
+    def test_arrays_that_are_not_what_they_say_are_refused(self, what: str, tmp_path: Path) -> None:
+        path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
+        (meta,) = path.rglob("meta.json")
+        said = json.loads(meta.read_text())
+        entry = said["tensor_00000000"]
+        if what == "short":
+            cut(next(path.rglob("*.memmap")))
+        else:
+            entry[what] = {"shape": [2**40], "dtype": "torch.nn"}[what]
+        meta.write_text(json.dumps(said))
+        with pytest.raises(CheckpointError, match="cut off|damaged"):
+            load(path)
+
     def test_networks_of_other_sizes_are_refused(
         self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
     ) -> None:

@@ -24,7 +24,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.checkpoint import CheckpointError
+from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.checkpoint._checkpoint import _encode_state_dict_value
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import ProbabilisticActor, ValueOperator
@@ -34,7 +34,13 @@ from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer, ExpertIterationTrainer, HMCTSTrainer
-from torchrl_hmcts.trainers.checkpoints import DurableRotation, newest_checkpoint, plain_checkpoint
+from torchrl_hmcts.trainers.checkpoints import (
+    DurableRotation,
+    PlainStateAdapter,
+    check_settings,
+    newest_checkpoint,
+    plain_checkpoint,
+)
 from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.experiments.run_folder import load_config, read_run, start_record
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
@@ -171,6 +177,22 @@ class Saved:
         self.state_dict = lambda: state
 
 
+def checkpoint_of_older_versions(folder: Path) -> Kind:
+    """A file without a seal, as TorchRL writes it."""
+    saved = Checkpoint(format="archive").register_adapter(object, PlainStateAdapter())
+    saved.register("net", nn.Linear(5, 3))
+    ours = {"version": "0.1", "checkpoint_version": 1, "settings": {"seed": 1}}
+    path = saved.save(folder / "checkpoint-000000000001.torchrl", metadata={"torchrl_hmcts": ours})
+
+    def load() -> Any:
+        net = nn.Linear(5, 3)
+        check_settings(newest_checkpoint(folder), {"seed": 1})
+        plain_checkpoint(net=net).load(newest_checkpoint(folder))
+        return net.state_dict()
+
+    return path, load
+
+
 def atari_run(folder: Path) -> Kind:
     from torchrl_hmcts.trainers.experiments.atari import load_run
 
@@ -238,8 +260,8 @@ def sweep_journal(folder: Path) -> Kind:
 
 
 KINDS = [
-    diayn, hmcts, a3c, expert_iteration, demo, labmaze, atari_run, atari_run_of_older_versions,
-    atari_trials, run_record, sweep_journal,
+    diayn, hmcts, a3c, expert_iteration, demo, labmaze, checkpoint_of_older_versions, atari_run,
+    atari_run_of_older_versions, atari_trials, run_record, sweep_journal,
 ]  # fmt: skip
 
 
