@@ -13,6 +13,8 @@ from tensordict import TensorDict
 
 pytest.importorskip("ale_py")
 
+from torchrl.checkpoint import CheckpointError  # noqa: E402
+
 from torchrl_hmcts.envs import (  # noqa: E402
     AtariOptionPool,
     ByteGoal,
@@ -27,9 +29,11 @@ from torchrl_hmcts.trainers import (  # noqa: E402
     GoalSearch,
 )
 from torchrl_hmcts.trainers.atari.trials import RememberedTrials, Trial  # noqa: E402
+from torchrl_hmcts.trainers.checkpoints import DurableRotation, plain_checkpoint  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari import (  # noqa: E402
     AtariRun,
     evaluate_atari,
+    load_run,
     run_atari,
 )
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig  # noqa: E402
@@ -184,8 +188,12 @@ def test_a_short_run_of_two_processes_leaves_its_figures(tmp_path) -> None:
         rows = list(csv.DictReader(file))
     assert {"score", "score_max"} <= {row["name"] for row in rows}
     assert int(rows[0]["step"]) * 4 == pytest.approx(metrics["episodes"][0]["frames"], abs=4)
-    for name in ("index.html", "scores.png", "episode.gif", "checkpoints/run.pt"):
+    for name in ("index.html", "scores.png", "episode.gif"):
         assert (tmp_path / name).stat().st_size > 100
+    checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    newest = f"checkpoint-{metrics['frames']:012d}.torchrl"
+    assert checkpoints[-1] == newest
+    assert len(checkpoints) == 2
 
 
 @pytest.mark.parametrize("guide", ["none", "prior_value"])
@@ -210,10 +218,10 @@ def test_a_run_in_pieces_is_the_run_in_one(tmp_path, guide) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         first.play(save, nothing)
-    path = tmp_path / "run.pt"
-    torch.save(saved[-1], path)
+    DurableRotation(tmp_path / "checkpoints").save(plain_checkpoint(run=first), step=1)
+    first.close()
     second = AtariRun(config)
-    second.load_state_dict(torch.load(path, weights_only=True))
+    second.load_state_dict(load_run(tmp_path)[1])
     second.play(nothing, nothing)
     assert second.scores == whole.scores
     assert second.points == whole.points
@@ -266,19 +274,74 @@ def test_a_run_stopped_while_it_looks_for_options_plays_no_trial_twice(
     assert second.scores == whole.scores
 
 
-def test_trials_of_other_settings_or_a_damaged_file_are_played_again(tmp_path) -> None:
+def test_a_run_of_an_older_version_continues_and_what_was_half_written_is_removed(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.atari.draw", lambda run, pictures: None)
+    config = AtariConfig(
+        frames=1_000, max_episode_frames=400, source="repeat", option_steps=10, ratio=1.0,
+        rollout_options=0, num_processes=0, replant_every=5, seed=4, out=str(tmp_path),
+    )  # fmt: skip
+    whole = run_atari(config)
+    folder = tmp_path / "checkpoints"
+    state = load_run(tmp_path)[1]
+    for path in folder.glob("checkpoint-*"):
+        path.unlink()
+    torch.save(state, folder / "run.pt")
+    (folder / ".run.pt.writing-999999999").write_bytes(b"half")
+    assert evaluate_atari(config)["checkpoint"] == "run.pt"
+    longer = dataclasses.replace(config, resume=True, frames=whole["frames"] + 1)
+    metrics = run_atari(longer)
+    assert metrics["episodes"][: len(whole["episodes"])] == whole["episodes"]
+    assert not list(folder.glob(".*"))
+    (folder / "run.pt").write_bytes((folder / "run.pt").read_bytes()[:-99])
+    assert load_run(tmp_path)[0].name == f"checkpoint-{metrics['frames']:012d}.torchrl"
+    for path in folder.glob("checkpoint-*"):
+        path.unlink()
+    with pytest.raises(CheckpointError, match=r"run\.pt' is damaged"):
+        evaluate_atari(config)
+
+
+def test_of_two_checkpoints_the_older_is_taken_where_the_newer_is_damaged(tmp_path, capsys) -> None:
+    class Saved:
+        def __init__(self, frames: int) -> None:
+            self.state_dict = lambda: {"frames": frames, "points": [(1, 2.0)]}
+
+    rotation = DurableRotation(tmp_path / "checkpoints")
+    for frames in (400, 800):
+        newest = rotation.save(plain_checkpoint(run=Saved(frames)), step=frames)
+    newest.write_bytes(newest.read_bytes()[:-1])
+    assert load_run(tmp_path)[1] == {"frames": 400, "points": [(1, 2.0)]}
+    assert "800.torchrl is damaged" in capsys.readouterr().err
+
+
+def test_trials_of_other_settings_or_a_damaged_file_are_played_again(tmp_path, capsys) -> None:
     path = tmp_path / "trials.json"
     RememberedTrials(None, path, {"game": "Pong"}).remember("key", Trial(1.0, 2, 3))
     assert RememberedTrials(None, path, {"game": "Pong"}).recall("key") == Trial(1.0, 2, 3)
     assert RememberedTrials(None, path, {"game": "Breakout"}).recall("key") is None
-    for text in ("[]", "{", '{"settings": {"game": "Pong"}}'):
-        path.write_text(text)
+    assert capsys.readouterr().err == ""
+    whole = path.read_text()
+    for text in (
+        "[]",
+        "{",
+        '{"settings": {"game": "Pong"}}',
+        whole.replace("1.0", "9.0"),
+        "\udcff",
+    ):
+        path.write_bytes(text.encode(errors="surrogateescape"))
         assert RememberedTrials(None, path, {"game": "Pong"}).recall("key") is None
+        said = capsys.readouterr().err
+        assert said.startswith(f"{path} cannot be read: ")
+        assert said.endswith("Its trials are played again.\n")
+    older = {"settings": {"game": "Pong"}, "trials": {"key": [1.0, 2, 3]}}  # without a checksum
+    path.write_text(json.dumps(older))
+    assert RememberedTrials(None, path, {"game": "Pong"}).recall("key") == Trial(1.0, 2, 3)
 
 
 @pytest.mark.parametrize("guide", ["none", "prior"])
 def test_a_run_is_evaluated_with_what_it_found_and_learned(tmp_path, monkeypatch, guide) -> None:
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.atari.draw", lambda run, out: {})
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.atari.draw", lambda run, pictures: None)
     config = AtariConfig(
         frames=1_000, max_episode_frames=400, source="repeat", option_steps=10, ratio=1.0,
         rollout_options=0, num_processes=0, replant_every=5, seed=4, out=str(tmp_path), guide=guide,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +84,30 @@ def test_a_run_is_tested_again_with_other_starts(run: Path, capsys) -> None:
 def test_what_evaluate_cannot_do_is_said(run: Path, capsys, words, message) -> None:
     assert main(["evaluate", *(word.format(run=run) for word in words)]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_damaged_checkpoints_are_a_sentence_in_every_command(run: Path, tmp_path, capsys) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "copy"))
+    for path in (copy / "checkpoints").iterdir():
+        path.write_bytes(path.read_bytes()[:-1])
+    for words in (["evaluate", f"run={copy}"], ["train", f"resume={copy}"]):
+        assert main(words) == 1
+        assert "No checkpoint in" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_on_a_full_disk_an_evaluation_is_printed(run: Path, tmp_path, monkeypatch, capsys) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    copy = Path(shutil.copytree(run, tmp_path / "copy"))
+    monkeypatch.setattr("torchrl_hmcts.trainers.files.os.replace", full)
+    assert main(["evaluate", f"run={copy}"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["test"]
+    assert [line.partition(":")[0] for line in said.err.splitlines()] == [
+        "Left out evaluation.json",
+        "Left out index.html",
+    ]
 
 
 def test_resume_goes_on_with_the_saved_config(tmp_path, monkeypatch) -> None:

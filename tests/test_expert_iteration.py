@@ -448,6 +448,12 @@ def test_a_run_that_was_stopped_and_loaded_is_the_run_that_never_stopped(tmp_pat
         assert torch.equal(a, b)
 
 
+def test_a_run_that_came_to_its_end_has_a_checkpoint_of_it(tmp_path: Path) -> None:
+    trainer = make_trainer(save_dir=tmp_path)
+    trainer.train()
+    assert make_trainer().load(tmp_path).collected_frames == trainer.collected_frames > 0
+
+
 def test_a_collector_goes_on_where_another_stopped() -> None:
     env = ChainEnv(length=5)
     planner = MCTSPlanner(env)

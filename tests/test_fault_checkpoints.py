@@ -10,8 +10,10 @@ import shlex
 import shutil
 import subprocess
 import sys
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +29,11 @@ from torchrl_hmcts.trainers.checkpoints import (
     DurableRotation,
     check_settings,
     find_damage,
+    newest_checkpoint,
     plain_checkpoint,
-    write_json,
-    write_text,
 )
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.resume import newest_checkpoint
+from torchrl_hmcts.trainers.files import write_json, write_text
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -120,7 +121,7 @@ class TestDamage:
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         assert said.startswith(f"Checkpoint {newest.name} is damaged (")
-        assert said.endswith("Going on from checkpoint-000000000002.torchrl.\n")
+        assert said.endswith("Continuing from checkpoint-000000000002.torchrl.\n")
 
     def test_every_cut_of_a_checkpoint_is_noticed(self, tmp_path: Path) -> None:
         (path,) = save(tmp_path, 1).checkpoints()
@@ -140,7 +141,7 @@ class TestDamage:
     def test_when_all_are_damaged_each_is_named(self, tmp_path: Path) -> None:
         for path in save(tmp_path, 1, 2).checkpoints():
             cut(path)
-        with pytest.raises(CheckpointError, match=r"is whole.*02\.torchrl.*01\.torchrl.*anew"):
+        with pytest.raises(CheckpointError, match=r"is whole.*02\.torchrl.*01\.torchrl.*again"):
             newest_checkpoint(tmp_path)
 
     @pytest.mark.parametrize("damage", ["cut", "missing"])
@@ -212,6 +213,33 @@ class TestRotation:
         rotation.save(plain_checkpoint(net=Big(150)), step=150)
         assert names(tmp_path) == ["checkpoint-000000000150.torchrl"]
         assert load(newest_checkpoint(tmp_path)) == 150.0
+
+    def test_a_clock_that_is_set_back_changes_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        class Clock(datetime):
+            @classmethod
+            def now(cls, tz: Any = None) -> datetime:
+                return datetime.now(tz) - timedelta(days=9)
+
+        rotation = save(tmp_path, 1, 2, keep_last=2)
+        monkeypatch.setattr("torchrl.checkpoint._checkpoint.datetime", Clock)
+        for step in (3, 4):
+            path = rotation.save(plain_checkpoint(net=Big(step)), step=step)
+            os.utime(path, (0, 0))
+            assert load(newest_checkpoint(tmp_path)) == step
+        assert [load(path) for path in DurableRotation(tmp_path).checkpoints()] == [3.0, 4.0]
+
+    def test_checkpoints_of_older_versions_are_in_the_order_of_their_steps(
+        self, tmp_path: Path
+    ) -> None:
+        for step in (3, 1, 2):
+            Checkpoint(net=Big(step), format="archive").save(
+                tmp_path / f"checkpoint-{step:012d}.torchrl"
+            )
+        assert load(newest_checkpoint(tmp_path)) == 3.0
+        save(tmp_path, 1, keep_last=2)  # of this version: newer than they are
+        assert [load(path) for path in DurableRotation(tmp_path).checkpoints()] == [3.0, 1.0]
 
     def test_the_same_step_can_be_saved_again(self, tmp_path: Path) -> None:
         rotation = save(tmp_path, 5)
@@ -339,6 +367,83 @@ class TestForeign:
             for name, data in content.items():
                 archive.writestr(name, data)
 
+    @pytest.mark.parametrize(
+        "manifest",
+        [
+            "[]",
+            "null",
+            "3",
+            "{",
+            "\\ud800",
+            '{"format": "torchrl.checkpoint", "format_version": 1, "components": []}',
+            '{"format": "torchrl.checkpoint", "format_version": 1, "components": {"a": 1}}',
+            *(
+                '{"format": "torchrl.checkpoint", "format_version": 1, "components": {}, '
+                f'"metadata": {metadata}}}'
+                for metadata in (
+                    "null",
+                    "[1]",
+                    '{"torchrl_hmcts": []}',
+                    '{"torchrl_hmcts": {"settings": "x"}}',
+                    '{"torchrl_hmcts": {"checkpoint_version": NaN}}',
+                    '{"torchrl_hmcts": {"serial": true}}',
+                )
+            ),
+        ],
+    )
+    @pytest.mark.parametrize("form", ["archive", "directory"])
+    def test_a_manifest_of_any_content_is_an_error_of_the_checkpoint(
+        self, manifest: str, form: str, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "c"
+        if form == "directory":
+            path.mkdir()
+            (path / "manifest.json").write_text(manifest)
+        else:
+            with zipfile.ZipFile(path, "w") as archive:
+                archive.writestr("manifest.json", manifest)
+        assert find_damage(path)
+        for read in (
+            newest_checkpoint,
+            load,
+            lambda path: check_settings(path, {"a": 1}),
+        ):
+            with pytest.raises(CheckpointError):
+                read(path)
+
+    @pytest.mark.parametrize("name", ["twice", "/root", "../up", "folder/", "components/other"])
+    def test_files_that_the_manifest_does_not_have_are_refused(
+        self, name: str, tmp_path: Path
+    ) -> None:
+        path = Checkpoint(net=Big(1), format="archive").save(tmp_path / "c")
+        with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of names that are there already
+            archive.writestr("manifest.json" if name == "twice" else name, b"x")
+        with pytest.raises(CheckpointError, match=r"in it 2 times|not in its manifest|damaged"):
+            load(path)
+
+    def test_links_in_a_folder_are_refused(self, tmp_path: Path) -> None:
+        path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
+        (array,) = path.rglob("*.memmap")
+        array.rename(tmp_path / "elsewhere")
+        array.symlink_to(tmp_path / "elsewhere")
+        with pytest.raises(CheckpointError, match="is a link"):
+            load(path)
+
+    def test_a_checkpoint_that_would_unpack_to_too_much_is_refused_unopened(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        made = Checkpoint(net=Big(1), format="archive", archive_compression="deflate")
+        path = made.save(tmp_path / "c")  # 0.5 MiB of ones, in some KiB
+        monkeypatch.setenv("TORCHRL_HMCTS_MAX_UNPACKED_BYTES", "500000")
+        for read in (load, newest_checkpoint):
+            with pytest.raises(CheckpointError, match=r"unpack to 52\d,\d+ bytes, and 500,000"):
+                read(path)
+        stored = plain_checkpoint(net=Big(2)).save(tmp_path / "d")
+        assert load(stored) == 2.0  # it is as large on the disk
+        monkeypatch.setenv("TORCHRL_HMCTS_MAX_UNPACKED_BYTES", "600000")
+        assert load(path) == 1.0
+
     def test_a_newer_version_is_named_and_nothing_older_is_taken_instead(
         self, tmp_path: Path
     ) -> None:
@@ -365,6 +470,38 @@ class TestForeign:
         other.run_settings["loss_module"] = "METRALoss"
         with pytest.raises(CheckpointError, match="loss_module was 'DIAYNLoss' and is 'METRALoss'"):
             other.load(tmp_path / "run")
+
+    @pytest.mark.parametrize("frames", [float("nan"), -16, "16", None])
+    def test_base_steps_that_are_no_count_are_refused(
+        self, frames: Any, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+    ) -> None:
+        one = trainer(folder=None)
+        one.collected_frames = frames
+        path = one._sync_checkpoint_components(one.checkpoint).save(tmp_path / "c")
+        with pytest.raises(CheckpointError, match=f"has {frames!r} base steps"):
+            trainer(folder=None).load(path)
+
+    def test_a_checkpoint_without_a_component_is_refused(
+        self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+    ) -> None:
+        one = trainer(folder=None)
+        path = plain_checkpoint(loss_module=one.loss_module).save(tmp_path / "c")
+        with pytest.raises(CheckpointError, match="missing=.*'optimizer'"):
+            one.load(path)
+
+    @pytest.mark.parametrize("what", ["shape", "dtype", "short"])
+    def test_arrays_that_are_not_what_they_say_are_refused(self, what: str, tmp_path: Path) -> None:
+        path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
+        (meta,) = path.rglob("meta.json")
+        said = json.loads(meta.read_text())
+        entry = said["tensor_00000000"]
+        if what == "short":
+            cut(next(path.rglob("*.memmap")))
+        else:
+            entry[what] = {"shape": [2**40], "dtype": "torch.nn"}[what]
+        meta.write_text(json.dumps(said))
+        with pytest.raises(CheckpointError, match="cut off|damaged"):
+            load(path)
 
     def test_networks_of_other_sizes_are_refused(
         self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path

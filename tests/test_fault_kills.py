@@ -75,8 +75,7 @@ def weights(folder: Path) -> Any:
 def kill_again_and_again(folder: Path, kills: int, seed: int = 0) -> dict[str, Any]:
     import torch
 
-    from torchrl_hmcts.trainers.checkpoints import find_damage
-    from torchrl_hmcts.trainers.resume import newest_checkpoint
+    from torchrl_hmcts.trainers.checkpoints import find_damage, newest_checkpoint
 
     torch.set_num_threads(1)
     rng, begin = random.Random(seed), time.process_time()

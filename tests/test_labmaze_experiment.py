@@ -21,10 +21,10 @@ from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import find_experiment
 from torchrl_hmcts.trainers.experiments.labmaze import run_labmaze
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.figures.lab_figures import frames_curve
 from torchrl_hmcts.trainers.lab import training
 from torchrl_hmcts.trainers.lab.evaluation import (
     _with_second_search,
+    frames_curve,
     solve_mazes,
     solve_with_wrong_model,
     wrong_models,

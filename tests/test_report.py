@@ -102,6 +102,44 @@ def test_a_page_in_another_place_holds_its_pictures(tmp_path) -> None:
     assert base64.b64decode(gif.partition(",")[2]) == (run / "episode.gif").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("run.json", b'{"experiment": "wat'),
+        ("run.json", b"[]"),
+        ("run.json", b'{"config": 3}'),
+        ("run.json", b'{"experiment": "x", "checksum": "0"}'),
+        ("run.json", b"\xff\x00"),
+        ("metrics.json", b""),
+        ("metrics.json", b"null"),
+        ("page.json", b'{"title": 3}'),
+        ("page.json", b'{"pictures": ["a.png"]}'),
+        ("evaluation.json", b'{"evaluations": {}}'),
+        ("curves.csv", b"name,frames,value\nloss,1,2\nloss,3"),
+        ("curves.csv", b"name,frames,value\nlo\xff,\x00,2\n"),
+    ],
+)
+def test_a_damaged_file_is_named_once_and_spares_all_else(
+    name: str, content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, good = write_run(tmp_path / "bad"), write_run(tmp_path / "good", 7, gamma=0.9)
+    (bad / name).write_bytes(content)
+    assert main(["report", str(bad)]) == 0
+    assert main(["report", str(bad), str(good), f"out={tmp_path}/both.html"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said == [said[0], said[0]]
+    assert said[0].startswith(f"bad/{name} cannot be read: ")
+    for page in (bad / "index.html", tmp_path / "both.html"):
+        text = page.read_text()
+        assert text.count(f"Damaged: bad/{name} cannot be read") == 1
+        assert str(tmp_path) not in text
+    assert ">17<" in text  # the other run's figure
+    if name == "run.json":
+        for words in (["train", f"resume={bad}"], ["evaluate", f"run={bad}"]):
+            assert main(words) == 2
+            assert "bad/run.json cannot be read" in capsys.readouterr().err
+
+
 def test_an_unfinished_run_has_a_page_too(tmp_path) -> None:
     run = write_run(tmp_path / "one", finished=False)
     write_run_page(run)

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 from torchrl.checkpoint import CheckpointError, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, GymEnv, TransformedEnv
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
@@ -141,6 +141,32 @@ def test_a_folder_without_checkpoint_is_named(tmp_path: Path) -> None:
         make_trainer(32).load(tmp_path / "nothing")
 
 
+def test_a_run_refuses_the_checkpoints_of_another_before_it_trains(tmp_path: Path) -> None:
+    make_trainer(96, save_dir=tmp_path).train()
+    other = make_trainer(32, save_dir=tmp_path)
+    with pytest.raises(FileExistsError, match=r"of another run: .*096\.torchrl.*overwrite=True"):
+        other.train()
+    assert other.collected_frames == 0
+    assert make_trainer(96).load(tmp_path).collected_frames == 96
+
+
+def test_a_run_that_overwrites_has_its_own_checkpoints_though_its_steps_are_fewer(
+    tmp_path: Path,
+) -> None:
+    make_trainer(96, save_dir=tmp_path).train()
+    make_trainer(32, save_dir=tmp_path, overwrite=True).train()
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000000032.torchrl"]
+
+
+def test_a_run_that_continues_from_an_older_checkpoint_keeps_what_it_saves(tmp_path: Path) -> None:
+    make_trainer(96, save_dir=tmp_path, save_trainer_interval=15).train()
+    older, newest = sorted(tmp_path.iterdir())
+    again = make_trainer(80 + 16, save_dir=tmp_path, keep_last=1).load(older)
+    newest.rename(tmp_path / "checkpoint-000000000999.torchrl")  # as if it had come further
+    again.train()
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000000096.torchrl"]
+
+
 def test_two_places_for_checkpoints_are_refused(tmp_path: Path) -> None:
     rotation = CheckpointRotation(tmp_path, keep_last=1)
     with pytest.raises(ValueError, match="save_dir=.* and checkpoint_rotation"):
@@ -172,17 +198,37 @@ def test_episodes_of_a_collector_go_on_in_another() -> None:
     copy.shutdown()
 
 
-def test_episodes_of_an_env_with_state_of_its_own_cannot_go_on() -> None:
-    class Locked(WaterworldMazeEnv):
-        batch_locked = True
-        _supports_set_state = False
+def make_gym_trainer(total: int, folder: Path, **kw: Any) -> DIAYNTrainer:
+    gym = GymEnv("CartPole-v1", categorical_action_encoding=True)
+    env = TransformedEnv(gym, SkillTransform(4, 5, seed=3))
+    keys = dict.fromkeys(("in_keys", "critic_keys", "discriminator_keys"), ["observation"])
+    loss = DIAYNTrainer.make_loss(env, 4, hidden=(8,), seed=0, **keys)
+    settings = {"frames_per_batch": 16, "batch_size": 8, "buffer_size": 64, "seed": 0, **kw}
+    return DIAYNTrainer(env, loss, total_frames=total, save_dir=folder, **settings)
 
-    collector = make_collector(Locked(batch_size=[4], observation=False))
-    episodes = RunningEpisodes(collector)
-    state = episodes.state_dict()
-    with pytest.raises(ValueError, match="Locked keeps state of its own"):
-        episodes.load_state_dict(state)
-    collector.shutdown()
+
+@pytest.mark.parametrize("new_episodes", [None, True])
+def test_in_an_env_with_state_of_its_own_all_but_the_episodes_continues(
+    new_episodes: bool | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    half = make_gym_trainer(32, tmp_path)
+    half.train()
+    saved = {"loss": half.loss_module.state_dict(), "adam": half.optimizer.state_dict()}
+    again = make_gym_trainer(64, tmp_path, seed=7).load(tmp_path, new_episodes=new_episodes)
+    loaded = {"loss": again.loss_module.state_dict(), "adam": again.optimizer.state_dict()}
+    assert differences(loaded, saved) == []
+    assert [again.collected_frames, again._optim_count, len(again.replay_buffer)] == [32, 6, 32]
+    assert again._modules["running_episodes"].collector._carrier["skill_step"].item() == 0
+    again.train()
+    assert [again.collected_frames, again._optim_count] == [64, 12]
+    said = "GymEnv keeps state of its own, so the episodes that were under way are left out"
+    assert capsys.readouterr().err.count(said) == (new_episodes is None)
+
+
+def test_episodes_that_cannot_continue_are_refused_on_request(tmp_path: Path) -> None:
+    make_gym_trainer(32, tmp_path).train()
+    with pytest.raises(CheckpointError, match=r"GymEnv keeps state.*new_episodes=True"):
+        make_gym_trainer(64, tmp_path).load(tmp_path, new_episodes=False)
 
 
 def test_a_collector_in_other_processes_is_refused() -> None:

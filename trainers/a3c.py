@@ -36,9 +36,10 @@ from torchrl_hmcts.trainers.asynchronous.shared_optimizers import (
 from torchrl_hmcts.trainers.checkpoints import (
     DurableRotation,
     check_settings,
+    newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.resume import HistoryState, newest_checkpoint
+from torchrl_hmcts.trainers.resume import HistoryState
 
 MakeOptimizer = Callable[[list[nn.Parameter]], Optimizer]
 
@@ -130,6 +131,8 @@ class A3CTrainer:
         save_interval (int, optional): frames between checkpoints, besides the one at the end.
             Default: a tenth of ``total_frames``.
         keep_last (int): checkpoints kept. Default 2.
+        overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
+            once this run has written one. Default False: ``train()`` refuses such a folder.
         progress (callable, optional): called with ``total=total_frames`` it returns a progress bar,
             e.g. ``tqdm.tqdm``. Default: quiet.
         seed (int): learner i is seeded by (seed, i, T at its start). Default 0.
@@ -185,6 +188,7 @@ class A3CTrainer:
         save_dir: str | Path | None = None,
         save_interval: int | None = None,
         keep_last: int = 2,
+        overwrite: bool = False,
         progress: Callable[..., Any] | None = None,
         seed: int = 0,
         start_method: str = "spawn",
@@ -255,9 +259,10 @@ class A3CTrainer:
         self.learners = LearnerProcesses(num_learners, start_method)
         self.evaluate, self.stop_when = evaluate, stop_when
         self.log, self.progress = LearnerLog(board, columns, logger), progress
-        self.rotation = None if save_dir is None else DurableRotation(save_dir, keep_last=keep_last)
         self.run_settings = {"trainer": "A3CTrainer", "loss_module": type(loss_module).__name__}
-        if self.rotation is not None:
+        self.rotation = None
+        if save_dir is not None:
+            self.rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
             self.rotation.settings = self.run_settings
         self.intervals = {"log": log_interval, "eval": eval_interval, "save": save_interval}
         self._checkpoint = plain_checkpoint(
@@ -308,7 +313,11 @@ class A3CTrainer:
         Raises:
             LearnerError: if a learner ended before its time; a checkpoint has been written.
             KeyboardInterrupt: after Ctrl-C; a checkpoint has been written.
+            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
+                unless ``overwrite`` is true.
         """
+        if self.rotation is not None:
+            self.rotation.begin()
         self.log.start()
         self._next = {name: self._after(name) for name in self.intervals}
         self._accepted: LossModule | None = None  # what stop_when was content with
@@ -335,10 +344,11 @@ class A3CTrainer:
         """Writes a checkpoint into ``save_dir``, atomically; returns its path."""
         if self.rotation is None:
             raise ValueError("There is nowhere to save to. Pass save_dir when building A3CTrainer.")
+        self.rotation.begin()
         return self.rotation.save(self._checkpoint, step=self.frames)
 
     def load(self, path: str | Path) -> A3CTrainer:
-        """Goes on from a checkpoint; call it before ``train()``.
+        """Continues from a checkpoint; call it before ``train()``.
 
         The optimiser's settings are the checkpoint's, the learning rate at the start included; the
         schedule and all else are this trainer's.
@@ -358,6 +368,8 @@ class A3CTrainer:
         found = newest_checkpoint(path)
         check_settings(found, self.run_settings)
         self._checkpoint.load(found)
+        if self.rotation is not None:
+            self.rotation.continue_from(found)
         return self
 
     # Running learners

@@ -2,25 +2,21 @@
 
 TorchRL's ``Checkpoint`` decides what is saved; here is how it reaches the disk. A checkpoint is one
 file: it is written under another name, flushed to the disk, and only then given its name, so that a
-file with that name is whole, whenever the process was killed. Zip's checksums tell damage, and the
-newest whole checkpoint is taken. What is inside are JSON and plain arrays; nothing in a checkpoint
-can be executed.
+file with that name is whole, whenever the process was killed. A digest tells damage, and the newest
+whole checkpoint is taken. What is inside are JSON and plain arrays; nothing in a checkpoint can be
+executed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
-import os
 import re
 import shutil
 import sys
 import tempfile
-import zipfile
 from collections.abc import Collection, Mapping
-from datetime import datetime, timezone
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -31,13 +27,34 @@ from torchrl.checkpoint import (
     CheckpointRotation,
     StateDictCheckpointAdapter,
 )
-from torchrl.checkpoint._checkpoint import _encode_state_dict_value  # its format, our writing
+from torchrl.checkpoint._checkpoint import (  # its format, our reading and writing
+    _decode_state_dict_value,
+    _encode_state_dict_value,
+)
 
 from torchrl_hmcts import __version__
+from torchrl_hmcts.trainers.files import remove, remove_leftovers, replacing
+from torchrl_hmcts.trainers.sealing import (
+    CHECKPOINT_VERSION,
+    NewerCheckpointError,
+    check_settings,
+    find_damage,
+    read_arrays,
+    read_manifest,
+    seal,
+)
 
-_VERSION = 1  # of what this package puts into a checkpoint; raise it when old ones no longer load
+__all__ = [
+    "DurableRotation",
+    "PlainStateAdapter",
+    "check_settings",
+    "find_damage",
+    "newest_checkpoint",
+    "plain_checkpoint",
+    "read_state",
+]
+
 _PLAIN = {".json", ".memmap"}
-_MANIFEST = "manifest.json"
 
 
 class PlainStateAdapter(StateDictCheckpointAdapter):
@@ -81,26 +98,62 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
                 "is_nested": False,
             }
         meta.update(shape=[], device="cpu", _type="<class 'tensordict._td.TensorDict'>")
-        (folder / "meta.json").write_text(json.dumps(meta))
-        (path / self.schema_filename).write_text(json.dumps(schema, separators=(",", ":")) + "\n")
+        (folder / "meta.json").write_text(json.dumps(meta), encoding="utf-8")
+        text = json.dumps(schema, separators=(",", ":")) + "\n"
+        (path / self.schema_filename).write_text(text, encoding="utf-8")
         return state
 
-    def load(self, component: Any, path: Path, **kwargs: Any) -> Any:
+    def load(
+        self,
+        component: Any,
+        path: Path,
+        *,
+        map_location: Any,
+        tensor_load_kwargs: Mapping[str, Any],
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> Any:
         for file in path.rglob("*"):
-            if file.is_file() and file.suffix not in _PLAIN:
+            if file.is_symlink() or (file.is_file() and file.suffix not in _PLAIN):
                 raise CheckpointError(
                     f"the checkpoint holds {file.name!r}, and only JSON and plain arrays are "
                     "read: other files could execute code. It was not written by this package."
                 )
-        return super().load(component, path, **kwargs)
+        schema = json.loads((path / self.schema_filename).read_text(encoding="utf-8"))
+        arrays = read_arrays(path / self.state_directory)
+        state = _decode_state_dict_value(schema, arrays, map_location)
+        component.load_state_dict(state, *args, **kwargs)
 
 
 def _bytes(tensor: torch.Tensor) -> bytes:
     return tensor.reshape(-1).view(torch.uint8).numpy().tobytes() if tensor.numel() else b"\0"
 
 
+class _PlainCheckpoint(Checkpoint):
+    """A checkpoint of one file that is sealed when it is saved and checked when it is loaded."""
+
+    def save(
+        self, path: str | Path, *, metadata: Mapping[str, Any] | None = None, **kwargs: Any
+    ) -> Path:
+        if (kwargs.get("format") or self.format) != "archive":
+            return super().save(path, metadata=metadata, **kwargs)
+        metadata = dict(metadata or {})
+        ours = {"version": __version__, "checkpoint_version": CHECKPOINT_VERSION, "sealed": True}
+        metadata["torchrl_hmcts"] = {**ours, **metadata.get("torchrl_hmcts", {})}
+        final = self._local_path(path)
+        final.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(final) as temporary:
+            super().save(temporary, metadata=metadata, **kwargs)
+            seal(temporary)
+        return final
+
+    def load(self, path: str | Path, **kwargs: Any) -> Any:
+        _check_whole(self._local_path(path))
+        return super().load(path, **kwargs)
+
+
 def plain_checkpoint(**components: Any) -> Checkpoint:
-    """Return a TorchRL ``Checkpoint`` of one file without pickle.
+    """Return a TorchRL ``Checkpoint`` of one file without pickle, which notices all damage.
 
     Args:
         **components: objects with ``state_dict`` and ``load_state_dict``, by name.
@@ -112,10 +165,39 @@ def plain_checkpoint(**components: Any) -> Checkpoint:
         >>> sorted(plain_checkpoint(net=torch.nn.Linear(2, 1)).load(path).loaded)
         ['net']
     """
-    checkpoint = Checkpoint(format="archive").register_adapter(object, PlainStateAdapter())
+    checkpoint = _PlainCheckpoint(format="archive").register_adapter(object, PlainStateAdapter())
     for name, component in components.items():
         checkpoint.register(name, component)
     return checkpoint
+
+
+def read_state(path: str | Path, name: str) -> Any:
+    """Return what a component of a checkpoint was saved with, without building the component.
+
+    Args:
+        path (path): of a checkpoint.
+        name (str): of the component.
+
+    Raises:
+        CheckpointError: if the checkpoint is damaged, or has no such component.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_hmcts.trainers.checkpoints import plain_checkpoint, read_state
+        >>> path = plain_checkpoint(net=torch.nn.Linear(2, 1)).save("linear.torchrl")
+        >>> list(read_state(path, "net"))
+        ['weight', 'bias']
+    """
+    held = _Held()
+    plain_checkpoint(**{name: held}).load(path, map_location="cpu")
+    return held.state
+
+
+class _Held:
+    """Takes the state of any component."""
+
+    def load_state_dict(self, state: Any) -> None:
+        self.state = state
 
 
 class DurableRotation(CheckpointRotation):
@@ -125,6 +207,8 @@ class DurableRotation(CheckpointRotation):
         directory (path): folder of the checkpoints; it is made.
         keep_last (int): good checkpoints kept; a damaged one does not count. Default ``2``: one to
             fall back to.
+        overwrite (bool): let :meth:`begin` accept the checkpoints of another run, which are removed
+            once this run has written one. Default ``False``.
 
     Attributes:
         settings (dict): values on which the run depends, by name (JSON). A checkpoint of other
@@ -144,11 +228,36 @@ class DurableRotation(CheckpointRotation):
         ['checkpoint-000000000200.torchrl', 'checkpoint-000000000300.torchrl']
     """
 
-    def __init__(self, directory: str | Path, *, keep_last: int = 2) -> None:
+    def __init__(
+        self, directory: str | Path, *, keep_last: int = 2, overwrite: bool = False
+    ) -> None:
         super().__init__(directory, keep_last=keep_last)
         self.settings: dict[str, Any] = {}
-        self._good: dict[Path, int] = {}  # modification times of those found whole
+        self.overwrite = overwrite
+        self._began = False
+        self._others: tuple[Path, ...] = ()  # of another run, which is overwritten
+        self._good: dict[Path, tuple[int, ...]] = {}  # which files were found whole
         _check_writable(self.directory)
+
+    def continue_from(self, path: Path) -> None:
+        """Note that the run continues from a checkpoint, perhaps one of those in this folder."""
+        self._began = self._began or path.resolve().parent == self.directory.resolve()
+
+    def begin(self) -> None:
+        """Refuse the checkpoints of another run, before the first of this one is written.
+
+        Raises:
+            FileExistsError: if there are some, and ``overwrite`` is false.
+        """
+        others = () if self._began else self.checkpoints()
+        if others and not self.overwrite:
+            raise FileExistsError(
+                f"{str(self.directory)!r} holds the checkpoints of another run: "
+                f"{', '.join(path.name for path in others)}. Continue it with load(), choose "
+                "another save_dir, or pass overwrite=True to have them removed as soon as this "
+                "run has written one of its own."
+            )
+        self._began, self._others = True, others
 
     def save(
         self,
@@ -166,36 +275,58 @@ class DurableRotation(CheckpointRotation):
         """
         self._validate_step(step)
         final = self._checkpoint_path(step, "archive")
-        temporary = final.with_name(f".{final.name}.writing-{os.getpid()}")
-        ours = {"version": __version__, "checkpoint_version": _VERSION, "settings": self.settings}
+        ours = {
+            "version": __version__,
+            "checkpoint_version": CHECKPOINT_VERSION,
+            "settings": self.settings,
+            "serial": 1 + max((serial for serial, _ in self._ordered()), default=0),
+            "sealed": True,
+        }
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            self._remove_leftovers()
-            checkpoint.save(
-                temporary,
-                components=components,
-                component_options=component_options,
-                format="archive",
-                metadata={**(metadata or {}), "torchrl_hmcts": ours},
-            )
-            _sync(temporary)
-            os.replace(temporary, final)
-            _sync(self.directory)
+            remove_leftovers(self.directory)
+            with replacing(final) as temporary:
+                Checkpoint.save(
+                    checkpoint,
+                    temporary,
+                    components=components,
+                    component_options=component_options,
+                    format="archive",
+                    metadata={**(metadata or {}), "torchrl_hmcts": ours},
+                )
+                seal(temporary)
         except OSError as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
             raise OSError(error.errno, self._not_written(step, error)) from error
-        self._good[final] = final.stat().st_mtime_ns
+        self._good[final] = _identity(final)
+        for path in set(self._others) - {final}:
+            remove(path)
+        self._others = ()
         self.prune()
         return final
 
     def checkpoints(self) -> tuple[Path, ...]:
-        """Return all checkpoints, damaged ones too, in the order in which they were written."""
+        """Return all checkpoints, damaged ones too, in the order in which they were written.
+
+        Each has a number one above those that it found. No clock is read: it may be set back.
+        """
+        return tuple(path for _, path in self._ordered())
+
+    def _ordered(self) -> list[tuple[int, Path]]:
+        """Number and path of each; a number that cannot be read is the one before in steps."""
         if not self.directory.is_dir():
-            return ()
-        name = re.compile(rf"{re.escape(self.prefix)}-\d+(\.torchrl)?")
-        found = [path for path in self.directory.iterdir() if name.fullmatch(path.name)]
-        return tuple(sorted(found, key=lambda path: (_written_at(path), path.name)))
+            return []
+        name = re.compile(rf"{re.escape(self.prefix)}-(\d+)(\.torchrl)?")
+        steps = {
+            path: int(match[1])
+            for path in self.directory.iterdir()
+            if (match := name.fullmatch(path.name))
+        }
+        found, before = [], 0
+        for path in sorted(steps, key=lambda path: (steps[path], path.name)):
+            with contextlib.suppress(CheckpointError):
+                before = read_manifest(path)["metadata"]["torchrl_hmcts"].get("serial", 0)
+            found.append((before, path))
+        return sorted(found, key=lambda entry: entry[0])  # stable: by step where numbers are equal
 
     def latest(self) -> Path | None:
         """Return the newest checkpoint that is whole; a line on stderr names damaged ones."""
@@ -204,13 +335,13 @@ class DurableRotation(CheckpointRotation):
             damage = find_damage(path)
             if damage is None:
                 if damaged:
-                    print(f"{' '.join(damaged)} Going on from {path.name}.", file=sys.stderr)
+                    print(f"{' '.join(damaged)} Continuing from {path.name}.", file=sys.stderr)
                 return path
             damaged.append(f"Checkpoint {path.name} is damaged ({damage}).")
         if damaged:
             raise CheckpointError(
                 f"No checkpoint in {str(self.directory)!r} is whole. {' '.join(damaged)} Start "
-                "anew in another folder, or restore one from a backup."
+                "again in another folder, or restore one from a backup."
             )
         return None
 
@@ -219,7 +350,7 @@ class DurableRotation(CheckpointRotation):
         whole, removed = 0, []
         for path in reversed(self.checkpoints()):
             if whole == self.keep_last:
-                _remove(path)
+                remove(path)
                 self._good.pop(path, None)
                 removed.append(path)
             else:
@@ -227,22 +358,14 @@ class DurableRotation(CheckpointRotation):
         return tuple(removed)
 
     def _is_good(self, path: Path) -> bool:
-        modified = path.stat().st_mtime_ns
-        if self._good.get(path) != modified:
+        if self._good.get(path) != _identity(path):
             try:
                 if find_damage(path) is not None:
                     return False
-            except CheckpointError:  # another version's: not ours to judge, and not to remove
+            except NewerCheckpointError:  # not ours to judge, and not to remove
                 return False
-            self._good[path] = modified
+            self._good[path] = _identity(path)
         return True
-
-    def _remove_leftovers(self) -> None:
-        """Removes what processes that were killed while writing have left."""
-        for path in self.directory.glob(f".*{self.prefix}-*.writing-*"):
-            process = int(re.sub(r"\D.*", "", path.name.rpartition(".writing-")[2]) or 0)
-            if process == os.getpid() or not _is_running(process):
-                _remove(path)
 
     def _not_written(self, step: int, error: OSError) -> str:
         kept = [path.name for path in self.checkpoints()]
@@ -252,124 +375,48 @@ class DurableRotation(CheckpointRotation):
         return (
             f"the checkpoint of step {step} could not be written to {str(self.directory)!r} "
             f"({error.strerror or error}; {free} free). Kept: {', '.join(kept) or 'none'}. Make "
-            "room, or choose another save_dir, and go on with trainer.load(save_dir)"
+            "room, or choose another save_dir, and continue with trainer.load(save_dir)"
         )
 
 
-def find_damage(path: str | Path) -> str | None:
-    """Return what is damaged in a checkpoint, or ``None`` if it is whole.
+def newest_checkpoint(path: str | Path) -> Path:
+    """Return the checkpoint that a path names.
 
     Args:
-        path (path): of a checkpoint, a file or (as TorchRL writes it) a folder. A file is read
-            whole and compared with its checksums; in a folder all files must have their sizes.
+        path (path): a checkpoint, or a folder of checkpoints, of which the newest whole one is
+            taken; a line on stderr names damaged ones.
 
     Raises:
-        CheckpointError: if a newer version wrote it: that is no damage.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_hmcts.trainers.checkpoints import find_damage, plain_checkpoint
-        >>> path = plain_checkpoint(net=torch.nn.Linear(2, 1)).save("linear.torchrl")
-        >>> find_damage(path)
-        >>> _ = path.write_bytes(path.read_bytes()[:-100])
-        >>> find_damage(path)
-        'it is cut off, or no checkpoint'
+        FileNotFoundError: if there is none.
+        CheckpointError: if none is whole, or a newer version wrote it.
     """
     path = Path(path)
-    try:
-        if path.is_dir():
-            return _folder_damage(path)
-        if not zipfile.is_zipfile(path):
-            return "it is cut off, or no checkpoint"
-        with zipfile.ZipFile(path) as archive:
-            manifest = _check_version(path, json.loads(archive.read(_MANIFEST)))
-            bad = archive.testzip()
-            if bad is not None:
-                return f"{bad} differs from its checksum"
-            missing = set(_inventory(manifest)).difference(archive.namelist())
-            return f"{min(missing)} is missing" if missing else None
-    except CheckpointError:
-        raise
-    except Exception as error:  # damage takes any form
-        return f"{type(error).__name__}: {error}"
+    if path.is_file() or (path / "manifest.json").exists():
+        _check_whole(path)
+        return path
+    found = _Reader(path).latest() if path.is_dir() else None
+    if found is None:
+        raise FileNotFoundError(
+            f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to continue, "
+            "or one of the checkpoints in it."
+        )
+    return found
 
 
-def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint of a run with other settings.
+class _Reader(DurableRotation):
+    """A folder of checkpoints that may be read-only."""
 
-    Args:
-        path (path): of a checkpoint.
-        settings (mapping): of this run. Names that only one of the two has are not compared.
+    def __init__(self, directory: Path) -> None:
+        CheckpointRotation.__init__(self, directory, keep_last=1)
 
-    Raises:
-        CheckpointError: naming each value that differs.
 
-    Examples:
-        >>> import torch
-        >>> from torchrl_hmcts.trainers.checkpoints import check_settings, plain_checkpoint
-        >>> checkpoint = plain_checkpoint(net=torch.nn.Linear(2, 1))
-        >>> path = checkpoint.save(
-        ...     "linear.torchrl", metadata={"torchrl_hmcts": {"settings": {"batch_size": 64}}})
-        >>> check_settings(path, {"batch_size": 64})
-    """
-    saved = Checkpoint.manifest(path).get("metadata", {}).get("torchrl_hmcts", {})
-    other = saved.get("settings", {})
-    here = json.loads(json.dumps(dict(settings)))
-    differing = [
-        f"{name} was {other[name]!r} and is {value!r} here"
-        for name, value in here.items()
-        if name in other and other[name] != value
-    ]
-    if differing:
+def _check_whole(path: Path) -> None:
+    damage = find_damage(path)
+    if damage is not None:
         raise CheckpointError(
-            f"The checkpoint {str(path)!r} is of a run with other settings: "
-            f"{'; '.join(differing)}. Build it as it was, or choose another folder to start anew."
+            f"The checkpoint {str(path)!r} is damaged ({damage}). Pass its folder to continue from "
+            "the newest one that is whole."
         )
-
-
-def write_json(path: str | Path, content: Any) -> None:
-    """Write numbers and texts as JSON in one move; what is no finite number becomes null.
-
-    Args:
-        path (path): file.
-        content: dicts, lists, texts and numbers.
-
-    Examples:
-        >>> from torchrl_hmcts.trainers.checkpoints import write_json
-        >>> write_json("metrics.json", {"solved": 0, "frames": float("nan")})
-    """
-    write_text(path, json.dumps(_finite(content), indent=2) + "\n")
-
-
-def _finite(content: Any) -> Any:
-    if isinstance(content, Mapping):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
-
-
-def write_text(path: str | Path, text: str) -> None:
-    """Write a file in one move: whoever reads it finds the old text or the new one.
-
-    Args:
-        path (path): file.
-        text (str): its content.
-
-    Examples:
-        >>> from torchrl_hmcts.trainers.checkpoints import write_text
-        >>> write_text("metrics.json", "{}")
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.writing-{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        _sync(temporary)
-        os.replace(temporary, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
 
 
 def _check_writable(directory: Path) -> None:
@@ -385,71 +432,7 @@ def _check_writable(directory: Path) -> None:
         ) from error
 
 
-def _check_version(path: Path, manifest: dict[str, Any]) -> dict[str, Any]:
-    """Raises if a newer version wrote the manifest, so that it is not taken for damaged."""
-    ours = manifest.get("metadata", {}).get("torchrl_hmcts", {})
-    if ours.get("checkpoint_version", 0) > _VERSION:
-        raise CheckpointError(
-            f"The checkpoint {str(path)!r} was written by torchrl_hmcts {ours.get('version')}, "
-            f"whose checkpoints have version {ours['checkpoint_version']}; {__version__} reads "
-            f"versions up to {_VERSION}. Install the newer one to go on with it."
-        )
-    if manifest.get("format_version") != 1:
-        Checkpoint.manifest(path)  # says which versions it reads
-    return manifest
-
-
-def _inventory(manifest: Mapping[str, Any]) -> list[str]:
-    return [
-        str(PurePosixPath(record["path"], file))
-        for record in manifest["components"].values()
-        for file in record["files"]
-    ]
-
-
-def _folder_damage(folder: Path) -> str | None:
-    manifest = _check_version(folder, json.loads((folder / _MANIFEST).read_text()))
-    for name in _inventory(manifest):
-        file = folder / name
-        if not file.is_file():
-            return f"{name} is missing"
-        if file.name == "meta.json":
-            for key, entry in json.loads(file.read_text()).items():
-                if isinstance(entry, dict) and "dtype" in entry:
-                    dtype = getattr(torch, entry["dtype"].removeprefix("torch."))
-                    need = math.prod(entry["shape"]) * dtype.itemsize
-                    if (file.parent / f"{key}.memmap").stat().st_size < need:
-                        return f"{key}.memmap of {file.parent.parent.name} is cut off"
-    return None
-
-
-def _written_at(path: Path) -> datetime:
-    try:
-        return datetime.fromisoformat(Checkpoint.manifest(path)["created_at"])
-    except Exception:  # damaged
-        return datetime.fromtimestamp(path.stat().st_mtime, timezone.utc)
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _is_running(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return process > 0
+def _identity(path: Path) -> tuple[int, ...]:
+    """Tells a file from the one that takes its place; times are compared for equality only."""
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -116,6 +117,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         >>> main(["demo", "sede=1"])
         2
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # in a locale without UTF-8
     arguments = _parser().parse_args(argv)
     module, _, name = _VERBS[arguments.verb][2].partition(":")
     run: Callable[[Sequence[str]], int] = getattr(

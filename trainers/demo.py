@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.record.loggers import Logger
 from tqdm import tqdm
@@ -17,13 +18,11 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
-from torchrl_hmcts.trainers.figures.animation import write_episode_gif
-from torchrl_hmcts.trainers.figures.plots import plot_losses, plot_search, plot_skill_fan
-from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.figures.report import finish, versions
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
 
@@ -85,41 +84,50 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
         plan_seconds_batched=round(batch_seconds, 2),
     )
     shown = _episode_to_show(episodes, starts, real.base_env)
-    print("Drawing ...")
-    plot_losses(trainer.history, config.train_base_steps, out / "losses.png")
-    sampling = SkillPolicy(loss.actor_network)
-    plot_skill_fan(
-        sampling,
-        config.num_skills,
-        test_mazes[int(starts["maze_index"][shown])],
-        out / "skills.png",
-    )
-    planner.plan(starts[shown : shown + 1])
-    assert planner.last_search is not None
-    plot_search(planner.last_search, real.base_env, out / "search.png")
-    write_episode_gif(real.base_env, starts[shown], episodes[shown], out / "episode.gif")
     metrics["seconds"] = round(time.perf_counter() - begin, 2)
-    write_json(out / "metrics.json", metrics)
-    write_page(
-        out / "index.html",
-        title="Solving random mazes by planning over learned skills",
-        metrics=metrics,
-        pictures=_PICTURES,
-    )
+    with finish(out, "Solving random mazes by planning over learned skills", metrics) as pictures:
+        print("Drawing ...")
+        maze = test_mazes[int(starts["maze_index"][shown])]
+        planner.plan(starts[shown : shown + 1])
+        _draw_episode(pictures, planner, real.base_env, starts[shown], episodes[shown])
+        _draw_worker(pictures, config, trainer, loss, maze)
     print(format_table(metrics))
-    print(f"Pictures and figures: {out / 'index.html'}")
     return metrics
 
 
-_PICTURES = {
-    "episode.gif": "A test maze as it was solved: the plan (colours are skills) and the worker "
-    "that carries it out.",
-    "search.png": "The search for that plan: every place an option led to in the maze (grey: "
-    "refused by the novelty test), and the tree.",
-    "skills.png": "The skills: 10 mini-episodes of 100 base steps for each, in an open room and "
-    "in the maze above.",
-    "losses.png": "Training of the worker: actor, both critics, discriminator.",
-}
+def _draw_episode(
+    pictures: Pictures,
+    planner: MCTSPlanner,
+    env: WaterworldMazeEnv,
+    start: TensorDictBase,
+    episode: Episode,
+) -> None:
+    words = "A test maze as it was solved: the plan (colours are skills) and the worker that "
+    with pictures.one("episode.gif", words + "carries it out.") as path:
+        from torchrl_hmcts.trainers.figures.animation import write_episode_gif
+
+        write_episode_gif(env, start, episode, path)
+    words = "The search for that plan: every place an option led to in the maze (grey: refused by "
+    with pictures.one("search.png", words + "the novelty test), and the tree.") as path:
+        from torchrl_hmcts.trainers.figures.plots import plot_search
+
+        assert planner.last_search is not None
+        plot_search(planner.last_search, env, path)
+
+
+def _draw_worker(
+    pictures: Pictures, config: DemoConfig, trainer: DIAYNTrainer, loss: Any, maze: Tensor
+) -> None:
+    words = "The skills: 10 mini-episodes of 100 base steps for each, in an open room and in the "
+    with pictures.one("skills.png", words + "maze above.") as path:
+        from torchrl_hmcts.trainers.figures.plots import plot_skill_fan
+
+        plot_skill_fan(SkillPolicy(loss.actor_network), config.num_skills, maze, path)
+    words = "Training of the worker: actor, both critics, discriminator."
+    with pictures.one("losses.png", words) as path:
+        from torchrl_hmcts.trainers.figures.plots import plot_losses
+
+        plot_losses(trainer.history, config.train_base_steps, path)
 
 
 def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict:

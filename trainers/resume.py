@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import random
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
-from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
@@ -29,7 +30,7 @@ from torchrl_hmcts.trainers.checkpoints import (
     DurableRotation,
     PlainStateAdapter,
     check_settings,
-    find_damage,
+    newest_checkpoint,
     plain_checkpoint,
 )
 
@@ -42,11 +43,17 @@ class RunningEpisodes:
 
     A collector's own state dict has its counters and the env's transforms, but not where the
     episodes stand, so that a resumed run would begin new ones. This adds the tensordict from which
-    the collector takes its next step. It needs an env whose whole state is in the tensordict.
+    the collector takes its next step. It needs an env whose whole state is in the tensordict: one
+    whose ``_supports_set_state`` is True or whose ``batch_locked`` is False, as those of
+    ``torchrl_hmcts.envs``. In other envs, e.g. ``GymEnv``, new episodes begin on loading.
 
     Args:
-        collector (Collector): single-process collector over an env whose ``_supports_set_state`` is
-            True or whose ``batch_locked`` is False, as those of ``torchrl_hmcts.envs``.
+        collector (Collector): single-process collector.
+
+    Attributes:
+        new_episodes (bool, optional): whether loading leaves the saved episodes out and begins new
+            ones. Default ``None``: only where the env cannot be set to their states; a line on
+            stderr says so.
 
     Raises:
         TypeError: if the collector runs its envs in other processes.
@@ -71,6 +78,7 @@ class RunningEpisodes:
                 "torchrl.collectors.Collector, or do without exact resume."
             )
         self.collector = collector
+        self.new_episodes: bool | None = None
 
     @property
     def complete(self) -> bool:
@@ -90,12 +98,26 @@ class RunningEpisodes:
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Lets the collector go on with the episodes that :meth:`state_dict` returned."""
+        """Lets the collector continue the episodes that :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the env has another batch size; or if it cannot be set to a state and
+                ``new_episodes`` is False.
+        """
+        env = getattr(self.collector.env, "base_env", self.collector.env)
+        if self.new_episodes or (self.new_episodes is None and not self.complete):
+            if self.new_episodes is None:
+                print(
+                    f"{type(env).__name__} keeps state of its own, so the episodes "
+                    "that were under way are left out; new ones begin.",
+                    file=sys.stderr,
+                )
+            return  # a collector that has not collected yet stands at the beginning of some
         if not self.complete:
             raise ValueError(
-                f"{type(self.collector.env).__name__} keeps state of its own, so its episodes "
-                "cannot go on from a checkpoint. Use an env that can be set to any state, or leave "
-                "this component out when loading (strict='warn'): new episodes begin then."
+                f"{type(env).__name__} keeps state of its own, so its episodes "
+                "cannot continue from a checkpoint. Use an env that can be set to any state, or "
+                "load with new_episodes=True."
             )
         old = self.collector._carrier
         saved = torch.Size(state_dict["batch_size"])
@@ -208,6 +230,8 @@ class ResumableTrainer(Trainer):
             ``save_trainer_interval`` base steps have passed, and at the end. Default ``None``: no
             checkpoints.
         keep_last (int): checkpoints kept. Default ``2``.
+        overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
+            once this run has written one. Default ``False``: ``train()`` refuses such a folder.
         **trainer_kwargs: passed to ``torchrl.trainers.Trainer``.
 
     Attributes:
@@ -241,7 +265,12 @@ class ResumableTrainer(Trainer):
     """
 
     def __init__(
-        self, *, save_dir: str | Path | None = None, keep_last: int = 2, **trainer_kwargs: Any
+        self,
+        *,
+        save_dir: str | Path | None = None,
+        keep_last: int = 2,
+        overwrite: bool = False,
+        **trainer_kwargs: Any,
     ) -> None:
         self.run_settings: dict[str, Any] = {"trainer": type(self).__name__}
         for part in ("loss_module", "optimizer"):
@@ -254,7 +283,7 @@ class ResumableTrainer(Trainer):
                         f"save_dir={str(save_dir)!r} and {other} both say where checkpoints go. "
                         "Pass one of them."
                     )
-            rotation = DurableRotation(save_dir, keep_last=keep_last)
+            rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
             rotation.settings = self.run_settings
             trainer_kwargs["checkpoint_rotation"] = rotation
         if trainer_kwargs.get("checkpoint") is None and not trainer_kwargs.get("save_trainer_file"):
@@ -267,6 +296,7 @@ class ResumableTrainer(Trainer):
         super().__init__(**trainer_kwargs)
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
         self._last_log: dict[str, Any] = {}
+        self._saved_frames = -1  # base steps at the newest checkpoint
         if self.checkpoint is not None and "rng" not in self.checkpoint:
             self.checkpoint.register("rng", GlobalRNGState())
         collector = self.collector
@@ -282,12 +312,37 @@ class ResumableTrainer(Trainer):
         """All values logged so far, by name."""
         return {key: [float(x) for x in values] for key, values in self._log_dict.items()}
 
-    def load(self, path: str | Path) -> ResumableTrainer:
-        """Goes on from a checkpoint; call it before ``train()``.
+    def train(self) -> None:
+        """Trains.
+
+        Raises:
+            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
+                unless ``overwrite`` is true.
+        """
+        if isinstance(self.checkpoint_rotation, DurableRotation):
+            self.checkpoint_rotation.begin()
+        super().train()
+
+    def _save_trainer(self) -> None:
+        super()._save_trainer()
+        self._saved_frames = self.collected_frames
+
+    def _shutdown_hook(self) -> None:
+        # A collector that ends by itself leaves TorchRL's loop without the checkpoint of the end.
+        if self.checkpoint_rotation is not None and self._saved_frames != self.collected_frames:
+            self.save_trainer(force_save=True)
+        super()._shutdown_hook()
+
+    def load(self, path: str | Path, *, new_episodes: bool | None = None) -> ResumableTrainer:
+        """Continues from a checkpoint; call it before ``train()``.
 
         Args:
             path (path): a checkpoint, or a folder of checkpoints (``save_dir``), of which the
                 newest whole one is taken.
+            new_episodes (bool, optional): leave the episodes that were under way out, and begin
+                new ones. Default ``None``: only in an env that cannot be set to a state (e.g.
+                ``GymEnv``), and a line on stderr says so; all else continues exactly. False:
+                refuse such an env.
 
         Returns:
             ResumableTrainer: itself.
@@ -299,7 +354,17 @@ class ResumableTrainer(Trainer):
         """
         found = newest_checkpoint(path)
         check_settings(found, self.run_settings)
+        episodes = self._modules.get("running_episodes")
+        if isinstance(episodes, RunningEpisodes):
+            episodes.new_episodes = new_episodes
         self.load_from_file(found)
+        if not all(type(n) is int and n >= 0 for n in (self.collected_frames, self._optim_count)):
+            raise CheckpointError(
+                f"The checkpoint {str(found)!r} has {self.collected_frames!r} base steps and "
+                f"{self._optim_count!r} updates, which are no counts. Load an older one."
+            )
+        if isinstance(self.checkpoint_rotation, DurableRotation):
+            self.checkpoint_rotation.continue_from(found)
         return self
 
     def compute_loss(self, sub_batch: TensorDictBase) -> TensorDictBase:
@@ -330,42 +395,6 @@ class ResumableTrainer(Trainer):
             f"{self.collected_frames} base steps. The update was not applied. {again} Look for "
             "rewards or observations that are not finite, or lower the learning rate."
         )
-
-
-def newest_checkpoint(path: str | Path) -> Path:
-    """Returns the checkpoint that a path names.
-
-    Args:
-        path (path): a checkpoint, or a folder of checkpoints, of which the newest whole one is
-            taken; a line on stderr names damaged ones.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        CheckpointError: if none is whole, or a newer version wrote it.
-    """
-    path = Path(path)
-    if path.is_file() or Checkpoint.is_checkpoint(path):
-        damage = find_damage(path)
-        if damage is not None:
-            raise CheckpointError(
-                f"The checkpoint {str(path)!r} is damaged ({damage}). Pass its folder to go on "
-                "from the newest one that is whole."
-            )
-        return path
-    found = _Reader(path).latest() if path.is_dir() else None
-    if found is None:
-        raise FileNotFoundError(
-            f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to go on "
-            "with, or one of the checkpoints in it."
-        )
-    return found
-
-
-class _Reader(DurableRotation):
-    """A folder of checkpoints that may be read-only."""
-
-    def __init__(self, directory: Path) -> None:
-        CheckpointRotation.__init__(self, directory, keep_last=1)
 
 
 class DetachedStepper(DefaultOptimizationStepper):

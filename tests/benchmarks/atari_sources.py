@@ -36,7 +36,7 @@ from torchrl_hmcts.trainers import (
     WorkerSource,
     load_options,
 )
-from torchrl_hmcts.trainers.checkpoints import write_json
+from torchrl_hmcts.trainers.files import write_json
 
 SMALL = GoalSearch(trial_steps=300, trial_ratio=5.0)
 

@@ -28,8 +28,9 @@ import torch
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.figures.lab_figures import frames_curve, plot_frames_curves
+from torchrl_hmcts.trainers.figures.lab_figures import plot_frames_curves
 from torchrl_hmcts.trainers.lab.evaluation import (
+    frames_curve,
     solve_mazes,
     solve_with_wrong_model,
     wrong_models,

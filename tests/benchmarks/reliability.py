@@ -2,12 +2,14 @@
 
     python tests/benchmarks/reliability.py                    (all but the slow ones)
     python tests/benchmarks/reliability.py kills --kills 50
+    python tests/benchmarks/reliability.py damage             (1,000 damaged files of each kind)
     python tests/benchmarks/reliability.py fuzz --slow        (100,000 cases)
     python tests/benchmarks/reliability.py ray                (kills processes of a Ray cluster)
     python tests/benchmarks/reliability.py coverage           (reads what `make coverage` measured)
 
-Each part is a file of its own: kills.json, fuzz.json, fuzz_slow.json, tests.json, contracts.json,
-ray.json, leaks.json, coverage.json, with the command that made it; a test that fails is named.
+Each part is a file of its own: kills.json, damage.json, fuzz.json, fuzz_slow.json, tests.json,
+contracts.json, ray.json, leaks.json, coverage.json, with the command that made it; a test that
+fails is named.
 """
 
 from __future__ import annotations
@@ -106,6 +108,12 @@ def kills(number: int) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def damage(number: int) -> dict[str, Any]:
+    command = [sys.executable, "tests/test_fault_damage.py", str(number)]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def fuzz(slow: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "counts"
@@ -146,7 +154,7 @@ def coverage() -> dict[str, Any]:
     return {"folders": found}
 
 
-PARTS = ["kills", "fuzz", "tests", "contracts", "leaks", "ray", "coverage"]
+PARTS = ["kills", "damage", "fuzz", "tests", "contracts", "leaks", "ray", "coverage"]
 SEPARATE = ["ray", "coverage"]  # what needs more than the extra dev, or a run before
 
 
@@ -156,6 +164,7 @@ def main() -> None:
         "parts", nargs="*", help=f"of {', '.join(PARTS)}; default: all but {SEPARATE}"
     )
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--damaged", type=int, default=1_000, help="files of each kind")
     parser.add_argument("--slow", action="store_true", help="fuzz 100,000 cases")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "reliability")
     arguments = parser.parse_args()
@@ -166,6 +175,9 @@ def main() -> None:
         if part == "kills":
             words = f"kills --kills {arguments.kills}"
             figures = kills(arguments.kills)
+        elif part == "damage":
+            words = f"damage --damaged {arguments.damaged}"
+            figures = damage(arguments.damaged)
         elif part == "fuzz":
             words, name = ("fuzz --slow", "fuzz_slow") if arguments.slow else ("fuzz", "fuzz")
             figures = fuzz(arguments.slow)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 from torchrl_hmcts.envs import AtariOptionPool, OptionWorker
 from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariSearch
 from torchrl_hmcts.trainers.atari.options import plain_worker
-from torchrl_hmcts.trainers.checkpoints import write_json
+from torchrl_hmcts.trainers.files import read_json, write_json
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class RememberedTrials:
 
     Args:
         make_pool (callable): ``make_pool(worker, max_steps, ...) -> AtariOptionPool``.
-        path (path): JSON file. Of another form, or of other settings, it is begun anew.
+        path (path): JSON file with a checksum. One of other settings is replaced; so is one that
+            is damaged, and a line on stderr says so.
         settings (mapping): all else on which trials depend, e.g. the game; plain data.
 
     Example:
@@ -67,11 +69,13 @@ class RememberedTrials:
         self._known: dict[str, list[float]] = {}
         if self._path.is_file():
             try:
-                found = json.loads(self._path.read_text())
+                found = read_json(self._path)
+                if set(found) != {"settings", "trials"}:
+                    raise ValueError(f"{self._path} cannot be read: it holds {sorted(found)}.")
                 if found["settings"] == self._settings:
                     self._known = dict(found["trials"])
-            except (ValueError, KeyError, TypeError):
-                pass  # it saves time only: the trials are played again
+            except (ValueError, TypeError) as error:  # it saves time only
+                print(f"{error} Its trials are played again.", file=sys.stderr)
 
     def __call__(self, *args: Any, **kwargs: Any) -> AtariOptionPool:
         """Make a pool."""
@@ -86,7 +90,8 @@ class RememberedTrials:
         """Add a trial and write the file in one move."""
         self._known[key] = [trial.score, trial.real_steps, trial.num_frames]
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(self._path, {"settings": self._settings, "trials": self._known})
+        content = {"settings": self._settings, "trials": self._known}
+        write_json(self._path, content, checksum=True)
 
 
 def play_trial(

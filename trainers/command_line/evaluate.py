@@ -16,6 +16,7 @@ from torchrl_hmcts.trainers.experiments.run_folder import (
     read_run,
     shown_word,
 )
+from torchrl_hmcts.trainers.files import left_out
 
 
 def evaluate(words: Sequence[str]) -> int:
@@ -48,6 +49,10 @@ def evaluate(words: Sequence[str]) -> int:
             results = function(changed)
     except FileNotFoundError as error:
         return fail("evaluate", error)
+    except RuntimeError as error:
+        if type(error).__name__ != "CheckpointError":  # torchrl's; not worth its import here
+            raise
+        return fail("evaluate", error)
     except ValueError as error:
         return refuse("evaluate", error)
     evaluation: dict[str, Any] = {
@@ -57,8 +62,9 @@ def evaluate(words: Sequence[str]) -> int:
         "versions": versions(),
         "machine": machine(),
     }
-    file = add_evaluation(run.path, evaluation)
-    write_run_page(run.path)
     print(json.dumps(results, indent=1))
-    print(f"Figures: {file}; with all others: {run.path / 'index.html'}")
+    with left_out("evaluation.json"):
+        print(f"Figures: {add_evaluation(run.path, evaluation)}")
+    with left_out("index.html"):
+        print(f"With all others: {write_run_page(run.path)}")
     return 0

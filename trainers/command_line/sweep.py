@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import sys
 from collections.abc import Iterator, Sequence
 
@@ -14,6 +13,7 @@ from torchrl_hmcts.trainers.config import parse_overrides
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, find_experiment
 from torchrl_hmcts.trainers.experiments.run_folder import shown_word
 from torchrl_hmcts.trainers.experiments.sweep_space import parse_space
+from torchrl_hmcts.trainers.files import left_out, write_json
 
 _OWN = ("experiment", "trials", "objective", "storage", "prune", "out")
 _DEFAULT_TRIALS = 20
@@ -74,15 +74,18 @@ def _page(plan: object, study: object, command: str) -> str:
     assert isinstance(plan, Sweep)
     rows, shares = trial_rows(study), importances(study)  # type: ignore[arg-type]
     content = {"objective": plan.objective, "trials": rows, "importances": shares}
-    (plan.folder / "sweep.json").write_text(json.dumps(content, indent=1) + "\n")
-    page = write_sweep_page(
-        plan.folder,
-        experiment=plan.experiment.name,
-        objective=plan.objective,
-        rows=rows,
-        importances=shares,
-        command=command,
-    )
+    with left_out("sweep.json"):
+        write_json(plan.folder / "sweep.json", content)
+    page = plan.folder / "index.html"
+    with left_out("index.html"):
+        write_sweep_page(
+            plan.folder,
+            experiment=plan.experiment.name,
+            objective=plan.objective,
+            rows=rows,
+            importances=shares,
+            command=command,
+        )
     best = next((row for row in rows if row["value"] is not None), None)
     if best is None:
         return f"No trial has finished. Page: {page}"

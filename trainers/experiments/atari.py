@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import csv
+import contextlib
 import dataclasses
-import io
-import os
 import time
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+from torchrl.checkpoint import CheckpointError
 from tqdm import tqdm
 
 from torchrl_hmcts.envs import AtariOptionPool, OptionWorker
@@ -31,11 +31,17 @@ from torchrl_hmcts.trainers.atari.sources import (
 from torchrl_hmcts.trainers.atari.trained_sources import FineTunedSource, RetrainedSource
 from torchrl_hmcts.trainers.atari.trials import RememberedTrials
 from torchrl_hmcts.trainers.atari.tuning import Tuned, tune_search
-from torchrl_hmcts.trainers.checkpoints import write_json, write_text
+from torchrl_hmcts.trainers.checkpoints import (
+    DurableRotation,
+    newest_checkpoint,
+    plain_checkpoint,
+    read_state,
+)
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
 from torchrl_hmcts.trainers.experiments.registry import ExperimentError
-from torchrl_hmcts.trainers.figures.atari_figures import plot_scores, write_atari_gif
-from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.figures.report import finish, versions
+from torchrl_hmcts.trainers.files import left_out, write_csv
 
 TOY: dict[str, Any] = {
     "frames": 20_000,
@@ -79,12 +85,18 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     run = AtariRun(config)
-    saved = out / "checkpoints" / "run.pt"
+    rotation = DurableRotation(out / "checkpoints")
+    rotation.settings = run.settings()
+    checkpoint = plain_checkpoint(run=run)
     if not config.resume:
+        rotation.begin()
         _trials(out).unlink(missing_ok=True)
-    elif saved.is_file():
-        run.load_state_dict(torch.load(saved, weights_only=True))
-    save = lambda: _save(saved, run.state_dict())  # noqa: E731
+    else:
+        with contextlib.suppress(FileNotFoundError):  # it was still looking for options
+            path, state = load_run(out)
+            run.load_state_dict(state)
+            rotation.continue_from(path)
+    save = lambda: (rotation.save(checkpoint, step=run.num_frames), None)[1]  # noqa: E731
     begin = time.perf_counter()
     with tqdm(total=config.frames, unit=" frames", unit_scale=True, disable=None) as bar:
         try:
@@ -97,15 +109,14 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
         "config": dataclasses.asdict(config),
         "versions": versions(),
     }
-    _write_curves(run, out / "curves.csv")
-    pictures = draw(run, out)
-    write_json(out / "metrics.json", metrics)
+    with left_out("curves.csv"):
+        write_csv(out / "curves.csv", ("step", "name", "value"), _curve_rows(run))
     title = f"{config.game} by planning over options, {config.protocol}"
-    write_page(out / "index.html", title=title, metrics=metrics, pictures=pictures)
+    with finish(out, title, metrics) as pictures:
+        draw(run, pictures)
     print(
         f"{config.game}: {len(run.scores)} episodes, best {metrics['score_max']:g}, last "
-        f"{metrics['score_final']:g}, {run.num_frames:,} frames. "
-        f"Pictures and figures: {out / 'index.html'}"
+        f"{metrics['score_final']:g}, {run.num_frames:,} frames."
     )
     return metrics
 
@@ -132,14 +143,14 @@ def evaluate_atari(config: AtariConfig) -> dict[str, Any]:
         config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)
     run = AtariRun(dataclasses.replace(config, options_from="", frames=1))
-    run.take_over(Path(config.out), "out")
+    checkpoint = run.take_over(Path(config.out), "out")
     before = run.num_frames
     try:
         run.play(lambda: None, lambda: None)
         row = run.scores[-1]
     finally:
         run.close()
-    return {"checkpoint": "run.pt", "test": {**row, "frames": int(row["frames"]) - before}}
+    return {"checkpoint": checkpoint.name, "test": {**row, "frames": int(row["frames"]) - before}}
 
 
 class AtariRun:
@@ -261,10 +272,10 @@ class AtariRun:
 
     def _remembering(self) -> RememberedTrials:
         """Makes pools whose trials a run that is stopped and resumed does not play again."""
-        settings = {k: v for k, v in dataclasses.asdict(self.config).items() if k not in _FREE}
-        return RememberedTrials(self.make_pool, _trials(Path(self.config.out)), settings)
+        path = _trials(Path(self.config.out))
+        return RememberedTrials(self.make_pool, path, self.settings())
 
-    def take_over(self, folder: Path, key: str) -> None:
+    def take_over(self, folder: Path, key: str) -> Path:
         """Take options, their length and what a guide has learned from another run.
 
         What it spent on them counts.
@@ -273,13 +284,17 @@ class AtariRun:
             folder: of the run.
             key: of the configuration that names it, for errors.
 
+        Returns:
+            The checkpoint.
+
         Raises:
             ExperimentError: if there is no run of this game.
+            CheckpointError: if no checkpoint of it is whole.
         """
-        path = folder / "checkpoints" / "run.pt"
-        if not path.is_file():
-            raise ExperimentError(f"{key}={folder} is no run of this experiment: no {path}.")
-        other = torch.load(path, weights_only=True)
+        try:
+            path, other = load_run(folder)
+        except FileNotFoundError as error:
+            raise ExperimentError(f"{key}={folder} is no run of this experiment: {error}") from None
         if other["config"]["game"] != self.config.game:
             raise ExperimentError(
                 f"{key}={folder} is a run of {other['config']['game']}, not of "
@@ -291,6 +306,12 @@ class AtariRun:
         if other["config"].get("guide", "none") == self.config.guide:
             self._learned = other["agent"].get("guide")
         self._frames_before += self.options.num_frames + self.tuned.num_frames
+        return path
+
+    def settings(self) -> dict[str, Any]:
+        """The keys that a run must keep when it continues."""
+        ours = dataclasses.asdict(self.config)
+        return {k: v for k, v in ours.items() if k not in _FREE}
 
     def _seed_episode(self, agent: AtariAgent) -> None:
         """Give an episode a start and draws of its own, whatever was played before."""
@@ -433,9 +454,8 @@ class AtariRun:
         assert self.options is not None
         assert self.tuned is not None
         assert self.agent is not None
-        ours = dataclasses.asdict(self.config)
         return {
-            "config": {k: v for k, v in ours.items() if k not in _FREE},
+            "config": self.settings(),
             "options": {
                 "names": self.options.names,
                 "num_frames": self.options.num_frames,
@@ -478,56 +498,73 @@ class AtariRun:
         self._resumed = state_dict["agent"]
 
 
-def draw(run: AtariRun, out: Path) -> dict[str, str]:
-    """Draw a run's pictures into a folder; return their captions by file.
+def load_run(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """Return a run's newest whole checkpoint and what it holds, as :meth:`AtariRun.state_dict`.
+
+    Args:
+        folder: of the run; one of an older version, with ``checkpoints/run.pt``, is read too.
+
+    Raises:
+        FileNotFoundError: if there is no checkpoint.
+        CheckpointError: if none is whole.
+    """
+    old = folder / "checkpoints" / "run.pt"
+    try:
+        path = newest_checkpoint(folder / "checkpoints")
+        return path, read_state(path, "run")
+    except FileNotFoundError:
+        if not old.is_file():
+            raise
+    try:
+        with zipfile.ZipFile(old) as archive:  # torch.load does not compare the checksums
+            bad = archive.testzip()
+        if bad is not None:
+            raise ValueError(f"{bad} differs from its checksum")
+        return old, torch.load(old, weights_only=True)
+    except Exception as error:  # damage takes any form
+        raise CheckpointError(f"The checkpoint {str(old)!r} is damaged ({error}).") from error
+
+
+def draw(run: AtariRun, pictures: Pictures) -> None:
+    """Draw a run's pictures.
 
     Args:
         run: with at least one episode.
-        out: folder.
+        pictures: of its folder.
     """
-    plot_scores(run.scores, out / "scores.png", title=run.config.game)
-    pictures = {"scores.png": "Score of each episode against emulated frames, real and simulated."}
     assert run.options is not None
     assert run.tuned is not None
-    pool = run.make_pool(run.options.worker, run.tuned.option_steps)
-    recorder = run.make_pool(run.options.worker, run.tuned.option_steps, record=True)
-    try:
-        search = dataclasses.replace(run.search(), ratio=min(run.config.ratio, 10.0))
-        agent = AtariAgent(pool, search, seed=run.config.seed)
-        steps = 60 if run.config.toy else 450
-        write_atari_gif(agent, recorder, out / "episode.gif", real_steps=steps)
-    finally:
-        pool.close()
-        recorder.close()
-    pictures["episode.gif"] = "The first minute of an episode, planned with fewer simulations."
-    return pictures
+    words = "Score of each episode against emulated frames, real and simulated."
+    with pictures.one("scores.png", words) as path:
+        from torchrl_hmcts.trainers.figures.atari_figures import plot_scores
+
+        plot_scores(run.scores, path, title=run.config.game)
+    words = "The first minute of an episode, planned with fewer simulations."
+    with pictures.one("episode.gif", words) as path:
+        from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif
+
+        pool = run.make_pool(run.options.worker, run.tuned.option_steps)
+        recorder = run.make_pool(run.options.worker, run.tuned.option_steps, record=True)
+        try:
+            search = dataclasses.replace(run.search(), ratio=min(run.config.ratio, 10.0))
+            agent = AtariAgent(pool, search, seed=run.config.seed)
+            steps = 60 if run.config.toy else 450
+            write_atari_gif(agent, recorder, path, real_steps=steps)
+        finally:
+            pool.close()
+            recorder.close()
 
 
 def _trials(out: Path) -> Path:
     return out / "checkpoints" / "trials.json"
 
 
-def _write_curves(run: AtariRun, path: Path) -> None:
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["step", "name", "value"])
+def _curve_rows(run: AtariRun) -> Iterator[tuple[int, str, float]]:
     best = float("-inf")
     for row in run.scores:
         steps = int(row["frames"]) // FRAMES_PER_STEP
         best = max(best, row["score"])
-        rows.writerow([steps, "score", row["score"]])
-        rows.writerow([steps, "score_max", best])
+        yield steps, "score", row["score"]
+        yield steps, "score_max", best
     for frames, score in run.points:
-        rows.writerow([frames // FRAMES_PER_STEP, "score_of_the_running_episode", score])
-    write_text(path, text.getvalue())
-
-
-def _save(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint in one move: there is always a whole one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.writing-{os.getpid()}")
-    with temporary.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+        yield frames // FRAMES_PER_STEP, "score_of_the_running_episode", score

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.checkpoint import Checkpoint
+from torchrl.checkpoint import CheckpointError
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.trainers.checkpoints import newest_checkpoint, plain_checkpoint
 from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
@@ -29,7 +30,6 @@ from torchrl_hmcts.trainers.lab.evaluation import (
     wrong_models,
 )
 from torchrl_hmcts.trainers.lab.worker import make_worker_loss
-from torchrl_hmcts.trainers.resume import newest_checkpoint
 from torchrl_hmcts.trainers.waterworld.agents import play_mazes
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
@@ -51,8 +51,8 @@ def load_networks(loss_module: LossModule, run: str | Path) -> Path:
     folder = Path(run) / "checkpoints"
     path = newest_checkpoint(folder)
     try:
-        Checkpoint(loss_module=loss_module).load(path)
-    except RuntimeError as error:
+        plain_checkpoint(loss_module=loss_module).load(path)
+    except CheckpointError as error:
         raise ValueError(
             f"The networks of {path} are not those of this configuration. Leave the keys that "
             f"shape them (num_skills, hidden, ...) as they were. {error}"

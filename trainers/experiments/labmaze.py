@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import time
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -17,20 +17,13 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import draw_first_person
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
-from torchrl_hmcts.trainers.figures.lab_figures import (
-    frames_curve,
-    plot_frames_curves,
-    plot_mazes,
-    plot_search,
-    plot_skill_fan,
-    write_episode_gif,
-)
-from torchrl_hmcts.trainers.figures.plots import plot_losses
-from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.figures.report import finish, versions
+from torchrl_hmcts.trainers.files import left_out, replacing, write_csv
 from torchrl_hmcts.trainers.lab.evaluation import (
+    frames_curve,
     make_maze_env,
     make_planner,
     solve_mazes,
@@ -97,7 +90,9 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     )
     logger.close()
     curve = frames_curve(trained.tests, config.frames_per_step, config.max_frames)
-    _write_curves(trained, curve, config, out / "curves.csv")
+    with left_out("curves.csv"):
+        head = ("curve", "training_frames", "value")
+        write_csv(out / "curves.csv", head, _curve_rows(trained, curve, config))
     worker = trained.policy
     print(f"Solving {config.mazes} mazes of {config.size} x {config.size} ...", flush=True)
     test = solve_mazes(config, worker)
@@ -120,59 +115,86 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
         "config": dataclasses.asdict(config),
         "versions": versions(),
     }
-    print("Drawing ...", flush=True)
-    draw(config, trained, out, unsolved=test["unsolved"])
     metrics["seconds"] = round(time.perf_counter() - begin, 1)
-    write_json(out / "metrics.json", metrics)
     title = "DeepMind Lab's random maze, by planning over learned skills"
-    write_page(out / "index.html", title=title, metrics=metrics, pictures=_PICTURES)
+    with finish(out, title, metrics) as pictures:
+        print("Drawing ...", flush=True)
+        draw(config, trained, pictures, unsolved=test["unsolved"])
     print(
         f"{test['solved']} of {test['mazes']} mazes solved at the first trial, in "
         f"{test['frames']['mean']:.0f} frames (a script on the shortest path: "
-        f"{test['script_frames']['mean']:.0f}). Pictures and figures: {out / 'index.html'}"
+        f"{test['script_frames']['mean']:.0f})."
     )
     return metrics
 
 
 def draw(
-    config: LabMazeConfig, trained: TrainedWorker, out: Path, *, unsolved: list[int] | None = None
+    config: LabMazeConfig,
+    trained: TrainedWorker,
+    pictures: Pictures,
+    *,
+    unsolved: list[int] | None = None,
 ) -> None:
-    """Draw all figures of a run into a folder.
+    """Draw all figures of a run.
 
     Args:
         config: of the experiment.
         trained: its worker.
-        out: folder.
+        pictures: of the run.
         unsolved: test mazes that are not to be shown as solved.
     """
     worker, seeds = trained.policy, held_out_seeds(max(4, config.mazes), config.size)
     model = make_maze_env(config, worker, seeds)
     real = make_maze_env(config, worker, seeds, trajectory_keys=_STATE)
     env = real.base_env
-    plot_mazes(env, out / "mazes.png")
-    sampling = SkillPolicy(
-        trained.loss.actor_network, generator=torch.Generator().manual_seed(config.seed)
-    )
-    plot_skill_fan(sampling, env, out / "skills.png", num_skills=config.num_skills)
-    plot_losses(trained.history, trained.steps, out / "losses.png")
-    curve = frames_curve(trained.tests, config.frames_per_step, env.max_frames)
-    name = "Algorithm 3" if config.algorithm == "hmcts" else "DIAYN"
-    plot_frames_curves(
-        [curve],
-        out / "solving.png",
-        title=f"{name}: {config.curve_mazes} held-out mazes of 9 x 9",
-        script=curve_script_frames(config),
-    )
     starts = make_starts(env, config.seed)
     lengths = ShortestPathScript(env).path_lengths(starts)
     shown = [i for i in np.argsort(lengths, kind="stable") if i not in (unsolved or ())]
     start = starts[int(shown[int(0.85 * (len(shown) - 1))]) if shown else 0]
     planner = make_planner(config, model)
     plan, states, options = play_plan(planner, real, start)
-    assert planner.last_search is not None
-    plot_search(planner.last_search, env, out / "search.png")
-    write_episode_gif(env, states, options, plan, out / "episode.gif")
-    iio.imwrite(out / "view.png", draw_first_person(env, states[0], width=640, height=480))
+    with _picture(pictures, "episode.gif") as path:
+        from torchrl_hmcts.trainers.figures.lab_figures import write_episode_gif
+
+        write_episode_gif(env, states, options, plan, path)
+    with _picture(pictures, "solving.png") as path:
+        from torchrl_hmcts.trainers.figures.lab_figures import plot_frames_curves
+
+        plot_frames_curves(
+            [frames_curve(trained.tests, config.frames_per_step, env.max_frames)],
+            path,
+            title=f"{'Algorithm 3' if config.algorithm == 'hmcts' else 'DIAYN'}: "
+            f"{config.curve_mazes} held-out mazes of 9 x 9",
+            script=curve_script_frames(config),
+        )
+    with _picture(pictures, "skills.png") as path:
+        from torchrl_hmcts.trainers.figures.lab_figures import plot_skill_fan
+
+        generator = torch.Generator().manual_seed(config.seed)
+        sampling = SkillPolicy(trained.loss.actor_network, generator=generator)
+        plot_skill_fan(sampling, env, path, num_skills=config.num_skills)
+    with _picture(pictures, "losses.png") as path:
+        from torchrl_hmcts.trainers.figures.plots import plot_losses
+
+        plot_losses(trained.history, trained.steps, path)
+    with _picture(pictures, "search.png") as path:
+        from torchrl_hmcts.trainers.figures.lab_figures import plot_search
+
+        assert planner.last_search is not None
+        plot_search(planner.last_search, env, path)
+    with _picture(pictures, "mazes.png") as path:
+        from torchrl_hmcts.trainers.figures.lab_figures import plot_mazes
+
+        plot_mazes(env, path)
+    with _picture(pictures, "view.png") as path, replacing(path) as temporary:
+        import imageio.v3 as iio
+
+        view = draw_first_person(env, states[0], width=640, height=480)
+        temporary.write_bytes(iio.imwrite("<bytes>", view, extension=".png"))
+
+
+def _picture(pictures: Pictures, name: str) -> AbstractContextManager[Path]:
+    return pictures.one(name, _PICTURES[name])
 
 
 def play_plan(
@@ -202,18 +224,15 @@ def play_plan(
     return plan, states, options
 
 
-def _write_curves(
-    trained: TrainedWorker, curve: dict[str, list[float]], config: LabMazeConfig, path: Path
-) -> None:
+def _curve_rows(
+    trained: TrainedWorker, curve: dict[str, list[float]], config: LabMazeConfig
+) -> Iterable[tuple[str, int, float]]:
     """All curves, a value a row."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("curve", "training_frames", "value"))
-        total = trained.steps * config.frames_per_step
-        for name in ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator"):
-            values = trained.history[name]
-            for i, value in enumerate(values):
-                writer.writerow((name, round(total * (i + 1) / len(values)), value))
-        for name in ("frames", "solved", "solved_frames"):
-            for frames, value in zip(curve["training_steps"], curve[name], strict=True):
-                writer.writerow((name, round(frames), value))
+    total = trained.steps * config.frames_per_step
+    for name in ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator"):
+        values = trained.history[name]
+        for i, value in enumerate(values):
+            yield name, round(total * (i + 1) / len(values)), value
+    for name in ("frames", "solved", "solved_frames"):
+        for frames, value in zip(curve["training_steps"], curve[name], strict=True):
+            yield name, round(frames), value

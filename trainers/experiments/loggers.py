@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.record.loggers import CSVLogger, Logger
 
 from torchrl_hmcts.trainers.config import check_logger
+from torchrl_hmcts.trainers.files import left_out
 
 Observer = Callable[[str, float, int], None]
 _OBSERVERS: ContextVar[tuple[Observer, ...]] = ContextVar("observers", default=())
@@ -24,6 +25,8 @@ _OBSERVERS: ContextVar[tuple[Observer, ...]] = ContextVar("observers", default=(
 
 class ScalarLoggers(Logger):
     """Hands every value to several loggers, and to those who observe the run.
+
+    A logger that fails, e.g. on a full disk, is left out from there on, and a line says so.
 
     Args:
         loggers: of TorchRL; an entry that one of them does not support is left out there.
@@ -55,26 +58,26 @@ class ScalarLoggers(Logger):
         value = float(value)
         if not math.isfinite(value):
             return
-        for logger in self.loggers:
-            logger.log_scalar(name, value, step=step)
+        self._each(lambda logger: logger.log_scalar(name, value, step=step))
         for observer in self.observers:
             observer(name, value, -1 if step is None else step)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Log a video where that is possible."""
-        for logger in self.loggers:
-            logger.log_video(name, video, step=step, **kwargs)
+        self._each(lambda logger: logger.log_video(name, video, step=step, **kwargs))
 
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
         """Log the configuration."""
-        for logger in self.loggers:
-            logger.log_hparams(dict(cfg))
+        self._each(lambda logger: logger.log_hparams(dict(cfg)))
 
     def log_histogram(self, name: str, data: Sequence[float], **kwargs: Any) -> None:
         """Log a histogram where that is possible."""
-        for logger in self.loggers:
+
+        def log(logger: Logger) -> None:
             with contextlib.suppress(NotImplementedError):
                 logger.log_histogram(name, data, **kwargs)
+
+        self._each(log)
 
     def state_dict(self) -> dict[str, Any]:
         """Return nothing: a run that goes on appends to its files."""
@@ -85,18 +88,34 @@ class ScalarLoggers(Logger):
 
     def close(self) -> None:
         """Write what is still to be written, and close the files."""
+        self._each(_close)
+
+    def _each(self, act: Callable[[Logger], None]) -> None:
+        """Do something with every logger; one that fails, e.g. on a full disk, gets no more."""
+        kept = []
         for logger in self.loggers:
-            experiment = logger.experiment
-            for file in getattr(experiment, "files", {}).values():
-                file.close()
-            for name in ("finish", "close"):  # of Weights & Biases; of TensorBoard
-                end = getattr(experiment, name, None)
-                if callable(end):
-                    end()
-                    break
+            with left_out(f"what {type(logger).__name__} still had to log"):
+                act(logger)
+                kept.append(logger)
+        for logger in self.loggers:
+            if logger not in kept:
+                with contextlib.suppress(Exception):  # what it could not write, it cannot now
+                    _close(logger)
+        self.loggers = kept
 
     def __repr__(self) -> str:
         return f"ScalarLoggers({self.loggers})"
+
+
+def _close(logger: Logger) -> None:
+    experiment = logger.experiment
+    for file in getattr(experiment, "files", {}).values():
+        file.close()
+    for name in ("finish", "close"):  # of Weights & Biases; of TensorBoard
+        end = getattr(experiment, name, None)
+        if callable(end):
+            end()
+            break
 
 
 def make_logger(config: Any) -> ScalarLoggers:

@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -22,6 +21,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, Experiment
+from torchrl_hmcts.trainers.files import left_out, read_json, write_json
 
 _NAME_COLUMNS = ("name", "curve")
 _STEP_LABELS = {
@@ -58,6 +58,7 @@ class RunFolder:
         title: heading of the page.
         pictures: captions by file; only files that are there.
         curves: by name.
+        damage: a sentence for each file that cannot be read; its content is empty.
 
     Example:
         >>> RunFolder(Path("runs/one"), {"config": {"seed": 3}}).seed
@@ -71,6 +72,7 @@ class RunFolder:
     title: str = ""
     pictures: dict[str, str] = field(default_factory=dict)
     curves: dict[str, RunCurve] = field(default_factory=dict)
+    damage: list[str] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -102,14 +104,17 @@ def read_run(path: str | Path) -> RunFolder:
     """Read a run's folder.
 
     Args:
-        path: folder that a command wrote; the run may be unfinished.
+        path: folder that a command wrote; the run may be unfinished. Of a file that is damaged,
+            ``damage`` says so, and all else is read.
 
     Raises:
         ValueError: if it is no folder of a run.
     """
     path = Path(path)
-    record, metrics = (_json(path / name, {}) for name in ("run.json", "metrics.json"))
-    if not record and not metrics:
+    damage: list[str] = []
+    record = _json(path / "run.json", damage, config=dict, commands=list, versions=dict)
+    metrics = _json(path / "metrics.json", damage, config=dict, versions=dict)
+    if not record and not metrics and not damage:
         raise ValueError(
             f"{path} is no folder of a run: it has neither run.json nor metrics.json. Pass the "
             "folder that was given as out=DIR."
@@ -118,18 +123,26 @@ def read_run(path: str | Path) -> RunFolder:
         config = metrics.get("config", {})
         record = {"experiment": _guess(config), "config": config}
         record["versions"] = metrics.get("versions", {})
-    page = _json(path / "page.json", {})
-    captions = page.get("pictures") or {
-        picture.name: "" for end in ("gif", "png") for picture in sorted(path.glob(f"*.{end}"))
-    }
+    page = _json(path / "page.json", damage, pictures=dict, title=str)
+    captions = page.get("pictures")
+    if captions is None:
+        found = (sorted(path.glob(f"*.{end}")) for end in ("gif", "png"))
+        captions = {picture.name: "" for pictures in found for picture in pictures}
+    evaluated = _json(path / "evaluation.json", damage, evaluations=list)
+    curves: dict[str, RunCurve] = {}
+    try:
+        curves = read_curves(path)
+    except (ValueError, csv.Error, OSError, KeyError, TypeError) as error:
+        damage.append(f"{path.resolve().name}/curves.csv cannot be read: {error}.")
     return RunFolder(
         path,
         record,
         {k: v for k, v in metrics.items() if k not in ("config", "versions")},
-        _json(path / "evaluation.json", {}).get("evaluations", []),
+        [e for e in evaluated.get("evaluations", []) if isinstance(e, dict)],
         page.get("title") or record.get("experiment") or path.resolve().name,
-        {name: text for name, text in captions.items() if (path / name).is_file()},
-        read_curves(path),
+        {name: str(text) for name, text in captions.items() if (path / name).is_file()},
+        curves,
+        damage,
     )
 
 
@@ -142,7 +155,7 @@ def read_curves(path: Path) -> dict[str, RunCurve]:
     points: dict[str, list[tuple[float, float]]] = {}
     label = "steps"
     if (path / "curves.csv").is_file():
-        with (path / "curves.csv").open(newline="") as file:
+        with (path / "curves.csv").open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
             columns = rows.fieldnames or []
             name = next((c for c in _NAME_COLUMNS if c in columns), None)
@@ -155,7 +168,7 @@ def read_curves(path: Path) -> dict[str, RunCurve]:
     else:
         log = path / "log" / "scalars"
         for scalars in sorted(log.rglob("*.csv")):
-            with scalars.open(newline="") as file:
+            with scalars.open(newline="", encoding="utf-8") as file:
                 rows_of = [(float(x), float(y)) for x, y in csv.reader(file)]
             points[scalars.relative_to(log).with_suffix("").as_posix()] = rows_of
     curves = {}
@@ -174,8 +187,12 @@ def load_config(run: RunFolder) -> tuple[Experiment, Any]:
         run: of :func:`read_run`.
 
     Raises:
-        ValueError: if the experiment is unknown, or no longer has one of the keys.
+        ValueError: if ``run.json`` is damaged, or the experiment is unknown or no longer has one of
+            the keys.
     """
+    for sentence in run.damage:
+        if "run.json" in sentence:
+            raise ValueError(sentence)
     if run.experiment not in ALL_EXPERIMENTS:
         raise ValueError(
             f"{run.path} does not say which experiment it is of (run.json). Experiments: "
@@ -206,7 +223,7 @@ def start_record(
     """
     path = Path(config.out)
     path.mkdir(parents=True, exist_ok=True)
-    before = _json(path / "run.json", {})
+    before = _json(path / "run.json", [], config=dict, commands=list)
     going_on = bool(getattr(config, "resume", False))
     commands = before.get("commands", []) if going_on else []
     values = asdict(config)
@@ -220,7 +237,7 @@ def start_record(
         **facts,
         "status": "running",
     }
-    _write(path / "run.json", record)
+    write_json(path / "run.json", record, checksum=True)
 
 
 def end_record(path: str | Path, status: str) -> None:
@@ -231,9 +248,10 @@ def end_record(path: str | Path, status: str) -> None:
         status: ``"finished"``, ``"stopped"`` or ``"failed"``.
     """
     file = Path(path) / "run.json"
-    record = _json(file, {})
+    record = _json(file, [])
     if record:
-        _write(file, {**record, "status": status})
+        with left_out(f"{file.name}'s status"):  # of what is over, e.g. on a full disk
+            write_json(file, {**record, "status": status}, checksum=True)
 
 
 def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
@@ -249,10 +267,10 @@ def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
     file = Path(path) / "evaluation.json"
     others = [
         e
-        for e in _json(file, {}).get("evaluations", [])
+        for e in _json(file, [], evaluations=list).get("evaluations", [])
         if e.get("changes") != evaluation.get("changes")
     ]
-    _write(file, {"evaluations": [*others, dict(evaluation)]})
+    write_json(file, {"evaluations": [*others, dict(evaluation)]})
     return file
 
 
@@ -288,17 +306,20 @@ def _guess(config: Mapping[str, Any]) -> str:
     return min(fitting)[1] if fitting else ""
 
 
-def _json(path: Path, default: Any) -> Any:
+def _json(path: Path, damage: list[str], **kinds: type) -> dict[str, Any]:
+    """A file's content, empty if there is none; or if it is damaged, which is noted.
+
+    ``kinds`` are types of entries, where they are there.
+    """
     if not path.is_file():
-        return default
+        return {}
     try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    """Atomically: a run that is killed leaves the file as it was."""
-    half = path.with_name(path.name + ".part")
-    half.write_text(json.dumps(content, indent=2) + "\n")
-    half.replace(path)
+        content = read_json(path)
+        for name, kind in kinds.items():
+            if not isinstance(content.get(name, kind()), kind):
+                raise ValueError(f"{path} cannot be read: {name} is {content[name]!r}.")
+        return content
+    except (ValueError, OSError) as error:
+        said = " ".join(str(error).split())
+        damage.append(said.replace(str(path), f"{path.parent.resolve().name}/{path.name}"))
+        return {}

@@ -12,10 +12,10 @@ from typing import Any
 
 import optuna
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.pool import NullPool  # Optuna depends on it
 
+from torchrl_hmcts.trainers.experiments.journal import CheckedJournal
 from torchrl_hmcts.trainers.experiments.loggers import observed
 from torchrl_hmcts.trainers.experiments.registry import Experiment
 from torchrl_hmcts.trainers.experiments.run_folder import end_record, start_record
@@ -77,7 +77,7 @@ class Sweep:
         self.folder.mkdir(parents=True, exist_ok=True)
         storage: str | BaseStorage
         if self.storage is None:
-            storage = JournalStorage(JournalFileBackend(str(self.folder / "journal.log")))
+            storage = JournalStorage(CheckedJournal(self.folder / "journal.log"))
         elif self.storage.startswith("redis"):
             storage = self.storage
         else:  # no pool: its connections would stay open until they are collected

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import time
@@ -20,16 +19,15 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.trainers.a3c import A3CTrainer
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
 from torchrl_hmcts.trainers.experiments.waterworld_config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
-from torchrl_hmcts.trainers.figures.goal_figures import plot_goals, plot_tile_search, write_goal_gif
-from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
-from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.figures.report import finish, versions
+from torchrl_hmcts.trainers.files import left_out, write_csv
 from torchrl_hmcts.trainers.waterworld.agents import make_maze_networks, play_mazes
 from torchrl_hmcts.trainers.waterworld.goal_episodes import run_goal_episodes
 from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
@@ -147,7 +145,8 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
     history = trainer.train()
     train_seconds = time.perf_counter() - begin
     logger.close()
-    write_curves(history, out / "curves.csv")
+    with left_out("curves.csv"):
+        write_curves(history, out / "curves.csv")
 
     print(f"Testing in {config.test_mazes} mazes it has never seen ...", flush=True)
     policy = loss.actor_network
@@ -165,30 +164,30 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
             metrics["test"][f"{key}_mean"] = round(float(sampled.last[key].double().mean()), 3)
     metrics["config"] = dataclasses.asdict(config)
     metrics["versions"] = versions()
-    write_json(out / "metrics.json", metrics)
-    pictures = {"learning.png": "Test mazes solved and base steps of an episode while it learns."}
-    plot_learning_curves(
-        {name: [learning_curve(history)]},
-        out / "learning.png",
-        title=f"{name[0].upper()}{name[1:]}, seed {config.seed}",
-        max_steps=config.max_episode_steps,
-    )
-    if with_goals:
-        pictures.update(draw_episode(policy, tests, starts, greedy.base_steps, out))
-    write_page(
-        out / "index.html",
-        title=f"Random mazes: {name}",
-        metrics=metrics,
-        pictures=pictures,
-    )
+    with finish(out, f"Random mazes: {name}", metrics) as pictures:
+        words = "Test mazes solved and base steps of an episode while it learns."
+        with pictures.one("learning.png", words) as path:
+            from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
+
+            plot_learning_curves(
+                {name: [learning_curve(history)]},
+                path,
+                title=f"{name[0].upper()}{name[1:]}, seed {config.seed}",
+                max_steps=config.max_episode_steps,
+            )
+        if with_goals:
+            draw_episode(policy, tests, starts, greedy.base_steps, pictures)
     print(json.dumps({k: metrics[k] for k in ("train_seconds", "test", "test_greedy")}, indent=1))
-    print(f"Pictures and figures: {out / 'index.html'}")
     return metrics
 
 
 def draw_episode(
-    policy: TensorDictModuleBase, env: EnvBase, starts: TensorDictBase, steps: Tensor, out: Path
-) -> dict[str, str]:
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    starts: TensorDictBase,
+    steps: Tensor,
+    pictures: Pictures,
+) -> None:
     """Draw a rather long episode of the goal-based agent: Figure 3.5, the search, and a GIF.
 
     Args:
@@ -196,23 +195,26 @@ def draw_episode(
         env: of :func:`make_agent_env`, with goals.
         starts: states ``[S]``.
         steps: int64 ``[S]``, base steps of the episodes from them.
-        out: folder to write into.
-
-    Returns:
-        Captions of the pictures, by file.
+        pictures: of the run.
     """
     index = int(steps.argsort()[int(0.85 * (len(steps) - 1))])
     start = starts[index]
     track = run_goal_episodes(env, policy, starts[index : index + 1], record=True).tracks[0]
-    plot_goals(env.base_env, start, track, out / "goals.png")
-    plot_tile_search(env.base_env, start, out / "search.png")
-    write_goal_gif(env.base_env, start, track, out / "episode.gif")
-    return {
-        "episode.gif": "A test maze: the player (blue) on its way along the goals (red) to the "
-        "target (green).",
-        "goals.png": "The same episode: the manager's goals, half way, and at the end.",
-        "search.png": "The manager's tree over tiles, and the path it found.",
-    }
+    words = "A test maze: the player (blue) on its way along the goals (red) to the target (green)."
+    with pictures.one("episode.gif", words) as path:
+        from torchrl_hmcts.trainers.figures.goal_figures import write_goal_gif
+
+        write_goal_gif(env.base_env, start, track, path)
+    words = "The same episode: the manager's goals, half way, and at the end."
+    with pictures.one("goals.png", words) as path:
+        from torchrl_hmcts.trainers.figures.goal_figures import plot_goals
+
+        plot_goals(env.base_env, start, track, path)
+    words = "The manager's tree over tiles, and the path it found."
+    with pictures.one("search.png", words) as path:
+        from torchrl_hmcts.trainers.figures.goal_figures import plot_tile_search
+
+        plot_tile_search(env.base_env, start, path)
 
 
 def learning_curve(history: dict[str, list[float]]) -> dict[str, list[float]]:
@@ -235,9 +237,8 @@ def write_curves(history: dict[str, list[float]], path: Path) -> None:
         history: of an :class:`A3CTrainer`.
         path: file to write.
     """
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("name", "frames", "value"))
-        for name, values in history.items():
-            frames = history["eval_frames" if name.startswith("eval_") else "frames"]
-            writer.writerows((name, int(t), v) for t, v in zip(frames, values, strict=True))
+    rows: list[tuple[str, int, float]] = []
+    for name, values in history.items():
+        frames = history["eval_frames" if name.startswith("eval_") else "frames"]
+        rows += [(name, int(t), v) for t, v in zip(frames, values, strict=True)]
+    write_csv(path, ("name", "frames", "value"), rows)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import imageio.v3 as iio
-import imageio_ffmpeg
 import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.trainers.figures.plots import option_rgb
+from torchrl_hmcts.trainers.files import left_out, replacing
 
 if TYPE_CHECKING:
     from torchrl_hmcts.envs import WaterworldMazeEnv
     from torchrl_hmcts.trainers.demo import Episode
+
+_VIDEO_SECONDS = 300  # after which ffmpeg is given up
 
 
 def write_episode_gif(
@@ -61,6 +63,8 @@ def write_gif(
 ) -> None:
     """Write pictures as an endless GIF, and as a video beside it (``.mp4``, H.264).
 
+    A video that cannot be written, e.g. without ffmpeg, is left out; a line on stderr says so.
+
     Args:
         frames: uint8 ``[height, width, 3]`` each. Where several in a row are the same, one is
             written into the GIF that is shown as long as all of them.
@@ -78,30 +82,37 @@ def write_gif(
     if last is not None:
         durations[-1] += last - milliseconds
     shown: float | list[float] = durations if len(kept) > 1 else durations[0]
-    iio.imwrite(path, np.stack(kept), extension=".gif", duration=shown, loop=0)
+    import imageio.v3 as iio  # here, so that a run without it loses no more than the picture
+
+    with replacing(path) as temporary:  # written here: after an error imageio would try again
+        content = iio.imwrite("<bytes>", np.stack(kept), extension=".gif", duration=shown, loop=0)
+        temporary.write_bytes(content)
     still = 0 if last is None else round(last / milliseconds) - 1
-    _write_video([*frames, *[frames[-1]] * still], Path(path).with_suffix(".mp4"), milliseconds)
+    video = Path(path).with_suffix(".mp4")
+    video.unlink(missing_ok=True)  # of an older episode
+    with left_out(video.name), replacing(video) as temporary:
+        _write_video([*frames, *[frames[-1]] * still], temporary, milliseconds)
 
 
 def _write_video(frames: Sequence[np.ndarray], path: Path, milliseconds: float) -> None:
     """Write pictures as a video; ones of odd height or width get a row or column more."""
+    import imageio_ffmpeg
+
     height, width = frames[0].shape[:2]
     room = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 halves the colours' resolution
     shown = [np.pad(frame, room, mode="edge") for frame in frames]
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (width + width % 2, height + height % 2),
-        fps=1000.0 / milliseconds,
-        codec="libx264",
-        macro_block_size=2,
-        ffmpeg_log_level="error",
+    size = f"{width + width % 2}x{height + height % 2}"
+    pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{1000.0 / milliseconds}"]
+    h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "25", "-v", "error"]
+    done = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *pictures, "-i", "-", "-an", *h264, str(path)],
+        input=b"".join(np.ascontiguousarray(frame).tobytes() for frame in shown),
+        capture_output=True,
+        timeout=_VIDEO_SECONDS,
     )
-    writer.send(None)
-    try:
-        for frame in shown:
-            writer.send(np.ascontiguousarray(frame))
-    finally:
-        writer.close()
+    if done.returncode:
+        words = done.stderr.decode(errors="replace").split()
+        raise RuntimeError(f"ffmpeg ended with {done.returncode}: {' '.join(words)}")
 
 
 def _pale(color: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -12,6 +12,7 @@ from matplotlib.ticker import EngFormatter
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv
 from torchrl_hmcts.trainers.atari.agent import AtariAgent
 from torchrl_hmcts.trainers.figures.animation import write_gif
+from torchrl_hmcts.trainers.figures.pictures import save_figure
 
 _EVERY = 3  # base steps between two pictures
 
@@ -35,7 +36,7 @@ def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: s
     axes.margins(x=0.08)
     axes.legend(frameon=False)
     axes.grid(alpha=0.25)
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path, dpi=120)
 
 
 def write_atari_gif(

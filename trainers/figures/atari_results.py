@@ -28,8 +28,9 @@ from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
 from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
+from torchrl_hmcts.trainers.figures.pictures import save_figure
+from torchrl_hmcts.trainers.files import write_text
 
-_DPI = 110
 _FEW = 30
 RUNNING = "score_of_the_running_episode"
 """The curve of the running score."""
@@ -114,7 +115,7 @@ def summaries(sources: Sources) -> list[dict[str, Any]]:
     if runs or folder is None:
         return runs
     for file in sorted(folder.glob("*.json")):
-        rows = json.loads(file.read_text())
+        rows = json.loads(file.read_text(encoding="utf-8"))
         for row in rows if isinstance(rows, list) else []:
             curves = {
                 name: RunCurve(name, curve["step"], curve["value"], "steps")
@@ -313,7 +314,7 @@ def draw_game(sources: Sources, path: Path, name: str) -> str:
     panels[0].set_xlabel("emulated steps since the options were found" if running else all_steps)
     panels[1].set_xlabel(all_steps)
     shown.suptitle(game, fontsize=11, x=0.01, ha="left")
-    shown.savefig(path, dpi=_DPI)
+    save_figure(shown, path)
     return (
         f"{game}: mean, least and largest over the seeds that play (left) or have a score (right), "
         "against emulated steps."
@@ -404,7 +405,8 @@ def write_table(sources: Sources, path: Path, name: str) -> str:
         "steps. Ours are of the source of options that scored highest in a game; scores at the end "
         "are means over its seeds with 95 % bootstrap intervals."
     )
-    path.write_text(
+    write_text(
+        path,
         page(
             "Table 5.1",
             Html(f'<p class="lead">{text(note)}</p>'),
@@ -415,12 +417,12 @@ def write_table(sources: Sources, path: Path, name: str) -> str:
             table(means, ["protocol", "score", "interquartile mean", "95 % interval", "games"]),
             Html("<h2>Table A.1: means of OpenAI Baselines, as the source gives them</h2>"),
             table(baselines, ["", *TABLE_5_1]),
-        )
+        ),
     )
     markdown = [" | ".join(head), " | ".join("---" for _ in head)]
     markdown += [" | ".join(_as_plain(cell) for cell in line) for line in cells]
     text_file = path.with_suffix(".md")
-    text_file.write_text("\n".join(f"| {line} |" for line in markdown) + "\n")
+    write_text(text_file, "\n".join(f"| {line} |" for line in markdown) + "\n")
     return f"Table 5.1 with {len(rows)} run(s) of ours; as Markdown: {text_file.name}."
 
 

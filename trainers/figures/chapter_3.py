@@ -77,7 +77,7 @@ def draw_learning(sources: Sources, path: Path, name: str) -> str:
             told.append(f"{agent}: {len(curves[agent])} seed(s) of the runs given")
     measured = sources.result("goals/goal_agent.json")
     if measured is not None:
-        for agent, rows in json.loads(measured.read_text())["agents"].items():
+        for agent, rows in json.loads(measured.read_text(encoding="utf-8"))["agents"].items():
             with_curves = [row["curve"] for row in rows if "curve" in row]
             if with_curves and agent not in curves:
                 curves[agent] = with_curves

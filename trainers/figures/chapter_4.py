@@ -22,11 +22,11 @@ from torchrl_hmcts.trainers.figures.lab_figures import (
     plot_mazes,
     plot_skill_fan,
 )
+from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.trainers.lab.training import curve_script_frames
 from torchrl_hmcts.trainers.lab.worker import held_out_seeds, make_lab_env, make_worker_loss
 
 _NAMES = {"diayn": "DIAYN", "hmcts": "Algorithm 3"}
-_DPI = 110
 
 
 def draw_mazes(sources: Sources, path: Path, name: str) -> str:
@@ -100,7 +100,7 @@ def draw_loss(sources: Sources, path: Path, name: str) -> str:
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.spines[["top", "right"]].set_visible(False)
-    shown.savefig(path, dpi=_DPI)
+    save_figure(shown, path)
     band = ", band from the least to the largest" if len(runs) > 1 else ""
     return (
         f"{figure.shows[0].upper()}{figure.shows[1:]}, {len(runs)} seed(s) of {where}: moving "
@@ -127,7 +127,7 @@ def draw_solving(sources: Sources, path: Path, name: str) -> str:
             )
     measured = sources.result("lab/labmaze.json")
     if not curves and measured is not None:
-        results = json.loads(measured.read_text())["results"]
+        results = json.loads(measured.read_text(encoding="utf-8"))["results"]
         curves = [
             row["curve"]
             for key, row in results.items()

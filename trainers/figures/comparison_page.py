@@ -26,7 +26,9 @@ from torchrl_hmcts.trainers.figures.page_parts import (
     table,
     text,
 )
-from torchrl_hmcts.trainers.figures.run_page import config_table, flatten
+from torchrl_hmcts.trainers.figures.report import say_damage
+from torchrl_hmcts.trainers.figures.run_page import config_table, damage_of, flatten
+from torchrl_hmcts.trainers.files import left_out, write_text
 
 _NOT_COMPARED = ("seed", "out", "resume", "logger")  # keys in which runs of a group may differ
 _SEEDS_FOR_IQM = 4
@@ -114,7 +116,9 @@ def write_comparison(folders: Sequence[str | Path], out: str | Path) -> Path:
     if file.suffix.lower() not in (".html", ".htm"):
         file = file / "index.html"
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(comparison_page(group_runs([read_run(path) for path in paths])))
+    runs = [read_run(path) for path in paths]
+    say_damage(*runs)
+    write_text(file, comparison_page(group_runs(runs)))
     return file
 
 
@@ -132,9 +136,10 @@ def comparison_page(groups: Sequence[RunGroup]) -> str:
     for run in runs:
         names += [n for n, c in run.curves.items() if n not in names and len(c.steps) > 1]
     panels = []
-    for name in names:
-        curves = {g.name: [r.curves[name] for r in g.runs if name in r.curves] for g in groups}
-        panels.append(drawing(panel(name, curves), name))
+    with left_out("the curves of the page"):
+        for name in names:
+            curves = {g.name: [r.curves[name] for r in g.runs if name in r.curves] for g in groups}
+            panels.append(drawing(panel(name, curves), name))
     several = any(len(group.runs) > 1 for group in groups)
     lines = "Lines are means over the seeds, bands go from the least to the largest of them."
     return page(
@@ -154,7 +159,7 @@ def comparison_page(groups: Sequence[RunGroup]) -> str:
         ),
         section("Pictures", *_pictures(groups)),
         section("Config", *_configs(groups)),
-        section("Runs", _runs(runs)),
+        section("Runs", *map(damage_of, runs), _runs(runs)),
     )
 
 

@@ -6,9 +6,6 @@ import io
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from torchrl_hmcts.trainers.experiments.run_folder import RunCurve
 
@@ -32,6 +29,10 @@ def panel(name: str, groups: Mapping[str, Sequence[RunCurve]]) -> str:
         >>> panel("entropy", {"": [RunCurve("entropy", [0, 1], [2, 1], "steps")]})[:5]
         '<?xml'
     """
+    from matplotlib import rc_context  # here: a page without it lacks its curves, no more
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
     figure = Figure(figsize=(4.3, 2.7), layout="constrained")
     axes = figure.subplots()
     label = "steps"

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
+from torchrl_hmcts.trainers.files import write_text
 
 _LAB_RUNS = "hmcts train experiment=labmaze seed={seed} out=runs/labmaze_{seed}"
 _GOAL_RUNS = "hmcts train experiment=waterworld_goals seed={seed} out=runs/goals_{seed}"
@@ -296,5 +297,5 @@ def draw_all(
         else:
             parts.append(section(title, there, picture(drawn.path, drawn.caption, embed=True)))
     file = Path(out) / "index.html"
-    file.write_text(page("The dissertation's figures, drawn of this package", *parts))
+    write_text(file, page("The dissertation's figures, drawn of this package", *parts))
     return file, lacking

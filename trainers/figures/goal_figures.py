@@ -18,11 +18,11 @@ from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.envs.rendering import PLAYER_COLOR, TARGET_COLOR
 from torchrl_hmcts.planners.drawing import option_color
 from torchrl_hmcts.trainers.figures.animation import write_gif
+from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.trainers.figures.plots import legend_below
 from torchrl_hmcts.trainers.waterworld.goal_episodes import GoalTrack
 from torchrl_hmcts.trainers.waterworld.goal_planning import make_tile_planner
 
-_DPI = 110
 _TRAIL_COLOR = (147, 178, 245)  # the player's blue, pale
 _ACTIONS = ("up", "down", "left", "right", "none")
 
@@ -93,7 +93,7 @@ def plot_goals(env: WaterworldMazeEnv, start: TensorDictBase, track: GoalTrack, 
     panels = figure.subplots(1, len(captions), squeeze=False)[0]
     for axes, (step, caption) in zip(panels, captions.items(), strict=True):
         _show(axes, draw_goals(env, start, track, step, tile_pixels=48), caption)
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def write_goal_gif(
@@ -143,7 +143,7 @@ def plot_macro_env(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) ->
         column, row = (int(x) for x in state[key].tolist())
         right.add_patch(Rectangle((column, row), 1, 1, color=np.array(color) / 255))
     right.set_title("Gridworld: tiles", fontsize=11, loc="left")
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def plot_tile_search(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) -> None:
@@ -185,7 +185,7 @@ def plot_tile_search(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) 
     right.plot(*points[-1], "o", color=np.array(TARGET_COLOR) / 255, markersize=13, zorder=1)
     right.set_title(f"the plan: {int(lengths[0])} tiles", fontsize=10, loc="left")
     legend_below(figure, legend, ncols=8)
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def _center(position: Any) -> np.ndarray:

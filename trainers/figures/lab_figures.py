@@ -21,11 +21,10 @@ from torchrl_hmcts.envs import LabMazeEnv, draw_first_person
 from torchrl_hmcts.planners import Plan, Search
 from torchrl_hmcts.planners.drawing import option_color
 from torchrl_hmcts.trainers.figures.animation import write_gif
+from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.trainers.figures.plots import legend_below, option_rgb
 from torchrl_hmcts.trainers.figures.solving_curves import draw_band, save_curves, show_shares
-from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 
-_DPI = 110
 _COLOR, _SCRIPT_COLOR = "#1d4ed8", "#d97706"
 _SCRIPT_LABEL = "script on the shortest path"
 
@@ -54,7 +53,7 @@ def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 
         )  # fmt: skip
         above.set_axis_off()
         _draw_maze(below, env, maze)
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def plot_skill_fan(
@@ -117,48 +116,7 @@ def plot_skill_fan(
         axes.set_title(title, fontsize=10, loc="left")
     handles = [Line2D([], [], color=option_color(z), label=f"skill {z}") for z in range(num_skills)]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(8, num_skills))
-    figure.savefig(path, dpi=_DPI)
-
-
-def frames_curve(
-    records: RoundRecords, frames_per_step: int, max_frames: int
-) -> dict[str, list[float]]:
-    """Return the mean frames of an episode against the frames of training; Figure 4.10's curve.
-
-    An episode without a plan, or whose plan fails, counts with its whole length.
-
-    Args:
-        records: of test rounds.
-        frames_per_step: frames of a base step.
-        max_frames: of an episode.
-
-    Returns:
-        ``"training_steps"`` and ``"frames"`` (both in frames), ``"solved"`` (share) and
-        ``"solved_frames"``, the mean over those that were solved (NaN if none was).
-
-    Example:
-        >>> import numpy as np
-        >>> columns = dict.fromkeys(RoundRecords().columns, np.array([0, 1]))
-        >>> columns = {**columns, "training_steps": np.array([8, 8])}
-        >>> columns = {**columns, "executed_steps": np.array([0, 50])}
-        >>> frames_curve(RoundRecords(columns), 4, 10_000)
-        {'training_steps': [32.0], 'frames': [5100.0], 'solved': [0.5], 'solved_frames': [200.0]}
-    """
-    columns = records.columns
-    out: dict[str, list[float]] = {}
-    for steps in np.unique(columns["training_steps"]):
-        here = columns["training_steps"] == steps
-        solved = columns["solved"][here].astype(bool)
-        frames = columns["executed_steps"][here] * frames_per_step
-        point = {
-            "training_steps": float(steps * frames_per_step),
-            "frames": float(np.where(solved, frames, max_frames).mean()),
-            "solved": float(solved.mean()),
-            "solved_frames": float(frames[solved].mean()) if solved.any() else float("nan"),
-        }
-        for name, value in point.items():
-            out.setdefault(name, []).append(value)
-    return out
+    save_figure(figure, path)
 
 
 def plot_frames_curves(
@@ -167,7 +125,8 @@ def plot_frames_curves(
     """Draw the mean frames of an episode and the share of mazes solved against training.
 
     Args:
-        curves: of :func:`frames_curve`, one per seed; the band is from the least to the largest.
+        curves: of :func:`~torchrl_hmcts.trainers.lab.evaluation.frames_curve`, one per seed; the
+            band is from the least to the largest.
         path: PNG to write.
         title: heading of the picture.
         script: mean frames of a script on the shortest path, in the same mazes.
@@ -214,7 +173,7 @@ def plot_search(search: Search, env: LabMazeEnv, path: str | Path, *, root: int 
     left.set_title("where the options led", fontsize=10, loc="left")
     tree.plot(root, ax=right, max_nodes=600, option_names=names)
     legend_below(figure, right.get_legend(), ncols=6)  # one for both
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def write_episode_gif(

@@ -6,7 +6,6 @@ import base64
 import html
 import json
 import math
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -226,7 +225,7 @@ def _width(path: Path) -> int:
             head = file.read(24)
     except OSError:
         return 0
-    return struct.unpack(">I", head[16:20])[0] if head[12:16] == b"IHDR" else 0
+    return int.from_bytes(head[16:20], "big") if head[12:16] == b"IHDR" else 0
 
 
 def _kind(cell: Any) -> str:

@@ -17,8 +17,8 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.planners import Search
 from torchrl_hmcts.planners.drawing import OPTION_COLORS, option_color
+from torchrl_hmcts.trainers.figures.pictures import save_figure
 
-_DPI = 110
 _MAX_NODES = 600  # of a tree in a picture
 
 
@@ -72,7 +72,7 @@ def plot_losses(history: Mapping[str, Sequence[float]], base_steps: int, path: P
             twin.set_ylabel("accuracy", color="#d97706", fontsize=9)
             twin.spines["top"].set_visible(False)
     figure.supxlabel("base steps", fontsize=10)
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def _draw_walls(axes: Axes, walls: Any) -> None:
@@ -142,7 +142,7 @@ def plot_skill_fan(
         axes.set_title(title, fontsize=10, loc="left")
     handles = [Line2D([], [], color=option_color(z), label=f"skill {z}") for z in range(num_skills)]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(8, num_skills))
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def legend_below(figure: Figure, legend: Legend, *, ncols: int) -> None:
@@ -189,4 +189,4 @@ def plot_search(search: Search, env: WaterworldMazeEnv, path: Path, *, root: int
     left.set_title("where the options led", fontsize=10, loc="left")
     tree.plot(root, ax=right, max_nodes=_MAX_NODES, option_names=names)
     legend_below(figure, right.get_legend(), ncols=6)  # one for both
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts import __version__
-from torchrl_hmcts.trainers.checkpoints import write_text
 from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.files import left_out, write_json, write_text
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "numpy")
 
@@ -44,6 +47,35 @@ def machine() -> dict[str, Any]:
     }
 
 
+@contextlib.contextmanager
+def finish(out: Path, title: str, metrics: Mapping[str, Any]) -> Iterator[Pictures]:
+    """Write what a run leaves: ``metrics.json`` first, then pictures, then the page.
+
+    What cannot be drawn or written is left out, with a line on stderr; the figures are printed
+    where ``metrics.json`` cannot be written, e.g. to a full disk.
+
+    Args:
+        out: folder of the run.
+        title: heading of the page.
+        metrics: figures by name.
+
+    Yields:
+        The pictures to draw.
+    """
+    written = False
+    with left_out("metrics.json"):
+        write_json(out / "metrics.json", metrics)
+        written = True
+    if not written:
+        print(json.dumps(metrics, indent=1, default=str))
+    pictures = Pictures(out)
+    with left_out("what was still to be drawn"):
+        yield pictures
+    with left_out("index.html"):
+        write_page(out / "index.html", title=title, metrics=metrics, pictures=pictures.captions)
+        print(f"Pictures and figures: {out / 'index.html'}")
+
+
 def write_page(
     path: Path, *, title: str, metrics: Mapping[str, Any], pictures: Mapping[str, str]
 ) -> None:
@@ -56,8 +88,7 @@ def write_page(
             ``"config"`` and ``"versions"`` are shown where there is no ``run.json``.
         pictures: caption of each picture file.
     """
-    content = {"title": title, "pictures": dict(pictures)}
-    write_text(path.parent / "page.json", json.dumps(content, indent=1) + "\n")
+    write_json(path.parent / "page.json", {"title": title, "pictures": dict(pictures)})
     run = RunFolder(path.parent)
     if any((path.parent / name).is_file() for name in ("run.json", "metrics.json")):
         run = read_run(path.parent)
@@ -83,10 +114,18 @@ def write_run_page(path: str | Path, out: str | Path | None = None) -> Path:
         ValueError: if it is no folder of a run.
     """
     run = read_run(path)
+    say_damage(run)
     file = run.path / "index.html" if out is None else Path(out)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_text(file, render_run(run, embed=out is not None))
     return file
+
+
+def say_damage(*runs: RunFolder) -> None:
+    """Say on stderr which files of runs cannot be read; their pages say so too."""
+    for run in runs:
+        for sentence in run.damage:
+            print(sentence, file=sys.stderr)
 
 
 def render_run(run: RunFolder, *, embed: bool = False) -> str:

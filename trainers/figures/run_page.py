@@ -20,6 +20,7 @@ from torchrl_hmcts.trainers.figures.page_parts import (
     table,
     text,
 )
+from torchrl_hmcts.trainers.files import left_out
 
 
 def run_page(run: RunFolder, *, embed: bool = False) -> str:
@@ -35,14 +36,17 @@ def run_page(run: RunFolder, *, embed: bool = False) -> str:
     pictures = [
         picture(run.path / file, words, embed=embed) for file, words in run.pictures.items()
     ]
-    panels = [
-        drawing(panel(name, {"": [curve]}), name)
-        for name, curve in run.curves.items()
-        if len(curve.steps) > 1
-    ]
+    panels: list[Html] = []
+    with left_out("the curves of the page"):
+        panels += [
+            drawing(panel(name, {"": [curve]}), name)
+            for name, curve in run.curves.items()
+            if len(curve.steps) > 1
+        ]
     return page(
         run.title or run.name,
         Html(f'<p class="lead">{text(_lead(run))}</p>'),
+        damage_of(run),
         grid(pictures, "pictures"),
         section("Figures", result_tables(run.metrics)),
         section("Evaluated again", *map(_evaluation, run.evaluations)),
@@ -50,6 +54,11 @@ def run_page(run: RunFolder, *, embed: bool = False) -> str:
         section("Config", config_table(run.experiment, run.config)),
         section("How it was made", made_by(run)),
     )
+
+
+def damage_of(run: RunFolder) -> Html:
+    """Return a sentence for each file of a run that cannot be read."""
+    return Html("".join(f'<p class="lead">Damaged: {text(words)}</p>' for words in run.damage))
 
 
 def result_tables(metrics: Mapping[str, Any]) -> Html:

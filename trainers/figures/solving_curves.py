@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
 
+from torchrl_hmcts.trainers.figures.pictures import save_figure
+
 CURVE_COLORS = ("#1d4ed8", "#d97706", "#16a34a", "#7c3aed")
-_DPI = 110
 
 Curve = Mapping[str, Any]
 
@@ -104,7 +105,7 @@ def save_curves(
         axes.spines[["top", "right"]].set_visible(False)
     figure.supxlabel(x_label, fontsize=10)
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def plot_solving_curves(

@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
-
 from torchrl_hmcts.trainers.figures.page_parts import Html, page, picture, section, table, text
+from torchrl_hmcts.trainers.figures.pictures import Pictures, save_figure
+from torchrl_hmcts.trainers.files import write_text
 
-_DPI = 110
 _COLOR = "#1d4ed8"
 
 
@@ -23,6 +21,8 @@ def plot_importances(importances: Mapping[str, float], path: str | Path) -> None
         path: PNG to write.
     """
     keys = sorted(importances, key=lambda key: importances[key])
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(6.4, 0.9 + 0.42 * len(keys)), layout="constrained")
     axes = figure.subplots()
     bars = axes.barh(keys, [importances[key] for key in keys], color=_COLOR, height=0.62)
@@ -31,7 +31,7 @@ def plot_importances(importances: Mapping[str, float], path: str | Path) -> None
     axes.set_xticks([])
     axes.spines[["top", "right", "bottom"]].set_visible(False)
     axes.set_title("importance of each key", fontsize=11, loc="left")
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def plot_trials(rows: Sequence[Mapping[str, Any]], path: str | Path, *, objective: str) -> None:
@@ -47,6 +47,9 @@ def plot_trials(rows: Sequence[Mapping[str, Any]], path: str | Path, *, objectiv
     best: list[float] = []
     for _, value in done:
         best.append(better(best[-1], value) if best else value)
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     numbers = [number for number, _ in done]
@@ -58,7 +61,7 @@ def plot_trials(rows: Sequence[Mapping[str, Any]], path: str | Path, *, objectiv
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9)
-    figure.savefig(path, dpi=_DPI)
+    save_figure(figure, path)
 
 
 def write_sweep_page(
@@ -84,14 +87,16 @@ def write_sweep_page(
         The page.
     """
     folder = Path(folder)
-    pictures = []
+    drawn = Pictures(folder)
     if any(row["value"] is not None for row in rows):
-        plot_trials(rows, folder / "trials.png", objective=objective)
-        pictures.append(picture(folder / "trials.png", "All finished trials.", embed=False))
+        with drawn.one("trials.png", "All finished trials.") as path:
+            plot_trials(rows, path, objective=objective)
     if importances:
-        plot_importances(importances, folder / "importances.png")
         words = "What sets the best trials apart from the others (PED-ANOVA)."
-        pictures.append(picture(folder / "importances.png", words, embed=False))
+        with drawn.one("importances.png", words) as path:
+            plot_importances(importances, path)
+    items = drawn.captions.items()
+    pictures = [picture(folder / name, words, embed=False) for name, words in items]
     keys = list(dict.fromkeys(key for row in rows for key in row["params"]))
     cells = []
     for row in rows:
@@ -107,13 +112,14 @@ def write_sweep_page(
         values = " ".join(f"{key}={value}" for key, value in best["params"].items())
         lead = f"Best: {objective.removeprefix('-')} = {best['value']:.6g} with {values}"
     file = folder / "index.html"
-    file.write_text(
+    write_text(
+        file,
         page(
             f"Sweep of {experiment}",
             Html(f'<p class="lead">{text(lead)}</p>'),
             Html('<div class="pictures">' + "".join(pictures) + "</div>"),
             section("Trials", table(cells, ["trial", "state", objective, *keys, "seconds"])),
             section("How it was made", Html(f"<pre>{text(command)}</pre>")),
-        )
+        ),
     )
     return file

@@ -103,7 +103,7 @@ def train_worker(
     make = _make_hmcts if config.algorithm == "hmcts" else _make_diayn
     trainer, tests = make(config, loss, save_dir, progress, logger)
     trainer.run_settings.update({name: getattr(config, name) for name in _KEPT})
-    if config.resume and save_dir is not None and any(Path(save_dir).glob("*")):
+    if config.resume and save_dir is not None and any(Path(save_dir).glob("checkpoint-*")):
         trainer.load(save_dir)
     trainer.train()
     if isinstance(tests, CurveTests) and config.keep == "best":

@@ -77,7 +77,7 @@ def _load_folder(folder: Path) -> TensorDictBase:
     data = TensorDict.load_memmap(storage, allow_pickle=False)
     filled = storage / "storage_metadata.json"
     if filled.is_file():
-        data = data[: json.loads(filled.read_text())["len"]]
+        data = data[: json.loads(filled.read_text(encoding="utf-8"))["len"]]
     return data
 
 
