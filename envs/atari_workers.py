@@ -18,8 +18,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
+
+from torchrl_hmcts.compiling import njit
 
 
 class OptionWorker(Protocol):
@@ -206,7 +207,7 @@ class SharedMLP:
         return int(_choose(ram, self._array, self._sizes, self._heads[option], self._logits, draw))
 
 
-@njit(cache=True)
+@njit()
 def _choose(
     ram: np.ndarray,
     weights: np.ndarray,
@@ -229,7 +230,7 @@ def _choose(
     return best  # rounding
 
 
-@njit(cache=True)
+@njit()
 def _logits(
     ram: np.ndarray, weights: np.ndarray, sizes: np.ndarray, head: int, out: np.ndarray
 ) -> None:
