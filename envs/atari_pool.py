@@ -69,10 +69,9 @@ class AtariOptionPool(EnvBase):
 
     A process that dies, is stopped or hangs for ``step_seconds`` is started again and its options
     run again; ``num_restarts`` counts them, ``num_frames`` counts all emulated frames, also those
-    that were lost. The processes start with the first step. A copy of a pool (pickled, or in a
-    forked process) has processes of its own; in a process that may have none, such as a worker of
-    a ``ParallelEnv`` or a ``DataLoader``, options run as with ``num_processes=0``. Threads take
-    turns.
+    that were lost. The processes start with the first step. A copy of a pool has processes of
+    its own; in a forked process, and in a worker of a ``ParallelEnv`` or a ``DataLoader``, which
+    may have none, options run as with ``num_processes=0``. Threads take turns.
 
     Writes, besides the entries of :class:`AtariRAMEnv`: ``"duration"`` (int64 ``[*B, 1]``, steps of
     ``frame_skip`` frames), ``"score"`` (float32 ``[*B, 1]``, :math:`\sum r_{i+1}`, undiscounted and
@@ -225,12 +224,13 @@ class AtariOptionPool(EnvBase):
         self._set_specs(emulator.states.width)
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
 
-    def _make_slots(self) -> None:
+    def _make_slots(self, forked: bool = False) -> None:
         """Begin with no step under way, in the process that this is."""
         self._owner, self._lock = os.getpid(), threading.RLock()
         width = self._emulator.states.width
         self._processes: EmulatorProcesses | None = None
-        if self.num_processes and not multiprocessing.current_process().daemon:
+        alone = forked or multiprocessing.current_process().daemon
+        if self.num_processes and not alone:
             self._processes = EmulatorProcesses(
                 self.num_processes,
                 width,
@@ -249,7 +249,7 @@ class AtariOptionPool(EnvBase):
     def _turn(self) -> Iterator[None]:
         """Let one thread at a time in; in a forked process, leave the slots to their owner."""
         if self._owner != os.getpid():
-            self._make_slots()
+            self._make_slots(forked=True)
         with self._lock:
             yield
 

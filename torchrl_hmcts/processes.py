@@ -142,8 +142,8 @@ def _advice(number: int) -> str:
         return "Raise the number of processes that this user may have (`ulimit -u`), or use fewer."
     folder = os.environ.get("TMPDIR") or tempfile.tempdir or "not set"
     return (
-        f"Look at the temporary folder (TMPDIR: {folder}), the memory and the limits (`ulimit -a`), "
-        "or choose another start_method."
+        f"Look at the temporary folder (TMPDIR: {folder}), the memory and the limits "
+        "(`ulimit -a`), or choose another start_method."
     )
 
 
