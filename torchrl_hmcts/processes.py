@@ -6,7 +6,6 @@ import contextlib
 import ctypes
 import errno
 import multiprocessing
-import multiprocessing.util
 import os
 import re
 import shutil
@@ -15,12 +14,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Hashable, Iterable, Iterator
+from multiprocessing.util import Finalize, get_temp_dir
 from typing import Any
 
 from torch import Tensor
 
 _SOCKET_BYTES = 107  # of a socket's path, on Linux; 103 on macOS
 _SOCKET_NAME = len("/listener-12345678")
+_SOCKET_FOLDERS = ("", "/tmp", "/var/tmp", "/dev/shm")
 _LONGEST_LOOK_AWAY = 2.0  # seconds
 _PR_SET_PDEATHSIG = 1
 
@@ -28,8 +29,8 @@ _PR_SET_PDEATHSIG = 1
 def start_context(method: str) -> Any:
     """Return multiprocessing's context; ``"spawn"`` where ``"forkserver"`` cannot have its socket.
 
-    The forkserver listens on a socket in the temporary folder, whose path may have 107 bytes. A
-    line on stderr says so where it cannot.
+    The forkserver listens on a socket whose path may have 107 bytes. Where ``TMPDIR`` is longer, is
+    full or cannot be written, the socket is put into another temporary folder.
 
     Args:
         method: ``"fork"``, ``"forkserver"`` or ``"spawn"``.
@@ -42,23 +43,26 @@ def start_context(method: str) -> Any:
         >>> start_context("spawn").get_start_method()
         'spawn'
     """
-    if method == "forkserver":
-        try:
-            folder = multiprocessing.util.get_temp_dir()
-            length = len(os.fsencode(folder)) + _SOCKET_NAME
-            limit = _SOCKET_BYTES if sys.platform == "linux" else _SOCKET_BYTES - 4
-            problem = "" if length <= limit else f"a socket's path may have {limit} bytes"
-        except OSError as error:
-            folder, problem = os.environ.get("TMPDIR", ""), str(error)
-        if problem:
-            method = "spawn"
-            print(
-                f"torchrl_hmcts: start_method='forkserver' cannot have a socket in TMPDIR={folder} "
-                f"({problem}); processes are started by 'spawn', which takes longer. Set TMPDIR to "
-                "a short path that can be written.",
-                file=sys.stderr,
-            )
+    if method == "forkserver" and not any(map(_fits_a_socket, _SOCKET_FOLDERS)):
+        method = "spawn"
     return multiprocessing.get_context(method)
+
+
+def _fits_a_socket(place: str) -> bool:
+    """Try a folder, the standard one if it is ``""``, for multiprocessing's sockets."""
+    limit = _SOCKET_BYTES if sys.platform == "linux" else _SOCKET_BYTES - 4
+    config: dict[str, Any] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
+    try:
+        folder = tempfile.mkdtemp(prefix="pymp-", dir=place) if place else get_temp_dir()
+        fits = len(os.fsencode(folder)) + _SOCKET_NAME <= limit
+        if place and fits:
+            config["tempdir"] = folder
+            Finalize(None, shutil.rmtree, args=(folder, True), exitpriority=-100)
+        elif place:
+            os.rmdir(folder)
+        return fits
+    except OSError:
+        return False
 
 
 def share(tensors: Iterable[Tensor], owner: str) -> None:
@@ -106,21 +110,24 @@ def system_errors(what: str) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, EOFError, RuntimeError, ValueError) as error:
-        number = error.errno if isinstance(error, OSError) else None
-        if isinstance(error, RuntimeError):  # torch spells the number: "... (28)"
-            found = re.search(r"\((\d+)\)", str(error))
-            number = int(found[1]) if found and "emory" in str(error) else None
-        if isinstance(error, ValueError) and "fds_to_keep" in str(error):  # a descriptor is missing
-            number = errno.EMFILE
-        if isinstance(error, EOFError):  # the process that starts the others has ended
-            number = errno.ECHILD
+    except (OSError, EOFError, RuntimeError) as error:
+        number = _number_of(error)
         if number is None:
             raise
         why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise OSError(
             number, f"{what}: {why or type(error).__name__}. {_advice(number)}"
         ) from error
+
+
+def _number_of(error: Exception) -> int | None:
+    """Return the system's number of an error, or None if the error is not the system's."""
+    if isinstance(error, OSError):
+        return error.errno
+    if isinstance(error, EOFError):  # the process that starts the others has ended
+        return errno.ECHILD
+    found = re.search(r"\((\d+)\)\W*$", str(error))  # torch spells it so: "... (28)"
+    return int(found[1]) if found and "memory" in str(error) else None
 
 
 def _advice(number: int) -> str:
