@@ -86,8 +86,9 @@ class A3CTrainer:
     A learner's exception, its death by a signal, ``step_seconds`` without a step (a process that
     is stopped, an env that hangs) or a gradient that is not finite ends the run: the others stop, a
     checkpoint is written, and :class:`LearnerError` names the learner and carries its traceback. If
-    T has been reached, a learner that does not answer is ended after 10 s, and the run ends well. Ctrl-C stops all, writes a checkpoint, says how to go on, and raises
-    ``KeyboardInterrupt``. If this process is killed, the learners notice and end.
+    T has been reached, a learner that does not answer is ended after 10 s, and the run ends well.
+    Ctrl-C stops all, writes a checkpoint, says how to go on, and raises ``KeyboardInterrupt``. If
+    this process is killed, the learners notice and end.
 
     A run goes on from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
     T, the learning rate's schedule and the curves are as they were. Not exact, and not meant to be:

@@ -54,6 +54,7 @@ class LearnerProcesses:
         if self.context.get_start_method() == "forkserver":
             # Imported once; learners then start within milliseconds.
             self.context.set_forkserver_preload(["__main__", run_learner.__module__])
+        self.silences: list[Silence] = []
         self.running: list[tuple[Any, Any]] = []  # process, end of a pipe with its traceback
 
     def start(self, payload: bytes, shared: SharedMemory, start_frames: int) -> None:
@@ -102,7 +103,8 @@ class LearnerProcesses:
         for i, (process, errors) in enumerate(self.running):
             if process.exitcode not in (None, 0):
                 raise self._error(i, process.exitcode, errors)
-        silent = self._silent(_STOP_SECONDS if enough else self.step_seconds)
+        patience = min(_STOP_SECONDS, self.step_seconds) if enough else self.step_seconds
+        silent = self._silent(patience)
         if silent and not enough:
             raise self._no_answer(silent[0])
         left = [i for i, (process, _) in enumerate(self.running) if process.exitcode is None]
@@ -167,8 +169,8 @@ class LearnerProcesses:
         else:
             how = "failed" if text else f"ended with exit code {exitcode} and no traceback"
         return LearnerError(
-            f"Learner {learner} of {self.number} {how} after {self._frames()} frames; the others were "
-            f"stopped.\n\n{text}",
+            f"Learner {learner} of {self.number} {how} after {self._frames()} frames; the others "
+            f"were stopped.\n\n{text}",
             learner=learner,
             exitcode=exitcode,
         )
