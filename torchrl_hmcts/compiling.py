@@ -11,7 +11,6 @@ import contextlib
 import hashlib
 import multiprocessing
 import os
-import pickle
 import stat
 import sys
 import tempfile
@@ -23,7 +22,12 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserWideCacheLocator
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    UserWideCacheLocator,
+)
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
@@ -128,8 +132,8 @@ class _CodeCache(FunctionCache):
                 )
 
 
-class _CodeFiles:
-    """A file with a checksum for each compiled version of a function, and no index.
+class _CodeFiles(IndexDataCacheFile):
+    """A file for each compiled version of a function, with a checksum at its end, and no index.
 
     Its name tells all that the code depends on, so processes that compile at once write either
     the same file or different ones.
@@ -141,6 +145,7 @@ class _CodeFiles:
         tag = sys.implementation.cache_tag
         self.base = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}.{tag}"
         self.base = self.base.replace("<", "").replace(">", "")
+        super().__init__(str(folder), self.base, None)
 
     def path(self, key: Any) -> Path:
         what = hashlib.sha256(repr((numba.__version__, key)).encode()).hexdigest()[:24]
@@ -153,19 +158,20 @@ class _CodeFiles:
         return digest.hexdigest()[:12]
 
     def load(self, key: Any) -> Any:
+        path = self.path(key)
         try:
-            content = self.path(key).read_bytes()
+            content = path.read_bytes()
         except FileNotFoundError:
             return None
-        digest, code = content[:_DIGEST], content[_DIGEST:]
-        return pickle.loads(code) if hashlib.sha256(code).digest() == digest else None
+        code, digest = content[:-_DIGEST], content[-_DIGEST:]
+        return self._load_data(path.name) if hashlib.sha256(code).digest() == digest else None
 
     def save(self, key: Any, data: Any) -> None:
         path, code = self.path(key), dumps(data)
         handle, temporary = tempfile.mkstemp(dir=self.folder, suffix=".tmp")
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(hashlib.sha256(code).digest() + code)
+                file.write(code + hashlib.sha256(code).digest())
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):
