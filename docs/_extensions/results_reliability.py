@@ -9,14 +9,22 @@ from results_tables import Section, table
 
 def kills(data: dict[str, Any]) -> str:
     rows = []
-    for name, run in data["runs"].items():
+    for name, run in data.get("runs", {"DIAYN": data}).items():
         same = run.get("same_figures", run.get("same_bits_as_the_unbroken_run"))
         lost = [run.get(key, 0) for key in ("not_continued", "went_back", "checkpoints_lost")]
         by = [run.get(f"by_{how}") for how in ("SIGKILL", "SIGTERM", "child")]
         by = by if by[0] is not None else [run["kills"], 0, 0]  # forks are killed
-        rows.append([name, run["kills"], *by, sum(lost), {None: "not promised"}.get(same, same)])
+        rows.append(
+            [
+                name,
+                run["kills"],
+                *by,
+                sum(lost),
+                {None: "not promised", True: "yes", False: "no"}[same],
+            ]
+        )
     head = ["run", "times ended", "SIGKILL", "SIGTERM", "a process of it", "lost", "same bits"]
-    return table(head, [*rows, ["all", data["kills"], "", "", "", data["lost"], ""]])
+    return table(head, [*rows, ["all", data["kills"], "", "", "", data.get("lost", 0), ""]])
 
 
 def environments(data: dict[str, Any]) -> str:
