@@ -30,9 +30,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 HMCTS = str(Path(sys.executable).with_name("hmcts"))
 SECONDS = 300  # in which a life ends, or hangs
-_OF_A_CLOCK = re.compile(
-    r"second|time|date|speed|commands|per_s|machine|versions|config|frames_all"
-)
+_OF_A_CLOCK = re.compile(r"second|time|date|speed|commands|per_s|machine|versions|config")
 
 
 @dataclass
@@ -154,6 +152,7 @@ def kill_run(run: Run, kills: int, folder: Path, rng: random.Random) -> dict[str
     whole = time.monotonic() - begin
     counts = dict.fromkeys(("SIGKILL", "SIGTERM", "child"), 0)
     result: dict[str, Any] = {"kills": 0, "not_continued": 0, "went_back": 0, "lives": 0}
+    result["processes_left"] = 0
     again, step = False, -1
     while True:
         words = [*run.words, f"out={place}"]
@@ -161,6 +160,7 @@ def kill_run(run: Run, kills: int, folder: Path, rng: random.Random) -> dict[str
             words = ["train", f"resume={place}"]
         process = start(words, log)
         result["lives"] += 1
+        how = ""
         begin = time.monotonic()
         if result["kills"] < kills:
             how = rng.choice(["SIGKILL", "SIGKILL", "SIGTERM", *["child"] * run.children])
@@ -172,10 +172,11 @@ def kill_run(run: Run, kills: int, folder: Path, rng: random.Random) -> dict[str
                 result["kills"] += 1
                 counts[how] += 1
         status = process.wait(SECONDS)
-        time.sleep(0.2)
-        for pid in of_session(process.pid):
-            if status == 0 or time.monotonic() - begin > SECONDS:
-                result["left"] = result.get("left", 0) + 1
+        time.sleep(5.0 if how == "SIGKILL" else 0.0)  # its processes notice
+        left = of_session(process.pid)
+        result["processes_left"] += len(left)
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
         found = newest_step(place)
         result["went_back"] += found < step
         step = max(step, found)
