@@ -26,6 +26,7 @@ from torchrl_hmcts.envs.atari_workers import OptionWorker
 from torchrl_hmcts.processes import (
     Silence,
     cpu_ticks,
+    need_descriptors,
     share,
     start_context,
     system_errors,
@@ -264,6 +265,7 @@ class EmulatorProcesses:
                 self._start()
 
     def _start(self) -> None:
+        need_descriptors(self.num_processes + 10)
         theirs: list[Any] = []
         ours: list[Any] = []
         try:

@@ -120,6 +120,31 @@ def system_errors(what: str) -> Iterator[None]:
         ) from error
 
 
+def need_descriptors(number: int) -> None:
+    """Raise at once if this process may not open so many more files.
+
+    Args:
+        number: of files, pipes included.
+
+    Raises:
+        OSError: with ``errno.EMFILE``; :func:`system_errors` says the fix.
+
+    Example:
+        >>> from torchrl_hmcts.processes import need_descriptors
+        >>> need_descriptors(3)
+    """
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        left = limit - len(os.listdir("/proc/self/fd"))
+    except (ImportError, OSError):  # not Linux
+        return
+    if left < number:
+        why = f"it needs {number} more files, and {left} are left"
+        raise OSError(errno.EMFILE, why)
+
+
 def _number_of(error: Exception) -> int | None:
     """Return the system's number of an error, or None if the error is not the system's."""
     if isinstance(error, OSError):

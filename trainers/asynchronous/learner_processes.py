@@ -10,7 +10,13 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import Any
 
-from torchrl_hmcts.processes import Silence, cpu_ticks, start_context, system_errors
+from torchrl_hmcts.processes import (
+    Silence,
+    cpu_ticks,
+    need_descriptors,
+    start_context,
+    system_errors,
+)
 from torchrl_hmcts.trainers.asynchronous.actor_learner import SharedMemory, run_learner
 
 _STOP_SECONDS = 10.0  # to finish a segment in, when the run is at its end
@@ -71,6 +77,7 @@ class LearnerProcesses:
             self._start(payload, shared, start_frames)
 
     def _start(self, payload: bytes, shared: SharedMemory, start_frames: int) -> None:
+        need_descriptors(2 * self.number + 10)
         for i in range(self.number):
             errors, send = self.context.Pipe(duplex=False)
             # Not daemons: those may not have processes of their own, as a ParallelEnv has.
