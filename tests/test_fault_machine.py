@@ -86,7 +86,10 @@ def damage(folder: Path, how: str) -> None:
         file.write_bytes({"flipped": bytes(content), "cut": content[:100], "empty": b""}[how])
 
 
-@pytest.mark.parametrize("how", ["flipped", "cut", "empty"])
+@pytest.mark.parametrize(
+    "how",
+    ["flipped", *(pytest.param(how, marks=pytest.mark.slow) for how in ("cut", "empty"))],
+)
 def test_a_damaged_file_of_compiled_code_is_compiled_again(tmp_path: Path, how: str) -> None:
     cache = tmp_path / "cache"
     assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n\n"
@@ -376,7 +379,15 @@ except Exception as error:
 
 
 @root_only
-@pytest.mark.parametrize("code", [A3C, POOL, NETWORK], ids=["a3c", "pool", "network"])
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param(A3C, marks=pytest.mark.slow),
+        pytest.param(POOL, marks=pytest.mark.slow),
+        NETWORK,
+    ],
+    ids=["a3c", "pool", "network"],
+)
 def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) -> None:
     done = python(code, "mount -t tmpfs -o size=16k tmpfs /dev/shm")
     assert done.stdout.startswith("OSError"), done
@@ -385,6 +396,7 @@ def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) 
 
 
 @linux
+@pytest.mark.slow
 @pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
 def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> None:
     begin = time.monotonic()
@@ -406,7 +418,7 @@ def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> No
 
 
 @linux
-@pytest.mark.parametrize("length", [10, 90, 200])
+@pytest.mark.parametrize("length", [10, pytest.param(90, marks=pytest.mark.slow), 200])
 def test_the_forkserver_has_a_socket_whatever_the_temporary_folder(
     tmp_path: Path, length: int
 ) -> None:
