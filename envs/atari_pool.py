@@ -70,8 +70,8 @@ class AtariOptionPool(EnvBase):
     A process that dies, is stopped or hangs for ``step_seconds`` is started again and its options
     run again; ``num_restarts`` counts them, ``num_frames`` counts all emulated frames, also those
     that were lost. The processes start with the first step. A copy of a pool has processes of
-    its own; in a forked process, and in a worker of a ``ParallelEnv`` or a ``DataLoader``, which
-    may have none, options run as with ``num_processes=0``. Threads take turns.
+    its own; in a forked process, and in one that may have none, such as a worker of a
+    ``DataLoader``, options run as with ``num_processes=0``. Threads take turns.
 
     Writes, besides the entries of :class:`AtariRAMEnv`: ``"duration"`` (int64 ``[*B, 1]``, steps of
     ``frame_skip`` frames), ``"score"`` (float32 ``[*B, 1]``, :math:`\sum r_{i+1}`, undiscounted and

@@ -560,7 +560,8 @@ def test_a_forked_process_steps_without_the_processes_of_its_parent() -> None:
     pool.close()
 
 
-def test_a_worker_of_a_parallel_env_has_a_pool_that_runs_options_itself() -> None:
+@pytest.mark.slow
+def test_a_worker_of_a_parallel_env_may_have_a_pool() -> None:
     make = partial(AtariOptionPool, "Pong", RepeatActions(2), max_steps=3, num_processes=2, seed=0)
     envs = ParallelEnv(2, make, mp_start_method="fork")
     try:

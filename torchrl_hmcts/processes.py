@@ -43,7 +43,8 @@ def start_context(method: str) -> Any:
         >>> start_context("spawn").get_start_method()
         'spawn'
     """
-    if method == "forkserver" and not any(map(_fits_a_socket, _SOCKET_FOLDERS)):
+    forked = multiprocessing.parent_process() is not None  # and may have its parent's forkserver
+    if method == "forkserver" and (forked or not any(map(_fits_a_socket, _SOCKET_FOLDERS))):
         method = "spawn"
     return multiprocessing.get_context(method)
 
