@@ -151,7 +151,7 @@ SITUATIONS = [
     Situation("Latin-1 output", environment={"PYTHONIOENCODING": "latin-1", "LANG": "C"}),
     Situation("clock of the year 2001", in_front="faketime '2001-01-01'", needs="faketime"),
     Situation("20 processes for this user", in_front="prlimit --nproc=20 setpriv --reuid=65534"),
-    Situation("3 GB of address space", "ulimit -v 3000000"),
+    Situation("8 GB of address space", "ulimit -v 8000000"),
 ]
 
 
