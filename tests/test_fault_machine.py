@@ -389,10 +389,14 @@ except Exception as error:
     ids=["a3c", "pool", "network"],
 )
 def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) -> None:
-    done = python(code, "mount -t tmpfs -o size=16k tmpfs /dev/shm")
+    done = python(
+        f"{code}import os; print('left', os.listdir('/dev/shm'))",
+        "mount -t tmpfs -o size=16k tmpfs /dev/shm",
+    )
     assert done.stdout.startswith("OSError"), done
     assert "/dev/shm has 16,384 bytes" in done.stdout
     assert "docker run --shm-size=" in done.stdout
+    assert done.stdout.endswith("left []\n")
 
 
 @linux

@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Hashable, Iterable, Iterator
 from multiprocessing.util import Finalize, get_temp_dir
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor
@@ -88,7 +89,12 @@ def share(tensors: Iterable[Tensor], owner: str) -> None:
     size = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
     with system_errors(f"{owner} cannot have {size:,} bytes of shared memory"):
         for tensor in tensors:
-            tensor.share_memory_()
+            try:
+                tensor.share_memory_()
+            except RuntimeError as error:  # torch leaves the file that it could not fill
+                if found := re.search(r"</(torch_\w+)>", str(error)):
+                    Path("/dev/shm", found[1]).unlink(missing_ok=True)
+                raise
 
 
 @contextlib.contextmanager
