@@ -37,6 +37,7 @@ class AtariEmulator:
     Raises:
         ImportError: if ale-py is not installed.
         ValueError: if there is no such game, or an argument is out of range.
+        OSError: if the game's file is missing or damaged.
     """
 
     def __init__(
@@ -52,14 +53,26 @@ class AtariEmulator:
         noop_max: int = 0,
     ) -> None:
         ale_py = _import_ale()
+        self._config = {
+            "game": game,
+            "frame_skip": frame_skip,
+            "repeat_action_probability": repeat_action_probability,
+            "full_action_space": full_action_space,
+            "max_frames": max_frames,
+            "mode": mode,
+            "difficulty": difficulty,
+            "noop_max": noop_max,
+        }
         self.game, rom = find_game(game)
         for name, value, low in (
             ("frame_skip", frame_skip, 1),
             ("max_frames", max_frames, 1),
             ("noop_max", noop_max, 0),
         ):
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"{self.game}: {name} is an int >= {low}; got {value!r}.")
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value < 2**31:
+                raise ValueError(
+                    f"{self.game}: {name} is an int >= {low} and < 2**31; got {value!r}."
+                )
         if not 0.0 <= repeat_action_probability < 1.0:
             raise ValueError(
                 f"{self.game}: repeat_action_probability is in [0, 1), 0.25 for sticky actions and "
@@ -78,7 +91,7 @@ class AtariEmulator:
         self.num_frames = 0
         """Frames emulated since construction, also those that set a state."""
         self.ale.setInt("random_seed", 0)
-        self.ale.loadROM(ale_py.roms.get_rom_path(rom))
+        self.ale.loadROM(_rom_path(rom))
         self._set_switches(mode, difficulty)
         self.ale.reset_game()
         actions = (
@@ -105,6 +118,15 @@ class AtariEmulator:
             raw = self._serialize()
         self._ending = self._state_type(raw)
         self._partial: bool | None = self.states.is_partial(raw)  # None: not known
+
+    def __getstate__(self) -> dict[str, Any]:
+        row = self.state(include_rng=True)
+        return {"config": self._config, "row": row, "num_frames": self.num_frames}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["config"])  # type: ignore[misc]
+        self.set_state(state["row"])
+        self.num_frames = state["num_frames"]
 
     def _set_switches(self, mode: int | None, difficulty: int | None) -> None:
         for name, value, offered in (
@@ -272,18 +294,40 @@ class AtariEmulator:
         return picture
 
 
+# Games for two, of which ALE ends the whole process when they are loaded for one player.
+_FOR_TWO = {"combat", "joust", "maze_craze", "warlords"}
+
+
 def find_game(game: str) -> tuple[str, str]:
     """Return a game's name as in Gymnasium and the name of its file, or raise a ValueError."""
     roms = _import_ale().roms.get_all_rom_ids()
-    names = {rom.title().replace("_", ""): rom for rom in roms}
+    names = {rom.title().replace("_", ""): rom for rom in roms if rom not in _FOR_TWO}
     asked = str(game).removeprefix("ALE/").removesuffix("-v5")
     plain = {name.lower(): name for name in names}
     found = plain.get(asked.replace("_", "").replace(" ", "").lower())
+    if found is None and asked.replace("_", "").replace(" ", "").lower() in {
+        rom.replace("_", "") for rom in _FOR_TWO
+    }:
+        raise ValueError(
+            f"{game!r} is a game for two players only; ale-py plays it for two or more. Choose one "
+            f"of the {len(names)} games for one player, e.g. Breakout, Pong, Seaquest."
+        )
     if found is None:
         near = difflib.get_close_matches(asked.replace("_", "").lower(), list(plain), 3, 0.4)
         hint = ", ".join(plain[name] for name in near) or "e.g. Breakout, Pong, Seaquest"
         raise ValueError(f"ale-py has no game {game!r}. Nearest: {hint}; it has {len(names)}.")
     return found, names[found]
+
+
+def _rom_path(rom: str) -> Any:
+    """Return a game's file, which ale-py has checked: of a bad one it ends the process."""
+    try:
+        return _import_ale().roms.get_rom_path(rom)
+    except OSError as error:
+        raise OSError(
+            f"ale-py's file of the game {rom} is missing or damaged ({error}). Install it again, "
+            "`pip install --force-reinstall ale-py`, or correct the folder in ALE_ROMS_DIR."
+        ) from error
 
 
 def _import_ale() -> Any:

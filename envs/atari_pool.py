@@ -6,9 +6,11 @@ Letters: *B batch of the tensordict, m its elements, T ``max_steps``.
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -65,9 +67,11 @@ class AtariOptionPool(EnvBase):
     ``determinised=False`` every call draws anew, for a planner that samples options more than once
     (``chance=ProgressiveWidening()``).
 
-    A process that dies is started anew and its options run again; ``num_restarts`` counts them,
-    ``num_frames`` counts all emulated frames, also those that were lost. The processes start with
-    the first step.
+    A process that dies, is stopped or hangs for ``step_seconds`` is started again and its options
+    run again; ``num_restarts`` counts them, ``num_frames`` counts all emulated frames, also those
+    that were lost. The processes start with the first step. A copy of a pool has processes of
+    its own; in a forked process, and in one that may have none, such as a worker of a
+    ``DataLoader``, options run as with ``num_processes=0``. Threads take turns.
 
     Writes, besides the entries of :class:`AtariRAMEnv`: ``"duration"`` (int64 ``[*B, 1]``, steps of
     ``frame_skip`` frames), ``"score"`` (float32 ``[*B, 1]``, :math:`\sum r_{i+1}`, undiscounted and
@@ -94,15 +98,21 @@ class AtariOptionPool(EnvBase):
             :class:`AtariRAMEnv`.
         repeat_action_probability (float): Default 0, for planning. To play under sticky actions
             make another pool with 0.25 and a seed that the planner does not know.
-        start_method ("forkserver" or "spawn"): how processes are started. Default forkserver. As
+        start_method ("forkserver" or "spawn"): how processes are started. Default forkserver, or
+            spawn where the path of the temporary folder (``TMPDIR``) is too long for it. As
             always with :mod:`multiprocessing`, a script needs ``if __name__ == "__main__":``.
+        step_seconds (float): longest time for one step of the worker and the emulator, seconds;
+            processes that neither step nor use the processor for so long are replaced. Default 60.
         batch_size (sequence of int): of ``reset()`` without a tensordict. Default none.
         seed (int, optional): of starts and of the draws inside options.
 
     Raises:
         ImportError: if ale-py is not installed.
         ValueError: if an argument is out of range; when stepping, if an option is.
-        RuntimeError: when stepping, if the worker raises an error.
+        RuntimeError: when stepping, if the worker raises an error, or processes die or hang again
+            and again.
+        OSError: if there is too little shared memory or too few file descriptors, or when stepping,
+            if processes cannot be started.
 
     Reference:
         Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999; dissertation, chapter 5.
@@ -146,6 +156,7 @@ class AtariOptionPool(EnvBase):
         difficulty: int | None = None,
         read_outs: Sequence[str] = ("ram", "observation"),
         start_method: Literal["forkserver", "spawn"] = "forkserver",
+        step_seconds: float = 60.0,
         batch_size: Sequence[int] = (),
         seed: int | None = None,
     ) -> None:
@@ -161,6 +172,8 @@ class AtariOptionPool(EnvBase):
                 "AtariOptionPool feeds its processes through POSIX pipes, which Windows has not. "
                 "Use num_processes=0 there, which emulates in the calling process."
             )
+        if not step_seconds > 0.0:
+            raise ValueError(f"AtariOptionPool needs step_seconds > 0; got {step_seconds}.")
         if not 0.0 < gamma <= 1.0:
             raise ValueError(f"AtariOptionPool needs a discount gamma in (0, 1]; got {gamma}.")
         if start_method not in ("forkserver", "spawn"):
@@ -202,21 +215,51 @@ class AtariOptionPool(EnvBase):
         self._run = run
         self._emulator = emulator
         self._drawing: AtariEmulator | None = None  # made when first needed
+        self._start_method, self._step_seconds = start_method, float(step_seconds)
         self._own_frames = np.zeros(1, np.int64)
-        self._processes: EmulatorProcesses | None = None
-        width = emulator.states.width
-        if num_processes:
-            self._processes = EmulatorProcesses(num_processes, width, run, worker, start_method)
-            self._slots = self._processes.slots
-        else:
-            self._slots = np.zeros(NUM_SLOTS, slot_type(width, run))
-        self._free = list(range(NUM_SLOTS))  # slots that no step under way uses
-        self._under_way: list[PendingStep] = []
+        self._make_slots()
         self.on_step: Callable[[TensorDictBase, TensorDictBase], object] | None = None
         """Called with what was stepped and what came of it, e.g. to keep what a search simulates
         (with ``record=True`` the steps inside the options, too)."""
-        self._set_specs(width)
+        self._set_specs(emulator.states.width)
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+
+    def _make_slots(self, forked: bool = False) -> None:
+        """Begin with no step under way, in the process that this is."""
+        self._owner, self._lock = os.getpid(), threading.RLock()
+        width = self._emulator.states.width
+        self._processes: EmulatorProcesses | None = None
+        alone = forked or multiprocessing.current_process().daemon
+        if self.num_processes and not alone:
+            self._processes = EmulatorProcesses(
+                self.num_processes,
+                width,
+                self._run,
+                self.worker,
+                self._start_method,
+                self._step_seconds,
+            )
+            self._slots = self._processes.slots
+        else:
+            self._slots = np.zeros(NUM_SLOTS, slot_type(width, self._run))
+        self._free = list(range(NUM_SLOTS))  # slots that no step under way uses
+        self._under_way: list[PendingStep] = []
+
+    @contextlib.contextmanager
+    def _turn(self) -> Iterator[None]:
+        """Let one thread at a time in; in a forked process, leave the slots to their owner."""
+        if self._owner != os.getpid():
+            self._make_slots(forked=True)
+        with self._lock:
+            yield
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k not in _OF_ONE_PROCESS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.on_step = None
+        self._make_slots()
 
     def _set_specs(self, width: int) -> None:
         shape = self.batch_size
@@ -268,6 +311,10 @@ class AtariOptionPool(EnvBase):
     # ---------------------------------------------------------------- playing
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        with self._turn():
+            return self._reset_alone(tensordict, **kwargs)
+
+    def _reset_alone(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
         shape = self.batch_size if tensordict is None else tensordict.batch_size
         to_state = bool(kwargs.get("set_state"))
         rows = self._rows(tensordict) if to_state else None
@@ -346,6 +393,10 @@ class AtariOptionPool(EnvBase):
         Raises:
             ValueError: if an option does not exist.
         """
+        with self._turn():
+            return self._begin_step(tensordict)
+
+    def _begin_step(self, tensordict: TensorDictBase) -> PendingStep:
         rows = self._rows(tensordict)
         options = _array(tensordict.get("option")).reshape(-1)
         count = len(rows)
@@ -391,7 +442,11 @@ class AtariOptionPool(EnvBase):
             raise ValueError(
                 "This step was begun by another pool; wait for it there, in ticket.pool."
             )
-        if ticket.used:
+        with self._turn():
+            return self._end_step(ticket)
+
+    def _end_step(self, ticket: PendingStep) -> TensorDictBase:
+        if ticket.used or ticket not in self._under_way:
             raise RuntimeError(
                 "This step was waited for before, and its outcome returned then, or given up. Call "
                 "step_async again to take another."
@@ -411,10 +466,11 @@ class AtariOptionPool(EnvBase):
 
         Blocks until its options have been run, unless the processes have been stopped.
         """
-        if ticket.pool is self and not ticket.used:
-            with contextlib.suppress(RuntimeError):
-                self._settle(ticket)
-            self._forget(ticket)
+        with self._turn():
+            if ticket.pool is self and not ticket.used and ticket in self._under_way:
+                with contextlib.suppress(RuntimeError):
+                    self._settle(ticket)
+                self._forget(ticket)
 
     def _make_room(self, count: int) -> None:
         """Wait for the oldest steps until so many slots are free."""
@@ -463,18 +519,25 @@ class AtariOptionPool(EnvBase):
 
     def render(self, tensordict: TensorDictBase) -> np.ndarray:
         """Return a state's picture, uint8 ``[210, 160, 3]``; see :meth:`AtariRAMEnv.render`."""
-        if self._drawing is None:
-            config = {**self._run.emulator, "frame_skip": 1, "repeat_action_probability": 0.0}
-            self._drawing = AtariEmulator(**config)
-        self._drawing.set_state(self._rows(tensordict)[0])
-        self._drawing.act(0)
-        return self._drawing.screen()
+        with self._turn():
+            if self._drawing is None:
+                config = {**self._run.emulator, "frame_skip": 1, "repeat_action_probability": 0.0}
+                self._drawing = AtariEmulator(**config)
+            self._drawing.set_state(self._rows(tensordict)[0])
+            self._drawing.act(0)
+            return self._drawing.screen()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Stop the processes."""
-        if self._processes is not None:
-            self._processes.stop()
+        if self._owner == os.getpid():
+            with self._lock:
+                if self._processes is not None:
+                    self._processes.stop()
         super().close(raise_if_closed=raise_if_closed)
+
+
+# What a copy in another process makes for itself.
+_OF_ONE_PROCESS = {"_owner", "_lock", "_processes", "_slots", "_free", "_under_way", "on_step"}
 
 
 def _array(tensor: Tensor) -> np.ndarray:

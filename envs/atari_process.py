@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import multiprocessing
 import os
 import select
 import signal
@@ -24,6 +23,15 @@ from torch import Tensor
 
 from torchrl_hmcts.envs.atari_emulator import AtariEmulator
 from torchrl_hmcts.envs.atari_workers import OptionWorker
+from torchrl_hmcts.processes import (
+    Silence,
+    cpu_ticks,
+    need_descriptors,
+    share,
+    start_context,
+    system_errors,
+    wake_with_parent,
+)
 
 NUM_SLOTS = 512
 """Options that can be under way at once; larger batches are run in several goes."""
@@ -31,6 +39,8 @@ NUM_SLOTS = 512
 _NUMBER = np.dtype("<i4")
 _MAX_MESSAGE = 4000  # of an error; what a pipe takes at once
 _DEATHS_IN_A_ROW = 5
+_SILENCES_IN_A_ROW = 2
+_LOOK_MILLISECONDS = 500
 _PRELOAD = __name__.replace("process", "preload")
 
 
@@ -160,6 +170,7 @@ class Channel:
 def serve(rank: int, run: OptionRun, worker: OptionWorker, channel: Channel) -> None:
     """Run options until the owner closes the pipe of jobs or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the owner's to handle
+    wake_with_parent()
     torch.set_num_threads(1)
     jobs, results = channel.jobs.fileno(), channel.results.fileno()
     try:
@@ -192,8 +203,9 @@ class EmulatorProcesses:
     """Runs the options in the slots on several processes.
 
     A process that dies, by a signal or a crash of the emulator, costs what was under way: all
-    processes are started anew, and the options without an outcome run again. An error that is
-    raised in a process, e.g. by the worker, is raised here.
+    processes are started again, and the options without an outcome run again. So does a process
+    that is stopped or hangs, after ``step_seconds``. An error that is raised in a process, e.g. by
+    the worker, is raised here.
 
     Args:
         num_processes: P.
@@ -202,8 +214,11 @@ class EmulatorProcesses:
         worker: sent to the processes once; what it shares with them (tensors in shared memory)
             stays shared.
         start_method: ``"forkserver"`` or ``"spawn"``.
+        step_seconds: longest time in which no process takes a step of its emulator, or uses any
+            processor time, while options are waited for.
 
     Raises:
+        OSError: if there is too little shared memory, or a process cannot be started.
         RuntimeError: in :meth:`wait`, if the worker fails or processes die again and again.
     """
 
@@ -214,17 +229,19 @@ class EmulatorProcesses:
         run: OptionRun,
         worker: OptionWorker,
         start_method: str = "forkserver",
+        step_seconds: float = 60.0,
     ) -> None:
-        self.num_processes = num_processes
+        self.num_processes, self.step_seconds = num_processes, step_seconds
         self.run, self.worker = run, worker
         self.num_restarts = 0
         """Processes that died and were started anew."""
-        self._context: Any = multiprocessing.get_context(start_method)
-        if start_method == "forkserver":  # imports once, so that a process starts in no time
+        self._context: Any = start_context(start_method)
+        if self._context.get_start_method() == "forkserver":  # imports once for all processes
             self._context.set_forkserver_preload([_PRELOAD])
         slot = slot_type(width, run)
-        memory = torch.zeros(NUM_SLOTS * slot.itemsize, dtype=torch.uint8).share_memory_()
-        frames = torch.zeros(num_processes, dtype=torch.int64).share_memory_()
+        memory = torch.zeros(NUM_SLOTS * slot.itemsize, dtype=torch.uint8)
+        frames = torch.zeros(num_processes, dtype=torch.int64)
+        share([memory, frames], "AtariOptionPool")
         self._memory = Channel(memory, frames)
         self.slots, self._frames = self._memory.views(slot)
         self._running: _Running | None = None
@@ -243,13 +260,23 @@ class EmulatorProcesses:
 
     def start(self) -> None:
         """Start the processes, if they do not run."""
-        if self._running is not None:
-            return
-        theirs, ours = [], []
-        for sent_by_us in (True, False, False):
-            reader, writer = self._context.Pipe(duplex=False)
-            theirs.append(reader if sent_by_us else writer)
-            ours.append(writer if sent_by_us else reader)
+        if self._running is None:
+            with system_errors(f"AtariOptionPool cannot start {self.num_processes} processes"):
+                self._start()
+
+    def _start(self) -> None:
+        need_descriptors(self.num_processes + 10)
+        theirs: list[Any] = []
+        ours: list[Any] = []
+        try:
+            for sent_by_us in (True, False, False):
+                reader, writer = self._context.Pipe(duplex=False)
+                theirs.append(reader if sent_by_us else writer)
+                ours.append(writer if sent_by_us else reader)
+        except OSError:
+            for end in (*theirs, *ours):
+                end.close()
+            raise
         channel = Channel(self._memory.slots, self._memory.frames, *theirs)
         running = _Running([], *ours)
         running.poll.register(running.results.fileno(), select.POLLIN)
@@ -289,14 +316,26 @@ class EmulatorProcesses:
                 "close(), so that it has no outcome. Take the step again."
             )
         try:
-            deaths = 0
+            deaths = silences = 0
+            silence = Silence()
             while not self._waiting.isdisjoint(slots):
                 before = len(self._waiting)
-                dead = self._listen()
-                deaths = len(dead) if len(self._waiting) < before else deaths + len(dead)
+                dead = self._listen(silence)
+                if len(self._waiting) < before:
+                    deaths = silences = 0
+                deaths += len(dead)
                 self.num_restarts += len(dead)
                 if self._running is not None or not self._waiting:
                     continue
+                silences += not dead
+                if silences >= _SILENCES_IN_A_ROW:
+                    raise RuntimeError(
+                        f"The processes of the pool took no step for {self.step_seconds:g} s, "
+                        f"{silences} times one after the other, so they were ended. If a step may "
+                        f"take longer, raise step_seconds; else look at what the worker waits for."
+                    )
+                if not dead:  # all that are stopped or hang cannot be told from those that wait
+                    self.num_restarts += 1
                 if deaths >= _DEATHS_IN_A_ROW:
                     raise RuntimeError(
                         f"{deaths} processes of the pool died one after the other without an "
@@ -315,12 +354,17 @@ class EmulatorProcesses:
         with contextlib.suppress(BrokenPipeError):  # all have died
             os.write(self._running.jobs.fileno(), np.array(slots, _NUMBER).tobytes())
 
-    def _listen(self) -> list[int | None]:
-        """Take what is done, an option at least, or stop all if one died; return exit codes."""
+    def _listen(self, silence: Silence) -> list[int | None]:
+        """Take what is done, or stop all if one died or all are silent; return exit codes."""
         running = self._running
         assert running is not None
         results = running.results.fileno()
-        ready = [fd for fd, _ in running.poll.poll()]
+        ready = [fd for fd, _ in running.poll.poll(_LOOK_MILLISECONDS)]
+        if not ready:
+            marks = (self.num_frames, *map(cpu_ticks, self.pids))
+            if silence.look(marks) >= self.step_seconds:
+                self._kill()
+            return []
         if results in ready:
             self._waiting.difference_update(_numbers(results))
         if ready == [results]:

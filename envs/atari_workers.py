@@ -18,8 +18,10 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
+
+from torchrl_hmcts.compiling import njit
+from torchrl_hmcts.processes import share
 
 
 class OptionWorker(Protocol):
@@ -90,6 +92,7 @@ class SharedMLP:
 
     Raises:
         ValueError: if a size is not positive, or the weights loaded have other shapes.
+        OSError: if there is too little shared memory.
 
     Reference:
         Dissertation, chapter 5: the Atari worker.
@@ -130,8 +133,9 @@ class SharedMLP:
         shapes = [(n, m) for n, m in zip(sizes[:-1], sizes[1:], strict=True)]
         shapes += [(sizes[-1], num_actions)] * num_options
         self._offsets = np.cumsum([0] + [n * m + m for n, m in shapes])
-        self.weights = torch.zeros(int(self._offsets[-1])).share_memory_()
-        """All weights, float32, in the order in which they are used."""
+        self.weights = torch.zeros(int(self._offsets[-1]))
+        """All weights, float32, in shared memory, in the order in which they are used."""
+        share([self.weights], "SharedMLP")
         self._prepare()
 
     def _prepare(self) -> None:
@@ -206,7 +210,7 @@ class SharedMLP:
         return int(_choose(ram, self._array, self._sizes, self._heads[option], self._logits, draw))
 
 
-@njit(cache=True)
+@njit()
 def _choose(
     ram: np.ndarray,
     weights: np.ndarray,
@@ -229,7 +233,7 @@ def _choose(
     return best  # rounding
 
 
-@njit(cache=True)
+@njit()
 def _logits(
     ram: np.ndarray, weights: np.ndarray, sizes: np.ndarray, head: int, out: np.ndarray
 ) -> None:

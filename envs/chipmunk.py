@@ -11,6 +11,8 @@ Letters: ``M`` mazes, ``H, W`` tiles of a maze, ``n`` discs moved by a call.
 from __future__ import annotations
 
 import math
+import os
+import threading
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -100,7 +102,8 @@ class ChipmunkMazes:
 
     followed by Chipmunk's contact impulses with friction and elasticity 0. The depth a disc has
     sunk into a wall is taken back within the same call (a second C step at rest), so that nothing
-    Chipmunk keeps between calls bears on the next result.
+    Chipmunk keeps between calls bears on the next result. Threads take turns, since Chipmunk
+    does not hold Python's lock, and a forked process builds a space of its own.
 
     Args:
         mazes: bool array ``[M, H, W]``, True where a tile is solid.
@@ -125,6 +128,7 @@ class ChipmunkMazes:
 
         self._pymunk = pymunk
         self._batch = batch
+        self._lock, self._process = threading.Lock(), os.getpid()
         self.mazes = np.ascontiguousarray(mazes, dtype=bool)
         self.radius = float(radius)
         self.time_step = float(time_step)
@@ -225,6 +229,18 @@ class ChipmunkMazes:
         Returns:
             The new ``(position, velocity)``, float32 arrays ``[n, 2]``.
         """
+        if self._process != os.getpid():  # the space may have been in the middle of a step
+            self.__setstate__(self.__getstate__())
+        with self._lock:
+            return self._step(maze_index, position, velocity, acceleration)
+
+    def _step(
+        self,
+        maze_index: npt.NDArray[np.int64],
+        position: Float32Array,
+        velocity: Float32Array,
+        acceleration: Float32Array,
+    ) -> tuple[Float32Array, Float32Array]:
         n = len(maze_index)
         if n == 0:
             return position.copy(), velocity.copy()

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from tensordict import TensorDictBase
 
+from torchrl_hmcts.compiling import njit
 from torchrl_hmcts.envs.lab_kernels import APPLES, SPAWN_HEADING
 from torchrl_hmcts.envs.lab_maze import LabMazeEnv
 from torchrl_hmcts.envs.lab_view import heading_degrees
@@ -91,7 +91,7 @@ def draw_first_person(
     return out
 
 
-@njit(cache=True)
+@njit()
 def _cast(image, depth, walls, x, y, angle, wide, pitch):
     """Draw floor, ceiling and walls; write the distance of each column's wall to ``depth``."""
     height, width, _ = image.shape
@@ -143,7 +143,7 @@ def _cast(image, depth, walls, x, y, angle, wide, pitch):
             image[row, column, 2] = blue * light
 
 
-@njit(cache=True)
+@njit()
 def _ball(image, depth, offset, angle, wide, pitch, radius, color):
     """Draw a ball at half the height of the walls, where no wall is nearer."""
     height, width, _ = image.shape

@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from torchrl_hmcts.compiling import njit
 
 f = np.float32
 
@@ -46,7 +47,7 @@ _MSEC = f(0.001)
 _REACH_WEST, _REACH_EAST, _REACH_Y = f(-50.0), f(44.0), f(36.0)
 
 
-@njit(cache=True)
+@njit()
 def _trace_box(px, py, qx, qy, west, east, south, north):
     """Where the way from p to q enters a box: (fraction, normal x, normal y); fraction 2: never."""
     enter, leave = f(-1.0), _ONE
@@ -80,7 +81,7 @@ def _trace_box(px, py, qx, qy, west, east, south, north):
     return f(2.0), nx, ny
 
 
-@njit(cache=True)
+@njit()
 def _trace(px, py, qx, qy, faces):
     """The first wall on the way from p to q: (fraction, normal x, normal y); 1 if there is none."""
     rows, columns = faces.shape
@@ -116,7 +117,7 @@ def _trace(px, py, qx, qy, faces):
     return best, nx, ny
 
 
-@njit(cache=True)
+@njit()
 def _slide(px, py, vx, vy, seconds, faces, planes):
     """Move for a time, sliding along what is in the way; returns position and velocity.
 
@@ -155,14 +156,14 @@ def _slide(px, py, vx, vy, seconds, faces, planes):
     return px, py, vx, vy
 
 
-@njit(cache=True)
+@njit()
 def _heading_units(yaw, spawn_heading):
     """The heading as the engine keeps it: 16 bits of a full turn, from -32,768."""
     units = (int(math.floor(yaw * f(65536.0 / 360.0) + f(0.5))) + spawn_heading) & 65535
     return units - 65536 if units >= 32768 else units
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def read_out(
     pairs,  # float32 [7, n, 2]: position, velocity and turned are read, the others written
     level,  # int64 [n, 7]
@@ -188,7 +189,7 @@ def read_out(
             pairs[6, i, axis] = f(-1.0) if nowhere else goal[axis] / CELL
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def advance(
     position,  # float32 [n, 2] x, y
     velocity,  # float32 [n, 2]
@@ -307,7 +308,7 @@ def advance(
     return -1
 
 
-@njit(cache=True)
+@njit()
 def _usable(m, position, velocity, action, faces, table):
     """Whether nothing would be read outside the arrays, nor a number that is none be carried on."""
     if not 0 <= m < faces.shape[0]:
@@ -322,7 +323,7 @@ def _usable(m, position, velocity, action, faces, table):
     return inside and abs(velocity[0]) < f(1e4) and abs(velocity[1]) < f(1e4)
 
 
-@njit(cache=True)
+@njit()
 def overlaps_wall(
     position,  # float32 [n, 2]
     maze_index,  # int64 [n]
@@ -356,13 +357,13 @@ def overlaps_wall(
     return out
 
 
-@njit(cache=True)
+@njit()
 def _touches(px, py, x, y):
     dx, dy = px - x, py - y
     return _REACH_WEST <= dx <= _REACH_EAST and -_REACH_Y <= dy <= _REACH_Y
 
 
-@njit(cache=True)
+@njit()
 def _wrap(degrees):
     """An angle modulo a full turn, from 0 to 360."""
     if degrees < _ZERO:

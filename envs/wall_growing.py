@@ -69,12 +69,9 @@ def _grow_walls(
 @lru_cache(maxsize=1)
 def _compiled_grow_walls() -> Callable[..., Any]:
     # numba takes a second to import; only generation needs it, not a pool read from the cache.
-    import numba
+    from torchrl_hmcts.compiling import njit
 
-    try:
-        return numba.njit(cache=True)(_grow_walls)
-    except RuntimeError:  # no writable folder for compiled code: compile in this process only
-        return numba.njit(_grow_walls)
+    return njit()(_grow_walls)
 
 
 def draw_mazes(

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import copy
+import multiprocessing
 import os
+import pickle
 import signal
+import sys
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +19,7 @@ import torch
 
 pytest.importorskip("ale_py", reason="the games come with ale-py: pip install ale-py")
 
+from torchrl.envs import ParallelEnv  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
 from torchrl_hmcts.envs import (  # noqa: E402
@@ -483,3 +490,81 @@ def test_an_option_that_does_not_exist_is_refused(worker):
 def test_a_network_of_other_shapes_is_refused():
     with pytest.raises(ValueError, match="parameters of the shapes"):
         SharedMLP(2, 4).load(SkillMLP(128, 4, 3, hidden=(128, 128, 128)).parameters())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="stops a process")
+def test_a_stopped_process_is_replaced_and_the_outcome_is_the_same() -> None:
+    pool = AtariOptionPool(
+        "Breakout", RepeatActions(4), max_steps=20, num_processes=1, seed=0, step_seconds=1.0
+    )
+    td = pool.reset().set("option", torch.tensor(1))
+    want = pool.step(td.clone())["next"]
+    (stopped,) = pool.pids
+    os.kill(stopped, signal.SIGSTOP)
+    begin = time.monotonic()
+    got = pool.step(td.clone())["next"]
+    assert time.monotonic() - begin < 30.0
+    assert got["emulator_state"].equal(want["emulator_state"])
+    assert pool.num_restarts == 1
+    assert stopped not in pool.pids
+    pool.close()
+
+
+class Sleeps:
+    """A worker whose steps never end in a process of a pool."""
+
+    num_options = 1
+
+    def act(self, ram, option, generator):
+        if multiprocessing.parent_process() is not None:
+            time.sleep(1e6)
+        return 0
+
+
+def test_processes_that_hang_again_and_again_are_an_error_that_names_step_seconds() -> None:
+    pool = AtariOptionPool("Pong", Sleeps(), max_steps=2, num_processes=1, seed=0, step_seconds=2.0)
+    with pytest.raises(RuntimeError, match="took no step for 2 s, 2 times .* step_seconds"):
+        pool.rollout(1)
+    pool.close()
+
+
+def test_threads_that_share_a_pool_get_what_they_would_in_turn() -> None:
+    pool = AtariOptionPool("Breakout", RepeatActions(4), max_steps=5, num_processes=2, seed=0)
+    roots = pool.reset().expand(4).clone().set("option", torch.arange(4))
+    want = pool.step(roots.clone())["next", "emulator_state"]
+    with ThreadPoolExecutor(4) as threads:
+        for got in threads.map(lambda _: pool.step(roots.clone()), range(8)):
+            assert got["next", "emulator_state"].equal(want)
+    pool.close()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_of_a_pool_steps_as_the_pool(copied) -> None:
+    pool = AtariOptionPool("Breakout", RepeatActions(4), max_steps=5, num_processes=0, seed=0)
+    td = pool.reset().set("option", torch.tensor(1))
+    want = pool.step(td.clone())["next", "emulator_state"]
+    assert copied(pool).step(td.clone())["next", "emulator_state"].equal(want)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_forked_process_steps_without_the_processes_of_its_parent() -> None:
+    pool = AtariOptionPool("Breakout", RepeatActions(4), max_steps=5, num_processes=1, seed=0)
+    td = pool.reset().set("option", torch.tensor(1))
+    want = pool.step(td.clone())["next", "emulator_state"]
+    child = os.fork()
+    if child == 0:
+        same = pool.step(td.clone())["next", "emulator_state"].equal(want)
+        os._exit(0 if same and not pool.pids else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    assert pool.step(td.clone())["next", "emulator_state"].equal(want)
+    pool.close()
+
+
+@pytest.mark.slow
+def test_a_worker_of_a_parallel_env_may_have_a_pool() -> None:
+    make = partial(AtariOptionPool, "Pong", RepeatActions(2), max_steps=3, num_processes=2, seed=0)
+    envs = ParallelEnv(2, make, mp_start_method="fork")
+    try:
+        assert envs.rollout(2)["next", "duration"].flatten().tolist() == [3] * 4
+    finally:
+        envs.close()

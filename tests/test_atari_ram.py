@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from functools import partial
 
 import numpy as np
@@ -269,3 +270,35 @@ def test_without_ale_py_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ale_py", None)
     with pytest.raises(ImportError, match="pip install ale-py"):
         AtariRAMEnv("Breakout")
+
+
+@pytest.mark.parametrize("game", ["Combat", "ALE/Joust-v5", "warlords", "MAZE_CRAZE", "maze craze"])
+def test_a_game_for_two_is_refused_where_ale_would_end_the_process(game: str) -> None:
+    with pytest.raises(ValueError, match="for two players only"):
+        AtariRAMEnv(game)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no game"])
+def test_a_missing_or_damaged_file_of_a_game_is_an_error(content, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("ALE_ROMS_DIR", str(tmp_path))
+    if content is not None:
+        (tmp_path / "pong.bin").write_bytes(content)
+    with pytest.raises(OSError, match="game pong is missing or damaged"):
+        AtariRAMEnv("Pong")
+
+
+def test_more_frames_than_the_emulator_can_count_are_refused() -> None:
+    with pytest.raises(ValueError, match="max_frames is an int"):
+        AtariRAMEnv("Pong", max_frames=2**31)
+
+
+@pytest.mark.parametrize("sticky", [0.0, 0.25])
+def test_a_pickled_env_plays_on_as_the_env(sticky: float) -> None:
+    env = AtariRAMEnv("Breakout", repeat_action_probability=sticky, noop_max=0, seed=0)
+    td = env.rollout(10)["next"][-1]
+    other = pickle.loads(pickle.dumps(env))
+    for _ in range(20):
+        td = td.exclude("reward").set("action", torch.tensor(1))
+        one, two = env.step(td.clone())["next"], other.step(td.clone())["next"]
+        assert one["emulator_state"].equal(two["emulator_state"])
+        td = one

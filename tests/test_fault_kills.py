@@ -1,7 +1,7 @@
 """A run that is killed again and again loses at most the work since its last checkpoint.
 
-``python tests/test_fault_kills.py FOLDER KILLS`` does it by itself and prints what happened. It
-imports everything once; each life of the run is a fork of that process.
+``python tests/test_fault_kills.py FOLDER KILLS KIND`` does it by itself and prints what happened;
+KIND is DIAYN (default) or HMCTS. It imports everything once; each life is a fork of that process.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ import pytest
 BATCH, TOTAL = 16, 16 * 400  # base steps; a checkpoint after every batch
 
 
-def make_trainer(folder: Path) -> Any:
+def make_hmcts(folder: Path) -> Any:
+    from test_hmcts_trainer import make_trainer as make_walk_trainer
+
+    return make_walk_trainer(rounds=10_000, retrain_interval=1, save_dir=folder)
+
+
+def make_trainer(folder: Path, kind: str = "DIAYN") -> Any:
     import torch
     from torchrl.envs import Compose, TransformedEnv
 
@@ -30,6 +36,8 @@ def make_trainer(folder: Path) -> Any:
     from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
     torch.manual_seed(1)
+    if kind == "HMCTS":
+        return make_hmcts(folder)
     base = WaterworldMazeEnv(batch_size=[8], observation=False, max_steps=10)
     env = TransformedEnv(base, Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()))
     loss = DIAYNTrainer.make_loss(env, 4, hidden=(8, 8), seed=0)
@@ -47,12 +55,14 @@ def make_trainer(folder: Path) -> Any:
     )
 
 
-def live(folder: Path, report: int, frames: int = TOTAL) -> None:
+def live(folder: Path, report: int, frames: int = TOTAL, kind: str = "DIAYN") -> None:
     """One life of the run: go on where it stood, and report every checkpoint that is written."""
-    trainer = make_trainer(folder)
+    trainer = make_trainer(folder, kind)
     if any(folder.glob("checkpoint-*")):
         trainer.load(folder)
-    trainer.total_frames = trainer.collector.total_frames = frames
+    trainer.total_frames = frames
+    if kind == "DIAYN":
+        trainer.collector.total_frames = frames
     rotation, save = trainer.checkpoint_rotation, trainer.checkpoint_rotation.save
 
     def save_and_report(*args: Any, **kwargs: Any) -> Path:
@@ -64,15 +74,17 @@ def live(folder: Path, report: int, frames: int = TOTAL) -> None:
     trainer.train()
 
 
-def weights(folder: Path) -> Any:
-    trainer = make_trainer(folder)
+def weights(folder: Path, kind: str) -> Any:
+    trainer = make_trainer(folder, kind)
     trainer.load(folder)
     state = {**trainer.loss_module.state_dict(), "frames": trainer.collected_frames}
     trainer.collector.shutdown()
     return state
 
 
-def kill_again_and_again(folder: Path, kills: int, seed: int = 0) -> dict[str, Any]:
+def kill_again_and_again(
+    folder: Path, kills: int, kind: str = "DIAYN", seed: int = 0
+) -> dict[str, Any]:
     import torch
 
     from torchrl_hmcts.trainers.checkpoints import find_damage, newest_checkpoint
@@ -88,7 +100,7 @@ def kill_again_and_again(folder: Path, kills: int, seed: int = 0) -> dict[str, A
             os.close(receive)
             status = 1
             try:
-                live(folder, report)
+                live(folder, report, kind=kind)
                 status = 0
             finally:
                 os._exit(status)
@@ -116,8 +128,8 @@ def kill_again_and_again(folder: Path, kills: int, seed: int = 0) -> dict[str, A
     end = last + 2 * BATCH
     resumed, unbroken = folder, folder.with_name("unbroken")
     for place in (resumed, unbroken):
-        live(place, report, end)
-    a, b = weights(resumed), weights(unbroken)
+        live(place, report, end, kind)
+    a, b = weights(resumed, kind), weights(unbroken, kind)
     same = a.keys() == b.keys() and all(
         torch.equal(a[k], b[k]) if isinstance(a[k], torch.Tensor) else a[k] == b[k] for k in a
     )
@@ -133,8 +145,8 @@ def kill_again_and_again(folder: Path, kills: int, seed: int = 0) -> dict[str, A
     }
 
 
-def run_killed(tmp_path: Path, kills: int) -> dict[str, Any]:
-    words = [sys.executable, __file__, str(tmp_path / "killed"), str(kills)]
+def run_killed(tmp_path: Path, kills: int, kind: str = "DIAYN") -> dict[str, Any]:
+    words = [sys.executable, __file__, str(tmp_path / "killed"), str(kills), kind]
     done = subprocess.run(words, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(done.stdout.splitlines()[-1])
@@ -147,8 +159,9 @@ def check(result: dict[str, Any], kills: int) -> None:
     assert result["same_bits_as_the_unbroken_run"]
 
 
-def test_a_run_killed_at_random_moments_ends_as_one_that_was_not(tmp_path: Path) -> None:
-    check(run_killed(tmp_path, 3), 3)
+@pytest.mark.parametrize("kind", ["DIAYN", "HMCTS"])
+def test_a_run_killed_at_random_moments_ends_as_one_that_was_not(tmp_path: Path, kind: str) -> None:
+    check(run_killed(tmp_path, 3, kind), 3)
 
 
 @pytest.mark.slow
@@ -161,4 +174,4 @@ def test_fifty_kills_lose_no_checkpoint(tmp_path: Path) -> None:
 if __name__ == "__main__":
     place = Path(sys.argv[1])
     place.mkdir(parents=True, exist_ok=True)
-    print(json.dumps(kill_again_and_again(place, int(sys.argv[2]))))
+    print(json.dumps(kill_again_and_again(place, int(sys.argv[2]), *sys.argv[3:4])))

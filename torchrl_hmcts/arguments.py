@@ -26,11 +26,16 @@ _INNER = {
     AttributeError,
     AssertionError,
     IndexError,
-    MemoryError,
     OverflowError,
     RuntimeError,
     ZeroDivisionError,
 }
+# What torch and numba raise as RuntimeError, though no argument is wrong.
+_OF_THE_SYSTEM = re.compile(
+    r"memory|No space left|Too many open files|Resource temporarily|cannot cache|"
+    r"CUDA error|cuda(?:rt)? error|device-side|NCCL|Permission denied|Read-only|\[Errno ",
+    re.IGNORECASE,
+)
 
 
 def name_arguments(cls: T) -> T:
@@ -139,7 +144,7 @@ def _explain(
     if type(error).__module__.startswith("torchrl_hmcts"):  # an error of our own says it all
         return None
     outward = isinstance(error, (TypeError, ValueError))
-    if not outward and type(error) not in _INNER:
+    if not outward and (type(error) not in _INNER or _is_of_the_system(error)):
         return None
     try:
         given = _given(init, args, kwargs)
@@ -169,6 +174,17 @@ def _explain(
         return None
     shown = ", ".join(f"{name}={_show(value)}" for name, value in given.items())
     return ValueError(f"{owner} cannot be built with {shown}: {type(error).__name__}: {message}")
+
+
+def _is_of_the_system(error: BaseException | None) -> bool:
+    """Whether the system's lack, rather than an argument, was the error or its cause."""
+    while error is not None:
+        if isinstance(error, (OSError, MemoryError, ImportError)):
+            return True
+        if isinstance(error, RuntimeError) and _OF_THE_SYSTEM.search(str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _is_explained(error: Exception) -> bool:

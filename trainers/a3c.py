@@ -18,6 +18,7 @@ from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 
 from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.processes import share
 from torchrl_hmcts.trainers.asynchronous.actor_learner import (
     ActorLearner,
     LearnerSettings,
@@ -83,10 +84,12 @@ class A3CTrainer:
     ``eval_x``
     ======================  =======================================================  ============
 
-    A learner's exception, its death by a signal or a gradient that is not finite ends the run: the
-    others stop, a checkpoint is written, and :class:`LearnerError` names the learner and carries
-    its traceback. Ctrl-C stops all, writes a checkpoint, says how to go on, and raises
-    ``KeyboardInterrupt``. If this process is killed, the learners notice and end.
+    A learner's exception, its death by a signal, ``step_seconds`` without a step (a process that
+    is stopped, an env that hangs) or a gradient that is not finite ends the run: the others stop, a
+    checkpoint is written, and :class:`LearnerError` names the learner and carries its traceback. If
+    T has been reached, a learner that does not answer is ended after 10 s, and the run ends well.
+    Ctrl-C stops all, writes a checkpoint, says how to go on, and raises ``KeyboardInterrupt``. If
+    this process is killed, the learners notice and end.
 
     A run goes on from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
     T, the learning rate's schedule and the curves are as they were. Not exact, and not meant to be:
@@ -139,10 +142,13 @@ class A3CTrainer:
         start_method (str): ``"spawn"`` (default) starts each learner as a new interpreter, which
             takes some seconds; ``"forkserver"`` imports once for all, and keeps that process for
             the next run; ``"fork"`` is immediate, but unsafe once this process has threads.
+        step_seconds (float): longest time for one step of a learner's env, seconds; a learner that
+            neither steps nor uses the processor for so long does not answer. Default 60.
 
     Raises:
         ValueError: if a number is out of range, or the loss does not reduce to one number.
         TypeError: if the loss has no actor, or the optimiser cannot be shared.
+        OSError: if there is too little shared memory or too few file descriptors.
 
     Reference:
         Mnih et al., "Asynchronous methods for deep reinforcement learning", 2016, arXiv 1602.01783;
@@ -192,6 +198,7 @@ class A3CTrainer:
         progress: Callable[..., Any] | None = None,
         seed: int = 0,
         start_method: str = "spawn",
+        step_seconds: float = 60.0,
     ) -> None:
         eval_interval = max(1, total_frames // 10) if eval_interval is None else eval_interval
         save_interval = max(1, total_frames // 10) if save_interval is None else save_interval
@@ -206,6 +213,8 @@ class A3CTrainer:
         ):
             if value < least:
                 raise ValueError(f"A3CTrainer needs {name} >= {least}; got {value}.")
+        if not step_seconds > 0.0:
+            raise ValueError(f"A3CTrainer needs step_seconds > 0; got {step_seconds}.")
         if clip_norm is not None and not clip_norm > 0.0:
             raise ValueError(
                 f"A3CTrainer needs clip_norm > 0, or None to leave gradients as they are; got "
@@ -253,10 +262,10 @@ class A3CTrainer:
         columns = board_columns(loss_module)
         board = torch.zeros(max(1, num_learners), len(columns), dtype=torch.float64)
         stop = torch.zeros(1, dtype=torch.uint8)
-        self.shared = SharedMemory(
-            parameters, self.optimizer, board.share_memory_(), stop.share_memory_()
-        )
-        self.learners = LearnerProcesses(num_learners, start_method)
+        steps = torch.zeros(len(board), dtype=torch.int64)
+        share([board, stop, steps], "A3CTrainer")
+        self.shared = SharedMemory(parameters, self.optimizer, board, stop, steps)
+        self.learners = LearnerProcesses(num_learners, start_method, step_seconds)
         self.evaluate, self.stop_when = evaluate, stop_when
         self.log, self.progress = LearnerLog(board, columns, logger), progress
         self.run_settings = {"trainer": "A3CTrainer", "loss_module": type(loss_module).__name__}
@@ -389,7 +398,7 @@ class A3CTrainer:
     def _watch(self) -> None:
         start = self.frames
         self.learners.start(cloudpickle.dumps(self.settings), self.shared, start)
-        while not self.learners.wait(_POLL_SECONDS):
+        while not self.learners.wait(_POLL_SECONDS, self.frames >= self.settings.total_frames):
             if self.frames == start:  # they are still importing
                 self.log.restart_clock()
             elif self._report():

@@ -8,16 +8,41 @@ from results_tables import Section, table
 
 
 def kills(data: dict[str, Any]) -> str:
-    lines = {
-        "times the run was killed": "kills",
-        "of these while it wrote a checkpoint": "killed_while_writing_a_checkpoint",
-        "checkpoints written": "checkpoints_written",
-        "damaged checkpoints": "damaged_checkpoints",
-        "checkpoints lost": "checkpoints_lost",
-    }
-    same = "the same bits as" if data["same_bits_as_the_unbroken_run"] else "other bits than"
-    rows = [[text, data[key]] for text, key in lines.items()]
-    return table(["", "count"], rows) + f"\nIt ended with {same} the run that was not killed.\n"
+    rows = []
+    for name, run in data.get("runs", {"DIAYN": data}).items():
+        same = run.get("same_figures", run.get("same_bits_as_the_unbroken_run"))
+        lost = [run.get(key, 0) for key in ("not_continued", "went_back", "checkpoints_lost")]
+        by = [run.get(f"by_{how}") for how in ("SIGKILL", "SIGTERM", "child")]
+        by = by if by[0] is not None else [run["kills"], 0, 0]  # forks are killed
+        rows.append(
+            [
+                name,
+                run["kills"],
+                *by,
+                sum(lost),
+                {None: "not promised", True: "yes", False: "no"}[same],
+            ]
+        )
+    head = ["run", "times ended", "SIGKILL", "SIGTERM", "a process of it", "lost", "same bits"]
+    return table(head, [*rows, ["all", data["kills"], "", "", "", data.get("lost", 0), ""]])
+
+
+def environments(data: dict[str, Any]) -> str:
+    actions = ["import", "plan", "demo", "a3c", "pool"]
+    rows, notes = [], []
+    for what, row in data["situations"].items():
+        if "skipped" in row:
+            rows.append([what, f"not tried: {row['skipped']}", "", "", "", ""])
+            continue
+        cells = []
+        for action in actions:
+            tried = row.get(action, {})
+            result = tried.get("result", "")
+            cells.append("error" if result.startswith("status") else result)
+            if "says" in tried:
+                notes.append(f"- {what}, {action}: `{tried['says'][:300].replace('`', ' ')}`")
+        rows.append([what, *cells])
+    return table(["machine", *actions], rows) + "\n" + "\n".join(notes) + "\n"
 
 
 def fuzz(data: dict[str, Any]) -> str:
@@ -100,7 +125,8 @@ def _counts(data: dict[str, Any]) -> list[int]:
 
 
 RELIABILITY = (
-    Section("A run that is killed", "reliability/kills.json", kills),
+    Section("Runs that are killed", "reliability/kills.json", kills),
+    Section("Machines that lack something", "reliability/environments.json", environments),
     Section("Faults, resumed and repeated runs", "reliability/tests.json", tests),
     Section("A Ray cluster whose processes die", "reliability/ray.json", ray),
     Section("Senseless input", "reliability/fuzz.json", fuzz),

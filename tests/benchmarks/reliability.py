@@ -1,7 +1,7 @@
 """Counts of faults survived, cases fuzzed, runs resumed and contracts kept, for docs/results.
 
     python tests/benchmarks/reliability.py                    (all but the slow ones)
-    python tests/benchmarks/reliability.py kills --kills 50
+    python tests/benchmarks/reliability.py kills              (60, of every experiment)
     python tests/benchmarks/reliability.py damage             (1,000 damaged files of each kind)
     python tests/benchmarks/reliability.py fuzz --slow        (100,000 cases)
     python tests/benchmarks/reliability.py ray                (kills processes of a Ray cluster)
@@ -97,14 +97,8 @@ def run_pytest(*words: str, **environment: str) -> dict[str, Any]:
 
 
 def kills(number: int) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(
-            [sys.executable, "tests/test_fault_kills.py", f"{folder}/run", str(number)],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            text=True,
-            check=True,
-        )
+    command = [sys.executable, "tests/benchmarks/kills.py", "--kills", str(number)]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -163,7 +157,7 @@ def main() -> None:
     parser.add_argument(
         "parts", nargs="*", help=f"of {', '.join(PARTS)}; default: all but {SEPARATE}"
     )
-    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--damaged", type=int, default=1_000, help="files of each kind")
     parser.add_argument("--slow", action="store_true", help="fuzz 100,000 cases")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "reliability")

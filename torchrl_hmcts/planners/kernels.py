@@ -7,9 +7,6 @@ plain Python under ``NUMBA_DISABLE_JIT=1``, for a debugger.
 
 Those that allocate nothing are compiled without reference counts (``_nrt=False``, as numba
 compiles its own string functions): counting the views of arrays took a third of a descent's time.
-
-They share one file, long as it is, because numba's cache looks at the file of the compiled function
-only: an inner function kept elsewhere could change and its callers would not notice.
 """
 
 # numba compiles these functions; it does not read annotations as strings.
@@ -18,6 +15,7 @@ import math
 import numba
 import numpy as np
 
+from torchrl_hmcts.compiling import njit
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     EDGE,
@@ -75,7 +73,7 @@ _MAX_REVISITS = 10_000
 # ------------------------------------------------------------------------------ choosing an option
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def exploration(s, total):
     """The part of the exploration term that all options of a node share, after ``total`` visits."""
     if s["score"] == PUCT_SCORE:
@@ -88,7 +86,7 @@ def exploration(s, total):
     return math.log(total + 1.0)
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def fill_factors(settings):
     """Fill the table of :func:`exploration`, whose logarithm costs as much as an option's score."""
     s = settings[0]
@@ -152,12 +150,12 @@ def _best_option(nodes, edges, root, s, gumbel, b, n, revisit):
     return best
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def _log(p):
     return math.log(p) if p > 0.0 else -np.inf
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def _completion(nodes, edges, s, n):
     """The mixed value of a node, and the lowest value and the scale of sigma(Q) of its options."""
     visits, most, seen, weighted = 0, 0, 0.0, 0.0
@@ -185,7 +183,7 @@ def _sigma(edge, mixed, low, scale):
     return scale * ((edge["value"] if edge["visits"] > 0 else mixed) - low)
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def _gumbel_option(nodes, edges, s, gumbel, b, n):
     num_options = edges.shape[-1]
     mixed, low, scale = _completion(nodes, edges, s, n)
@@ -388,7 +386,7 @@ def _revisit(nodes, edges, root, s, n):
     root["revisits"] += 1
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def select(nodes, edges, roots, settings, gumbel, wave):
     """Descend to the leaves of every active root; return how many outcomes to simulate.
 
@@ -468,7 +466,7 @@ def _is_untried(edge):
     return not edge["closed"] and edge["child"] < 0 and edge["in_flight"] == 0
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def extend(nodes, edges, roots, settings, ended, draws, wave):
     """Schedule an option of each new node ``ended``, by its prior; return how many there are.
 
@@ -510,7 +508,7 @@ def extend(nodes, edges, roots, settings, ended, draws, wave):
     return count
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def cancel(nodes, edges, settings, wave):
     """Forget a wave that was selected and will never be inserted."""
     s = settings[0]
@@ -559,7 +557,7 @@ def _write_node(nodes, edges, n, parent, option, value, priors, masks, i):
     node["open_options"] = opened
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def add_roots(nodes, edges, roots, rows, values, closed, priors, masks):
     """Write node 0 of the roots ``rows`` and forget all that was known of them."""
     for i in range(rows.shape[0]):
@@ -587,7 +585,7 @@ def add_roots(nodes, edges, roots, rows, values, closed, priors, masks):
         root["highest"] = -np.inf
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def begin(roots, limit):
     """Count what is spent from 0, up to a number of simulations."""
     for b in range(roots.shape[0]):
@@ -721,7 +719,7 @@ def _arrived(nodes, edges, roots, s, wave, count):
             _release(nodes[b], edges[b], n)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def number_nodes(roots, rows):
     """The numbers that :func:`insert` will give to the nodes of a wave of roots ``rows``."""
     numbers = np.empty(rows.shape[0], np.int64)
@@ -732,7 +730,7 @@ def number_nodes(roots, rows):
     return numbers
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def insert(
     nodes,
     edges,
@@ -795,7 +793,7 @@ def insert(
             _close(tree, links, new)
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def advance(
     nodes, edges, roots, settings, gumbel, wave, masks, stored, states, count,
     rewards, discounts, values, priors, new_states,
@@ -877,7 +875,7 @@ def handle(nodes, edges, roots, settings, gumbel, wave, masks, stored, states):
     return np.array([*addresses, *sizes], np.int64)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def advance_at(at, count, rewards, discounts, values, priors, embedding):
     """:func:`advance` with its lasting arrays behind one handle: a third of the call's cost."""
     num_roots, capacity, num_options = at[9], at[10], at[11]
@@ -905,7 +903,7 @@ def advance_at(at, count, rewards, discounts, values, priors, embedding):
 # ------------------------------------------------------------------------- reopening and re-rooting
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def reopen(trees, links, b, n):
     """Undo the pruning of node ``n``: it and its ancestors may be searched again."""
     nodes, edges = trees[b], links[b]
@@ -923,7 +921,7 @@ def reopen(trees, links, b, n):
         n = parent
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def reroot(trees, links, roots, b, root, kept):
     """Make node ``root`` the root and move its subtree to the front, in place.
 
@@ -982,7 +980,7 @@ def reroot(trees, links, roots, b, root, kept):
     return count
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def solve(trees, links, roots, b, tolerance, max_sweeps):
     """Sweep over a finished tree with twins until every value is that of its best option."""
     nodes, edges = trees[b], links[b]
@@ -1007,7 +1005,7 @@ def solve(trees, links, roots, b, tolerance, max_sweeps):
     return False
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def still_active(
     nodes, roots, active, expansions, base_steps, num_nodes, until_plan, improve, kept, stuck
 ):
@@ -1038,13 +1036,13 @@ def still_active(
 # ------------------------------------------------------- for descents that are controlled by Python
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def release_all(nodes, edges, rows, leaves):
     for i in range(rows.shape[0]):
         _release(nodes[rows[i]], edges[rows[i]], leaves[i])
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def revisit_all(nodes, edges, roots, settings, rows, leaves):
     for i in range(rows.shape[0]):
         _release(nodes[rows[i]], edges[rows[i]], leaves[i])
@@ -1052,13 +1050,13 @@ def revisit_all(nodes, edges, roots, settings, rows, leaves):
         _revisit(nodes[b], edges[b], roots[b], settings[0], leaves[i])
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def refresh_all(nodes, edges, rows, leaves):
     for i in range(rows.shape[0]):
         _refresh_twins(nodes[rows[i]], edges[rows[i]], leaves[i])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def wants_samples(edges, settings, rows, leaves, options):
     wants = np.zeros(rows.shape[0], np.bool_)
     for i in range(rows.shape[0]):
@@ -1067,7 +1065,7 @@ def wants_samples(edges, settings, rows, leaves, options):
     return wants
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def outcomes(nodes, rows, first):
     chosen = first.copy()
     for i in range(rows.shape[0]):
@@ -1076,7 +1074,7 @@ def outcomes(nodes, rows, first):
     return chosen
 
 
-@numba.njit(cache=True, error_model="numpy", _nrt=False)
+@njit(error_model="numpy", _nrt=False)
 def completed_values(nodes, edges, settings, b, n, out):
     """Write sigma(Q) of the options of a node, unvisited ones completed by the mixed value."""
     mixed, low, scale = _completion(nodes[b], edges[b], settings[0], n)

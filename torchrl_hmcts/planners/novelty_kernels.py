@@ -10,8 +10,9 @@ root has room for.
 # numba compiles these functions; it does not read annotations as strings.
 import math
 
-import numba
 import numpy as np
+
+from torchrl_hmcts.compiling import njit
 
 # What the radius test knows of a root.
 RADIUS_ROOT = np.dtype(
@@ -38,18 +39,18 @@ _MARGIN = 1.0 + 1e-6
 # ------------------------------------------------------------------------------- distant states
 
 
-@numba.njit(cache=True)
+@njit()
 def _cell(x, edge):
     return int(min(max(np.floor(x / edge), -_FURTHEST), _FURTHEST))
 
 
-@numba.njit(cache=True)
+@njit()
 def _bucket(i, j, k, num_buckets):
     mixed = (i * 73856093) ^ (j * 19349663) ^ (k * 83492791)
     return (((mixed & 0x7FFFFFFF) * 2654435761) >> 16) & (num_buckets - 1)
 
 
-@numba.njit(cache=True)
+@njit()
 def _is_finite(states, i):
     for f in range(states.shape[1]):
         if not math.isfinite(states[i, f]):
@@ -57,7 +58,7 @@ def _is_finite(states, i):
     return True
 
 
-@numba.njit(cache=True)
+@njit()
 def _link(seen, links, heads, root, b, j):
     """Put accepted state ``j`` into its cell; one that is not finite is near none."""
     if not _is_finite(seen[b], j):
@@ -73,7 +74,7 @@ def _link(seen, links, heads, root, b, j):
     heads[b, bucket] = j
 
 
-@numba.njit(cache=True)
+@njit()
 def _choose_axes(seen, root, b):
     """Span the grid by the three features that vary most; a distance in them is a lower bound."""
     num_features = seen.shape[2]
@@ -98,7 +99,7 @@ def _choose_axes(seen, root, b):
     root["axis0"], root["axis1"], root["axis2"] = order[0], order[1], order[2]
 
 
-@numba.njit(cache=True)
+@njit()
 def _build_grid(seen, links, heads, root, b):
     """Sort the accepted states of a root into cells twice as wide as its radius."""
     root["cell"] = 2.0 * root["radius"]
@@ -108,7 +109,7 @@ def _build_grid(seen, links, heads, root, b):
         _link(seen, links, heads, root, b, j)
 
 
-@numba.njit(cache=True)
+@njit()
 def _is_near(features, i, seen, b, j, limit):
     distance = 0.0
     for f in range(features.shape[1]):
@@ -117,7 +118,7 @@ def _is_near(features, i, seen, b, j, limit):
     return distance < limit
 
 
-@numba.njit(cache=True)
+@njit()
 def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_enough):
     """The fewest base steps of the accepted states within the radius, -1 if there is none."""
     limit = root["radius"] * root["radius"]
@@ -158,7 +159,7 @@ def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_
     return fewest
 
 
-@numba.njit(cache=True)
+@njit()
 def accept_distant(
     seen, seen_steps, links, heads, known, tally, roots, features, base_steps, shorter_by,
     accepted, first,
@@ -201,7 +202,7 @@ def accept_distant(
 # ------------------------------------------------------------------------------------ new values
 
 
-@numba.njit(cache=True)
+@njit()
 def accept_new_bytes(counts, limits, tally, roots, features, accepted):
     """Accept, in order, the states with a byte whose value ``counts [B, F, 256]`` has seldom."""
     for i in range(roots.shape[0]):
@@ -220,7 +221,7 @@ def accept_new_bytes(counts, limits, tally, roots, features, accepted):
             tally[0] += 1
 
 
-@numba.njit(cache=True)
+@njit()
 def _slot(values, owners, b, f, value):
     """The slot of feature ``f`` with this value in the hash table of a root, or a free one."""
     last = owners.shape[1] - 1
@@ -231,7 +232,7 @@ def _slot(values, owners, b, f, value):
     return slot
 
 
-@numba.njit(cache=True)
+@njit()
 def accept_new_integers(
     values, owners, counts, used, limits, tally, roots, features, accepted, slots, first
 ):
@@ -267,7 +268,7 @@ def accept_new_integers(
     return roots.shape[0]
 
 
-@numba.njit(cache=True)
+@njit()
 def move_values(values, owners, counts, to_values, to_owners, to_counts):
     """Fill a larger hash table."""
     for b in range(owners.shape[0]):
@@ -282,7 +283,7 @@ def move_values(values, owners, counts, to_values, to_owners, to_counts):
 # ----------------------------------------------------------------------------------- equal states
 
 
-@numba.njit(cache=True)
+@njit()
 def _code_bucket(codes, i, num_buckets):
     mixed = 0x11C9DC5
     for k in range(codes.shape[1]):  # FNV-1a, cut to 31 bits
@@ -290,7 +291,7 @@ def _code_bucket(codes, i, num_buckets):
     return ((mixed * 2654435761) >> 16) & (num_buckets - 1)
 
 
-@numba.njit(cache=True)
+@njit()
 def _is_equal(codes, i, others, j):
     for k in range(codes.shape[1]):
         if codes[i, k] != others[j, k]:
@@ -298,7 +299,7 @@ def _is_equal(codes, i, others, j):
     return True
 
 
-@numba.njit(cache=True)
+@njit()
 def find_equal(seen, seen_nodes, links, heads, counts, tally, roots, codes, nodes, twins, first):
     """Write the node of the same state, or remember a new one under its node; return how far.
 
@@ -328,7 +329,7 @@ def find_equal(seen, seen_nodes, links, heads, counts, tally, roots, codes, node
     return roots.shape[0]
 
 
-@numba.njit(cache=True)
+@njit()
 def link_codes(seen, links, heads, counts):
     """Sort all states into buckets anew."""
     heads[:] = -1

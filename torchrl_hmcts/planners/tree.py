@@ -87,8 +87,7 @@ WAVE = np.dtype(
     align=True,
 )
 
-# Bits of a node's flags. The compiled kernels hold their values: after changing one, delete the
-# __pycache__ of this folder, since numba looks at kernels.py only.
+# Bits of a node's flags.
 EXPANDED = 1  # its options have been simulated
 PENDING = 2  # its options are being simulated
 TERMINAL = 4  # the episode ends here, by termination or truncation

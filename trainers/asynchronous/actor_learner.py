@@ -30,6 +30,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.processes import wake_with_parent
+
 COUNTERS = ("frames", "updates", "episodes", "return", "length", "grad_norm")
 _GRACE_SECONDS = 5.0
 
@@ -69,12 +71,14 @@ class SharedMemory:
         board: float64 ``[L, columns]``, sums over what each learner has done. Each row has one
             writer, so that no lock is needed; the counter T is the sum of the first column.
         stop: uint8 ``[1]``, 1 to ask the learners to end.
+        steps: int64 ``[L]``, a sign of life: steps of its env that each learner has taken.
     """
 
     parameters: list[nn.Parameter]
     optimizer: Optimizer
     board: Tensor
     stop: Tensor
+    steps: Tensor
 
 
 def board_columns(loss_module: LossModule) -> list[str]:
@@ -146,7 +150,7 @@ class ActorLearner:
         self.parameters = trained_parameters(self.loss_module)
         self.columns = board_columns(self.loss_module)
         self.row = np.zeros(len(self.columns))
-        self.board = shared.board.numpy()
+        self.board, self.steps = shared.board.numpy(), shared.steps.numpy()
         self.frames_per_segment = env.numel() * settings.segment_steps
         self.running_return = np.zeros(env.numel())
         self.running_length = np.zeros(env.numel())
@@ -190,6 +194,7 @@ class ActorLearner:
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             for _ in range(self.settings.segment_steps):
                 step, state = self.env.step_and_maybe_reset(self.actor(state))
+                self.steps[self.learner] += 1
                 if self.keys is None:
                     self.keys = self._segment_keys()
                 steps.append(step.select(*self.keys, strict=False))
@@ -282,6 +287,7 @@ def run_learner(
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
     torch.set_num_threads(1)
+    wake_with_parent()
     threading.Thread(target=_end_with_parent, args=(shared.stop,), daemon=True).start()
     actor_learner = None
     try:

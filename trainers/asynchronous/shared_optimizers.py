@@ -11,6 +11,7 @@ from torch.optim import Optimizer
 
 # Those whose state after a step with zero gradients is the state they start from.
 from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.processes import share
 
 _SHAREABLE = (
     torch.optim.Adagrad,
@@ -39,6 +40,7 @@ def share_optimizer(optimizer: Optimizer) -> Optimizer:
     Raises:
         TypeError: if it is another kind, whose state cannot be built beforehand.
         ValueError: if a parameter is not on the CPU.
+        OSError: if there is too little shared memory.
 
     Examples:
         >>> weight = torch.nn.Parameter(torch.ones(2))
@@ -57,11 +59,8 @@ def share_optimizer(optimizer: Optimizer) -> Optimizer:
         )
     if any(not optimizer.state.get(p) for p in parameters):
         _build_state(optimizer, parameters)
-    for parameter in parameters:
-        parameter.share_memory_()
-        for entry in optimizer.state[parameter].values():
-            if isinstance(entry, Tensor):
-                entry.share_memory_()
+    states = [entry for p in parameters for entry in optimizer.state[p].values()]
+    share([*parameters, *(s for s in states if isinstance(s, Tensor))], type(optimizer).__name__)
     return optimizer
 
 

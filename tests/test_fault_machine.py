@@ -1,0 +1,445 @@
+"""A machine that lacks something: compiled code, processes and shared memory get by, or say it."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
+from torchrl.modules import ProbabilisticActor, ValueOperator
+
+from torchrl_hmcts import processes
+from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_pool
+from torchrl_hmcts.objectives import A3CLoss
+from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
+from torchrl_hmcts.testing import ChainEnv
+from torchrl_hmcts.trainers import A3CTrainer, LearnerError
+from torchrl_hmcts.trainers.asynchronous import learner_processes
+from torchrl_hmcts.transforms import OptionTransform
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="uses Linux's /proc and limits")
+root_only = pytest.mark.skipif(
+    sys.platform != "linux"
+    or os.geteuid() != 0
+    or shutil.which("unshare") is None
+    or subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode != 0,
+    reason="makes a mount namespace, which needs root on Linux",
+)
+
+
+def python(code: str, before: str = "true", **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a shell in a mount namespace, after some commands of root."""
+    words = ["unshare", "-m", "bash", "-c", f'{before} && exec {sys.executable} -c "$0"', code]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
+    return subprocess.run(words, capture_output=True, text=True, env=environment, timeout=120)
+
+
+# ------------------------------------------------------------------ compiled code
+
+KERNEL = """
+import sys
+from torchrl_hmcts.compiling import njit
+FACTOR = {factor}
+@njit()
+def inner(x):
+    return x * FACTOR
+@njit()
+def kernel(x):
+    return inner(x) + 1
+if __name__ == "__main__":
+    print(kernel(3))
+    print(*kernel.stats.cache_hits.values())
+"""
+
+
+def run_kernel(path: Path, factor: int = 2, **environment: str) -> subprocess.CompletedProcess[str]:
+    path.write_text(KERNEL.format(factor=factor))
+    return subprocess.run(
+        [sys.executable, path],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+        timeout=120,
+    )
+
+
+def damage(folder: Path, how: str) -> None:
+    for file in folder.rglob("*.nbc"):
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes({"flipped": bytes(content), "cut": content[:100], "empty": b""}[how])
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["flipped", *(pytest.param(how, marks=pytest.mark.slow) for how in ("cut", "empty"))],
+)
+def test_a_damaged_file_of_compiled_code_is_compiled_again(tmp_path: Path, how: str) -> None:
+    cache = tmp_path / "cache"
+    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n\n"
+    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n1\n"
+    damage(cache, how)
+    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n\n"
+    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n1\n"
+
+
+def test_compiled_code_follows_a_constant_that_it_holds(tmp_path: Path) -> None:
+    cache = str(tmp_path / "cache")
+    assert run_kernel(tmp_path / "k.py", 2, NUMBA_CACHE_DIR=cache).stdout.startswith("7")
+    assert run_kernel(tmp_path / "k.py", 5, NUMBA_CACHE_DIR=cache).stdout.startswith("16")
+
+
+@root_only
+@pytest.mark.parametrize("where", ["temporary folder", "nowhere", "full"])
+def test_without_a_folder_for_compiled_code_it_is_compiled_with_one_line(
+    tmp_path: Path, where: str
+) -> None:
+    (tmp_path / "k.py").write_text(KERNEL.format(factor=2))
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    before = f"mount --bind {tmp_path} {tmp_path} && mount -o remount,ro,bind {tmp_path}"
+    environment = {"HOME": "/nonexistent", "XDG_CACHE_HOME": "/proc/nowhere"}
+    if where == "temporary folder":
+        before += f" && mount -t tmpfs tmpfs {temporary}"
+        environment["TMPDIR"] = str(temporary)
+    elif where == "nowhere":
+        theirs = tmp_path / "torchrl_hmcts-0"
+        theirs.write_text("somebody else's")
+        environment["TMPDIR"] = str(temporary)
+        before += f" && mount -t tmpfs tmpfs {temporary} && touch {temporary}/torchrl_hmcts-0"
+    else:
+        before += f" && mount -t tmpfs -o size=8k tmpfs {temporary}"
+        environment["NUMBA_CACHE_DIR"] = str(temporary)
+    code = f"import runpy; runpy.run_path({str(tmp_path / 'k.py')!r}, run_name='__main__')"
+    done = python(code, before, **environment)
+    assert done.stdout == "7\n\n", done.stderr
+    (line,) = done.stderr.splitlines()
+    said = "is kept in" if where == "temporary folder" else "cannot be kept in"
+    assert said in line
+    assert "NUMBA_CACHE_DIR" in line
+
+
+@linux
+@pytest.mark.parametrize("made", ["by another user", "open to all", "as a link"])
+def test_code_is_not_loaded_from_a_temporary_folder_that_others_can_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: str
+) -> None:
+    from torchrl_hmcts import compiling
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    compiling.private_folder.cache_clear()
+    folder = compiling.private_folder()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    compiling.private_folder.cache_clear()
+    if made == "open to all":
+        folder.chmod(0o777)
+    elif made == "as a link":
+        folder.rename(tmp_path / "elsewhere")
+        folder.symlink_to(tmp_path / "elsewhere")
+    else:
+        other = os.geteuid() + 1
+        folder.rename(folder.with_name(f"torchrl_hmcts-{other}"))
+        monkeypatch.setattr("os.geteuid", lambda: other)
+    with pytest.raises(OSError, match="others can write it|not a folder"):
+        compiling.private_folder()
+    compiling.private_folder.cache_clear()
+
+
+# ------------------------------------------------------------------ threads and copies
+
+
+def played(env: Any, actions: torch.Tensor) -> torch.Tensor:
+    td = env.reset()
+    root = td.clone()
+
+    def play(row: torch.Tensor) -> torch.Tensor:
+        td = root.clone()
+        for action in row:
+            td = env.step(td.set("action", action))["next"].exclude("reward")
+        return td["position"]
+
+    in_turn = torch.stack([play(row) for row in actions])
+    with ThreadPoolExecutor(4) as pool:
+        together = torch.stack(list(pool.map(play, actions)))
+    assert torch.equal(in_turn, together)
+    return in_turn
+
+
+@pytest.mark.parametrize("kind", [WaterworldMazeEnv, GridworldMazeEnv])
+def test_threads_that_share_an_env_step_as_one_after_the_other(kind: Any) -> None:
+    actions = torch.randint(4, (6, 40), generator=torch.Generator().manual_seed(0))
+    end = played(kind(maze_pool("test")[:1], seed=0, max_steps=1000), actions)
+    assert len(end.unique(dim=0)) > 1
+
+
+def make_planner_env() -> Any:
+    worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+    base = WaterworldMazeEnv(maze_pool("test")[:2], seed=0)
+    return TransformedEnv(base, OptionTransform(worker, num_options=4, max_steps=20))
+
+
+def test_plans_in_threads_end_with_the_trees_of_plans_in_turn() -> None:
+    env = make_planner_env()
+    roots = [env.reset() for _ in range(4)]
+
+    def plan(root: Any) -> np.ndarray:
+        planner = MCTSPlanner(env, novelty=RadiusNovelty("position", 0.6))
+        planner(root.clone())
+        tree = planner.last_search.tree
+        return tree.nodes[0, : int(tree.num_nodes[0])].copy()
+
+    in_turn = [plan(root) for root in roots]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(plan, roots))
+    for one, other in zip(in_turn, together, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_process_forked_while_a_thread_steps_can_step() -> None:
+    env = WaterworldMazeEnv(maze_pool("test")[:1], seed=0)
+    td = env.reset().set("action", torch.tensor(1))
+    want = env.step(td.clone())["next", "position"]
+    stop = threading.Event()
+
+    def step() -> None:
+        while not stop.is_set():
+            env.step(td.clone())
+
+    thread = threading.Thread(target=step)
+    thread.start()
+    try:
+        for _ in range(5):
+            child = os.fork()
+            if child == 0:
+                signal.alarm(20)  # a lock held by a thread that is not here
+                os._exit(0 if env.step(td.clone())["next", "position"].equal(want) else 1)
+            assert os.waitpid(child, 0)[1] == 0
+    finally:
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_steps_as_the_env_that_was_copied(copied: Any) -> None:
+    env = WaterworldMazeEnv(maze_pool("test")[:1], seed=0)
+    td = env.reset().set("action", torch.tensor(2))
+    other = copied(env)
+    assert other.step(td.clone())["next", "position"].equal(
+        env.step(td.clone())["next", "position"]
+    )
+
+
+# ------------------------------------------------------------------ signs of life
+
+
+def test_a_look_after_a_long_sleep_counts_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(processes.time, "monotonic", lambda: now[0])
+    silence = processes.Silence()
+    silence.look("a")
+    now[0] += 3600.0  # stopped, or asleep
+    assert silence.look("a") == 2.0
+    now[0] += 0.5
+    assert silence.look("a") == 2.5
+    now[0] += 0.5
+    assert silence.look("b") == 0.0
+
+
+def make_loss() -> A3CLoss:
+    actor = ProbabilisticActor(
+        TensorDictModule(torch.nn.Embedding(4, 2), ["state"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
+    )
+    return A3CLoss(actor, ValueOperator(torch.nn.Embedding(4, 1), in_keys=["state"]))
+
+
+def stop_a_learner(trainer: A3CTrainer, stopped: list[int]) -> None:
+    """Stop learner 1 as soon as it has taken a step, in a thread."""
+
+    def wait() -> None:
+        while int(trainer.shared.steps[1]) == 0:
+            time.sleep(0.01)
+        stopped.append(trainer.learners.running[1][0].pid)
+        os.kill(stopped[0], signal.SIGSTOP)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def gone(pid: int) -> bool:
+    return not os.path.exists(f"/proc/{pid}")
+
+
+@linux
+def test_a_stopped_learner_ends_the_run_with_its_name_and_a_checkpoint(tmp_path: Path) -> None:
+    trainer = A3CTrainer(
+        lambda: ChainEnv(4),
+        make_loss(),
+        total_frames=10**9,
+        save_dir=tmp_path,
+        start_method="fork",
+        step_seconds=2.0,
+    )
+    stopped: list[int] = []
+    stop_a_learner(trainer, stopped)
+    with pytest.raises(LearnerError, match=r"Learner 1 of 2 .* has not answered for \d+ s"):
+        trainer.train()
+    assert any(tmp_path.glob("checkpoint-*"))
+    assert gone(stopped[0])
+
+
+@linux
+def test_a_run_that_has_reached_its_frames_ends_though_a_learner_is_stopped(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(learner_processes, "_STOP_SECONDS", 1.0)
+    trainer = A3CTrainer(lambda: ChainEnv(4), make_loss(), total_frames=4000, start_method="fork")
+    stopped: list[int] = []
+    stop_a_learner(trainer, stopped)
+    history = trainer.train()
+    assert history["frames"][-1] >= 4000
+    assert gone(stopped[0])
+    assert "Learner 1 of 2" in capfd.readouterr().err
+
+
+# ------------------------------------------------------------------ what the machine lacks
+
+
+def test_what_the_system_refuses_is_no_wrong_argument() -> None:
+    @name_arguments
+    class Part:
+        def __init__(self, error: Exception) -> None:
+            raise error
+
+    for error in (
+        OSError(28, "No space left on device"),
+        MemoryError(),
+        ImportError("no such library"),
+        RuntimeError("unable to allocate shared memory(shm) for file </x>: No space left (28)"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory"),
+        RuntimeError("CUDA error: an illegal memory access was encountered"),
+        RuntimeError("cannot cache function 'f': no locator available for file 'f.py'"),
+    ):
+        with pytest.raises(type(error)) as caught:
+            Part(error)
+        assert caught.value is error
+    with pytest.raises(ValueError, match="Part cannot be built with error="):
+        Part(RuntimeError("size mismatch"))
+
+
+A3C = """
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor, ValueOperator
+from torchrl_hmcts.objectives import A3CLoss
+from torchrl_hmcts.testing import ChainEnv
+from torchrl_hmcts.trainers import A3CTrainer
+actor = ProbabilisticActor(
+    TensorDictModule(torch.nn.Embedding(4, 2), ['state'], ['logits']), in_keys=['logits'],
+    distribution_class=torch.distributions.Categorical)
+loss = A3CLoss(actor, ValueOperator(torch.nn.Embedding(4, 1), in_keys=['state']))
+try:
+    A3CTrainer(lambda: ChainEnv(4), loss, total_frames=100, num_learners=2).train()
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+POOL = """
+from torchrl_hmcts.envs import AtariOptionPool, RepeatActions
+try:
+    pool = AtariOptionPool('Pong', RepeatActions(2), max_steps=2, num_processes=4, seed=0)
+    pool.rollout(1)
+    pool.close()
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+NETWORK = """
+from torchrl_hmcts.envs import SharedMLP
+try:
+    SharedMLP(4, 4)
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+@root_only
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param(A3C, marks=pytest.mark.slow),
+        pytest.param(POOL, marks=pytest.mark.slow),
+        NETWORK,
+    ],
+    ids=["a3c", "pool", "network"],
+)
+def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) -> None:
+    done = python(
+        f"{code}import os; print('left', os.listdir('/dev/shm'))",
+        "mount -t tmpfs -o size=16k tmpfs /dev/shm",
+    )
+    assert done.stdout.startswith("OSError"), done
+    assert "/dev/shm has 16,384 bytes" in done.stdout
+    assert "docker run --shm-size=" in done.stdout
+    assert done.stdout.endswith("left []\n")
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
+def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> None:
+    begin = time.monotonic()
+    limited = (
+        "import os, resource\n"
+        "few = len(os.listdir('/proc/self/fd')) + 7\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
+    )
+    imports, attempt = code.split("try:\n")
+    done = subprocess.run(
+        [sys.executable, "-c", f"{imports}{limited}try:\n{attempt}"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout.startswith("OSError"), done
+    assert "ulimit -n" in done.stdout
+    assert time.monotonic() - begin < 60.0  # the imports included
+
+
+@linux
+@pytest.mark.parametrize("length", [10, pytest.param(90, marks=pytest.mark.slow), 200])
+def test_the_forkserver_has_a_socket_whatever_the_temporary_folder(
+    tmp_path: Path, length: int
+) -> None:
+    folder = tmp_path / ("x" * (length - length // 2)) / ("y" * (length // 2))
+    folder.mkdir(parents=True)
+    code = (
+        "from torchrl_hmcts.processes import start_context\n"
+        "if __name__ == '__main__':\n"
+        "    context = start_context('forkserver')\n"
+        "    process = context.Process(target=print, args=('ran', ))\n"
+        "    process.start(); process.join(); print(context.get_start_method(), process.exitcode)\n"
+    )
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    environment = {**os.environ, "TMPDIR": str(folder)}
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, env=environment, timeout=60
+    )
+    assert done.stdout.splitlines() == ["ran", "forkserver 0"], done.stderr
+    assert not list(folder.iterdir())
