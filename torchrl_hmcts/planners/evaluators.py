@@ -195,7 +195,9 @@ class RolloutEvaluator:
     def bind(self, simulator: Simulator, gamma: float) -> None:
         """Take the simulator and the discount per base step of a planner; a planner calls this."""
         bound = self._simulator
-        if bound is not None and (bound.env is not simulator.env or gamma != self._gamma):
+        if bound is not None and (
+            bound.given_env is not simulator.given_env or gamma != self._gamma
+        ):
             raise ValueError(
                 "This RolloutEvaluator simulates for a planner with another env or discount. Give "
                 "each planner one of its own."
