@@ -34,12 +34,12 @@ class HierarchicalPolicy(TensorDictModuleBase):
     planner's choice is taken and planning starts anew after it.
 
     The plan lives in the tensordict, as a recurrent policy's state does: ``"plan"`` (int64
-    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made so
-    far, with TorchRL's ``InitTracker`` those of this episode (int64 ``[*B, 1]``), and with ``divergence`` ``"plan_states"`` (float32
-    ``[*B, L + 1, f]``). Every episode begins with a new plan: the policy looks at what the last
-    step led to, and where it was the end, or another state than the one it is to act in, the plan
-    is out of date. Where it cannot see that, as in a tensordict that was copied before the step,
-    append TorchRL's ``InitTracker`` or ``StepCounter`` to the env.
+    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made so far, or
+    in this episode with TorchRL's ``InitTracker`` (int64 ``[*B, 1]``), and with ``divergence``
+    ``"plan_states"`` (float32 ``[*B, L + 1, f]``). Every episode begins with a new plan: the policy
+    looks at what the last step led to, and where it was the end, or another state than the one it
+    is to act in, the plan is out of date. Where it cannot see that, as in a tensordict that was
+    copied before the step, append TorchRL's ``InitTracker`` or ``StepCounter`` to the env.
 
     With ``reuse`` the trees are kept from one decision to the next: where the options carried out
     led to a state that the tree holds, its subtree is searched further

@@ -22,10 +22,10 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Categorical, OneHot, TensorSpec
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
-from torchrl_hmcts.nesting import env_name
+from torchrl_hmcts.nesting import env_name, flat_transforms
 
 _BESIDE = ("step_async", "step_wait", "step_abandon")
 
@@ -158,6 +158,13 @@ class Simulator:
                     f"[{self.num_options}], from {self.mask_key!r}; in {name} that is "
                     f"{_described(mask, env)}. Name the options' own mask by mask_key, or None if "
                     f"all may be taken."
+                )
+            below = _masks_actions_below_options(env, self.mask_key)
+            if below:
+                raise ValueError(
+                    f"MCTSPlanner reads which options may be taken from {self.mask_key!r}, which "
+                    f"{name} writes of its {below} base actions, below the OptionTransform. Write "
+                    f"the options' own mask in a transform behind it, or pass mask_key=None."
                 )
 
     def root(self, td: TensorDictBase) -> TensorDictBase:
@@ -382,6 +389,22 @@ def _reward_key(env: EnvBase, name: str, reward_key: NestedKey | None) -> Nested
             f"{reward_key!r}. Name one of them, e.g. reward_key={keys[0]!r}."
         )
     return keys[0]
+
+
+def _masks_actions_below_options(env: EnvBase, mask_key: NestedKey) -> int:
+    """The number of base actions if the mask is theirs and nobody behind the options wrote it."""
+    transforms = flat_transforms(env) if isinstance(env, TransformedEnv) else []
+    for transform in reversed(transforms):
+        if mask_key in map(unravel_key, transform.out_keys):
+            return 0
+        if hasattr(transform, "num_options"):  # the options are made here
+            parent = transform.parent
+            if mask_key not in map(unravel_key, parent.full_observation_spec.keys(True, True)):
+                return 0
+            actions = [getattr(s.space, "n", 0) for s in parent.full_action_spec.values(True, True)]
+            numel = parent.full_observation_spec[mask_key].shape[parent.batch_dims :].numel()
+            return next((int(n) for n in actions if n == numel), 0)
+    return 0
 
 
 def _done_keys(env: EnvBase, name: str) -> tuple[NestedKey, NestedKey]:

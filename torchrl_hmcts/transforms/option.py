@@ -33,6 +33,10 @@ class OptionTransform(Transform):
     the done flags, and observation and state after the last base step. Every batch element has its
     own option and its own end; an element that has ended does not step any more.
 
+    The base env's ``"action_mask"`` forbids base actions and no options: worker and termination
+    read it by its name, above it is ``"base_action_mask"``. A transform behind this one may write
+    the options' own ``"action_mask"``, e.g. :class:`SkillMaskTransform`.
+
     TorchRL's estimators discount by ``gamma ** steps_to_next_obs``. With
     ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
     ``make_value_estimator``, any TorchRL loss is correct for the SMDP.
@@ -136,7 +140,7 @@ class OptionTransform(Transform):
                 f"OptionTransform found no option under {self.option_key!r}. Write it with a "
                 f"planner or policy, or with env.rand_action(td)."
             )
-        inner = tensordict.copy()
+        inner = fit.masks.show(tensordict).copy()
         inner.set(self.skill_key, self._skill(option, tensordict.batch_size))
         with torch.no_grad():
             self.worker(inner)
@@ -161,7 +165,7 @@ class OptionTransform(Transform):
                 out = self._run_locked(fit, root, next_tensordict, skipped)
             else:
                 out = self._run(fit, root, next_tensordict)
-        return out.reshape(batch_size) if flatten else out
+        return fit.leave(out.reshape(batch_size) if flatten else out)
 
     def _run(self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
         """Go on in a stateless env, with fewer rows whenever some have ended."""
@@ -288,15 +292,20 @@ class OptionTransform(Transform):
         duration: Tensor,
         trajectory: OptionTrajectory | None,
     ) -> TensorDictBase:
+        fit.masks.hide(out)
         out.set(fit.reward_key, reward)
         out.set(self.duration_key, duration)
         if trajectory is not None:
             out.set(OptionTrajectory.KEY, trajectory.data)
         return out
 
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+        return tensordict if tensordict is None else self._fitted().masks.show(tensordict.copy())
+
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        self._fitted().masks.hide(tensordict_reset)
         shape, device = tensordict_reset.batch_size, tensordict_reset.device
         zero = torch.zeros((*shape, 1), dtype=torch.int64, device=device)
         tensordict_reset.set(self.duration_key, zero)
@@ -346,14 +355,18 @@ class OptionTransform(Transform):
         spec = Composite(shape=shape, device=device)
         spec[self.option_key] = option
         input_spec["full_action_spec"] = spec
+        masks = self._fitted().masks
         state = input_spec.get("full_state_spec", None)
+        if state is not None:
+            masks.hide_specs(state)
         if not self._fitted().batch_locked and state is not None and not state.is_empty():
             # The first step reads and hands out what the env showed: a stored state needs it.
             observed = self.parent.full_observation_spec
             handed = () if self.trajectory is None else self.trajectory.keys
             for key in map(unravel_key, (*getattr(self.worker, "in_keys", ()), *handed)):
-                if key in observed.keys(True, True) and key not in state.keys(True, True):
-                    state[key] = observed[key].clone()
+                above = masks.name(key)
+                if key in observed.keys(True, True) and above not in state.keys(True, True):
+                    state[above] = observed[key].clone()
         return input_spec
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
@@ -364,7 +377,7 @@ class OptionTransform(Transform):
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        observation_spec = observation_spec.clone()
+        observation_spec = self._fitted().masks.hide_specs(observation_spec.clone())
         shape, device = observation_spec.shape, observation_spec.device
         observation_spec[self.duration_key] = Bounded(
             0, self.max_steps, shape=(*shape, 1), dtype=torch.int64, device=device

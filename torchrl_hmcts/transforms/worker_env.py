@@ -7,7 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
-from torchrl.envs import EnvBase
+from torchrl.envs import CatFrames, EnvBase, Transform
+
+from torchrl_hmcts.carried_state import CarriedFrames, apart
+from torchrl_hmcts.nesting import flat_transforms
+from torchrl_hmcts.transforms.base_masks import BaseMasks
 
 if TYPE_CHECKING:
     from torchrl_hmcts.transforms.option import OptionTransform
@@ -25,8 +29,10 @@ class WorkerEnv:
     """
 
     def __init__(self, parent: EnvBase, transform: OptionTransform) -> None:
+        parent = apart(parent)  # rows come and go: their frames are in the tensordict
         base = parent.base_env
         self.batch_locked = parent.batch_locked
+        self.masks = BaseMasks(parent)
         if len(parent.reward_keys) != 1:
             raise ValueError(
                 f"OptionTransform sums one reward; {type(base).__name__} has the rewards "
@@ -49,6 +55,7 @@ class WorkerEnv:
         )
         # What the env writes under "next" in a base step.
         self.written = {_first(k) for k in (*keys, *parent.done_keys, self.reward_key)}
+        self._frames = _frames_before(transform)
         self._check_worker(parent, transform)
         if transform.trajectory is not None:
             self.trajectory_spec = transform.trajectory.make_spec(parent)
@@ -62,6 +69,13 @@ class WorkerEnv:
             self._writes_all_done = self._complete.issubset(after.keys(True, True))
         if not self._writes_all_done:
             self._env._complete_done(self._done_spec, after)
+        return after
+
+    def leave(self, after: TensorDictBase) -> TensorDictBase:
+        """Hand the frames after an option's last base step to the CatFrames of the env itself."""
+        for frames in self._frames:
+            for in_key, out_key in zip(frames.in_keys, frames.out_keys, strict=True):
+                setattr(frames, f"_cat_buffers_{in_key}", after.get(out_key).clone())
         return after
 
     def step_mdp(
@@ -133,6 +147,17 @@ class WorkerEnv:
                     f"{sorted(map(str, available))}. Put a transform that writes {key!r} before "
                     f"OptionTransform."
                 )
+
+
+def _frames_before(transform: Transform) -> list[CatFrames]:
+    """The CatFrames, with buffers of their own, of the env that a transform is part of."""
+    found: list[CatFrames] = []
+    for before in flat_transforms(transform.container):
+        if before is transform:
+            break
+        if isinstance(before, CatFrames) and not isinstance(before, CarriedFrames):
+            found.append(before)
+    return found
 
 
 def _first(key: NestedKey) -> str:
