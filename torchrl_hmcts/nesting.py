@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
@@ -61,6 +62,35 @@ def envs_below(env: EnvBase) -> Iterator[EnvBase]:
         for part in (*vars(env).get("_modules", {}).values(), *vars(env).values()):
             if isinstance(part, EnvBase):
                 yield part
+
+
+def step_states(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+    """Take a step and return what is written as next, of any number of states if it is stateless.
+
+    ``TransformedEnv.step`` without its checks, and without the shape of the env's own batch.
+    """
+    if type(env)._step is not TransformedEnv._step:
+        return env._step(states)
+    inner = env.transform._inv_call(states.copy())
+    after = step_states(env.base_env, inner)
+    complete_done(env.base_env, after)
+    return env.transform._step(inner, after)
+
+
+def set_states(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+    """Set an env to states; ``env.reset(states, set_state=True)`` without its checks."""
+    if type(env)._reset is not TransformedEnv._reset:
+        return env._reset(states, set_state=True)
+    inner = env.transform._reset_env_preprocess(states.copy())
+    shown = set_states(env.base_env, inner)
+    complete_done(env.base_env, shown)
+    return env.transform._reset(inner, shown)
+
+
+def complete_done(env: EnvBase, after: TensorDictBase) -> None:
+    """Write the done entries that an env left out, in place."""
+    if any(after.get(key, None) is None for key in env.done_keys):
+        env._complete_done(env.full_done_spec_unbatched, after)
 
 
 def known_gamma(env: EnvBase) -> float | None:

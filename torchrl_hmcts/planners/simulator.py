@@ -25,7 +25,7 @@ from torchrl.data import Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
-from torchrl_hmcts.nesting import env_name, flat_transforms
+from torchrl_hmcts.nesting import env_name, flat_transforms, set_states, step_states
 
 _BESIDE = ("step_async", "step_wait", "step_abandon")
 
@@ -208,7 +208,7 @@ class Simulator:
     def step(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Take option ``options[i]`` in state ``i``; return what the env writes as next."""
         self._choose(states, options)
-        after = self.env._step(states) if self.stateless else self._step_in_turn(states)
+        after = step_states(self.env, states) if self.stateless else self._step_in_turn(states)
         return self._completed(states, after)
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
@@ -248,6 +248,8 @@ class Simulator:
     def _step_in_turn(self, states: TensorDictBase) -> TensorDictBase:
         """Set an env with a state of its own to as many states as it holds at a time, and step."""
         env, m = self.env, len(states)
+        if not env.batch_dims:
+            return self._step_one_by_one(states)
         size = env.batch_size.numel()
         parts = []
         for begin in range(0, m, size):
@@ -258,6 +260,17 @@ class Simulator:
             after = env.step(before.update(part)).get("next")
             parts.append(after.reshape(-1)[: min(size, m - begin)])
         return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    def _step_one_by_one(self, states: TensorDictBase) -> TensorDictBase:
+        """Set an env of one state to each of the states, and step."""
+        parts = []
+        alone = states.select(*self.state_keys).unbind(0)
+        for state, option in zip(alone, states.get(self.option_key).unbind(0), strict=True):
+            root = set_states(self.env, state).update(state)
+            _put(root, self.option_key, option)
+            parts.append(step_states(self.env, root))
+        stacked: TensorDictBase = torch.stack(parts)
+        return stacked
 
     @contextmanager
     def searching(self) -> Iterator[None]:

@@ -143,7 +143,7 @@ class OptionTransform(Transform):
         inner = fit.masks.show(tensordict).copy()
         inner.set(self.skill_key, self._skill(option, tensordict.batch_size))
         with torch.no_grad():
-            self.worker(inner)
+            fit.act(inner)
         for key in (self.skill_key, *fit.action_keys):
             tensordict.set(key, inner.get(key))
         return tensordict
@@ -161,7 +161,9 @@ class OptionTransform(Transform):
         if flatten:  # one batch dimension is all the loop has to know
             root, next_tensordict = root.reshape(-1), next_tensordict.reshape(-1)
         with torch.no_grad():
-            if fit.batch_locked:
+            if fit.alone and skipped is None and self.trajectory is None:
+                out = self._run_alone(fit, root, next_tensordict)
+            elif fit.batch_locked:
                 out = self._run_locked(fit, root, next_tensordict, skipped)
             else:
                 out = self._run(fit, root, next_tensordict)
@@ -212,6 +214,22 @@ class OptionTransform(Transform):
             duration[rows] = taken
         return self._finish(fit, out, reward, duration, trajectory)
 
+    def _run_alone(
+        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase
+    ) -> TensorDictBase:
+        """Go on in an env of one state, whose rows need no masks."""
+        reward = after.get(fit.reward_key)
+        carried = fit.carried(root, after)
+        discount, taken = 1.0, 1
+        while taken < self.max_steps and not self._ended(fit, root, after, taken).item():
+            discount *= self.gamma
+            root = self._advance(fit, root, after, carried)
+            after = fit.step(root)
+            reward = reward + discount * after.get(fit.reward_key)
+            taken += 1
+        duration = torch.full((1,), taken, dtype=torch.int64, device=reward.device)
+        return self._finish(fit, after.copy(), reward, duration, None)
+
     def _run_locked(
         self,
         fit: WorkerEnv,
@@ -254,7 +272,7 @@ class OptionTransform(Transform):
     ) -> TensorDictBase:
         """The next root: what the env wrote becomes its input, and the worker acts on it."""
         root = fit.step_mdp(root, after, carried)
-        self.worker(root)
+        fit.act(root)
         return root
 
     def _ended(

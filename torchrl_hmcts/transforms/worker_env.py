@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs import CatFrames, EnvBase, Transform
 
 from torchrl_hmcts.carried_state import CarriedFrames, apart
-from torchrl_hmcts.nesting import flat_transforms
+from torchrl_hmcts.direct_calls import is_plain
+from torchrl_hmcts.nesting import flat_transforms, step_states
 from torchrl_hmcts.transforms.base_masks import BaseMasks
 
 if TYPE_CHECKING:
@@ -43,6 +45,11 @@ class WorkerEnv:
         self.done_keys = [k for k in parent.done_keys if _last(k) == "done"]
         self._env = base if not len(parent.transform) else parent
         self._parent = parent
+        # One state at a time: there is nobody to wait for, nor to leave alone.
+        self.alone = self.batch_locked and not parent.batch_size
+        self._reward_shape = parent.full_reward_spec[self.reward_key].shape
+        self._worker = worker = transform.worker
+        self._plain = is_plain(worker) and list(worker.out_keys) == self.action_keys
         keys = [*parent.full_observation_spec.keys(True, True), *parent.state_keys]
         self._flat = all(isinstance(k, str) for k in (*keys, *parent.done_keys, self.reward_key))
         self._done_spec = parent.full_done_spec
@@ -62,14 +69,26 @@ class WorkerEnv:
 
     def step(self, root: TensorDictBase) -> TensorDictBase:
         """Take a base step, without the bookkeeping of ``EnvBase.step`` where it can be spared."""
-        if self.batch_locked:
+        if self.batch_locked and not self.alone:
             return self._parent.step(root).get("next")
-        after = self._env._step(root)
+        after = step_states(self._env, root)
         if self._writes_all_done is None:
             self._writes_all_done = self._complete.issubset(after.keys(True, True))
         if not self._writes_all_done:
             self._env._complete_done(self._done_spec, after)
+        if self.alone and after.get(self.reward_key).shape != self._reward_shape:
+            after.set(self.reward_key, after.get(self.reward_key).reshape(self._reward_shape))
         return after
+
+    def act(self, root: TensorDictBase) -> None:
+        """Let the worker write its action; a plain network is called on its tensors."""
+        worker = self._worker
+        if self._plain and not (worker._forward_hooks or worker._forward_pre_hooks):
+            action = worker.module(*(root.get(key) for key in worker.in_keys))
+            if isinstance(action, Tensor):
+                root.set(self.action_keys[0], action)
+                return
+        worker(root)
 
     def leave(self, after: TensorDictBase) -> TensorDictBase:
         """Hand the frames after an option's last base step to the CatFrames of the env itself."""
@@ -86,7 +105,7 @@ class WorkerEnv:
             root.set("next", after)
             return self._parent.step_mdp(root)
         # What the env wrote is the next root as it stands: nobody reads the reward in it.
-        following = after.copy() if self.batch_locked else after
+        following = after.copy() if self.batch_locked and not self.alone else after
         for key in carried:
             following.set(key, root.get(key))
         return following
