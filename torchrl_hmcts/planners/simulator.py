@@ -119,6 +119,8 @@ class Simulator:
         self._done_keys = [unravel_key(k) for k in env.done_keys]
         self._done_key, self._terminated_key = _done_keys(env, name)
         self._check_specs(env)
+        last = flat_transforms(env)[-1:] if type(env) is TransformedEnv else []
+        self._run_from = getattr(last[0], "run_from", None) if last else None
         self._ones = np.ones(0, np.int64)
         self._no_masks = np.zeros((0, self.num_options), np.bool_)
 
@@ -208,7 +210,10 @@ class Simulator:
     def step(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Take option ``options[i]`` in state ``i``; return what the env writes as next."""
         self._choose(states, options)
-        after = step_states(self.env, states) if self.stateless else self._step_in_turn(states)
+        if self.stateless:
+            after = step_states(self.env, states)
+        else:
+            after = self._step_in_turn(states, options)
         return self._completed(states, after)
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
@@ -245,11 +250,11 @@ class Simulator:
                 after.set(key, states.get(key))
         return after
 
-    def _step_in_turn(self, states: TensorDictBase) -> TensorDictBase:
+    def _step_in_turn(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Set an env with a state of its own to as many states as it holds at a time, and step."""
         env, m = self.env, len(states)
         if not env.batch_dims:
-            return self._step_one_by_one(states)
+            return self._step_one_by_one(states, options)
         size = env.batch_size.numel()
         parts = []
         for begin in range(0, m, size):
@@ -261,14 +266,17 @@ class Simulator:
             parts.append(after.reshape(-1)[: min(size, m - begin)])
         return torch.cat(parts) if len(parts) > 1 else parts[0]
 
-    def _step_one_by_one(self, states: TensorDictBase) -> TensorDictBase:
+    def _step_one_by_one(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Set an env of one state to each of the states, and step."""
         parts = []
         alone = states.select(*self.state_keys).unbind(0)
-        for state, option in zip(alone, states.get(self.option_key).unbind(0), strict=True):
-            root = set_states(self.env, state).update(state)
-            _put(root, self.option_key, option)
-            parts.append(step_states(self.env, root))
+        for state, option in zip(alone, torch.from_numpy(options), strict=True):
+            after = None if self._run_from is None else self._run_from(state, option)
+            if after is None:
+                root = set_states(self.env, state).update(state)
+                _put(root, self.option_key, self.encode(option))
+                after = step_states(self.env, root)
+            parts.append(after)
         stacked: TensorDictBase = torch.stack(parts)
         return stacked
 

@@ -161,7 +161,7 @@ class OptionTransform(Transform):
         if flatten:  # one batch dimension is all the loop has to know
             root, next_tensordict = root.reshape(-1), next_tensordict.reshape(-1)
         with torch.no_grad():
-            if fit.alone and skipped is None and self.trajectory is None:
+            if fit.alone and self.trajectory is None:
                 out = self._run_alone(fit, root, next_tensordict)
             elif fit.batch_locked:
                 out = self._run_locked(fit, root, next_tensordict, skipped)
@@ -214,6 +214,27 @@ class OptionTransform(Transform):
             duration[rows] = taken
         return self._finish(fit, out, reward, duration, trajectory)
 
+    def run_from(self, state: TensorDictBase, option: Tensor) -> TensorDictBase | None:
+        """Run an option from a state of an env that holds one; what ``step`` writes as next.
+
+        A planner's short way past the bookkeeping of ``reset(set_state=True)`` and ``step``.
+
+        Args:
+            state (TensorDictBase): the env's ``state_spec``, without a batch dimension.
+            option (Tensor): int64, without a dimension.
+
+        Returns:
+            The outcome, or None where ``reset`` and ``step`` are needed.
+        """
+        fit = self._fitted()
+        if not fit.alone or self.trajectory is not None:
+            return None
+        with torch.no_grad():
+            root = fit.set_state(state)
+            root.set(self.skill_key, option)
+            fit.act(root)
+            return self._run_alone(fit, root, fit.step(root))
+
     def _run_alone(
         self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase
     ) -> TensorDictBase:
@@ -221,7 +242,7 @@ class OptionTransform(Transform):
         reward = after.get(fit.reward_key)
         carried = fit.carried(root, after)
         discount, taken = 1.0, 1
-        while taken < self.max_steps and not self._ended(fit, root, after, taken).item():
+        while taken < self.max_steps and not self._has_ended(fit, root, after, taken):
             discount *= self.gamma
             root = self._advance(fit, root, after, carried)
             after = fit.step(root)
@@ -229,6 +250,13 @@ class OptionTransform(Transform):
             taken += 1
         duration = torch.full((1,), taken, dtype=torch.int64, device=reward.device)
         return self._finish(fit, after.copy(), reward, duration, None)
+
+    def _has_ended(
+        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, taken: int
+    ) -> bool:
+        if self.termination is None and len(fit.done_keys) == 1:
+            return after.get(fit.done_keys[0]).item()
+        return self._ended(fit, root, after, taken).item()
 
     def _run_locked(
         self,

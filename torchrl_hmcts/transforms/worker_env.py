@@ -12,8 +12,10 @@ from torchrl.envs import CatFrames, EnvBase, Transform
 
 from torchrl_hmcts.carried_state import CarriedFrames, apart
 from torchrl_hmcts.direct_calls import is_plain
-from torchrl_hmcts.nesting import flat_transforms, step_states
+from torchrl_hmcts.nesting import flat_transforms, set_states, step_states
 from torchrl_hmcts.transforms.base_masks import BaseMasks
+
+_AS_IT_IS = {"validated": True, "inplace": False, "non_blocking": False}
 
 if TYPE_CHECKING:
     from torchrl_hmcts.transforms.option import OptionTransform
@@ -45,8 +47,6 @@ class WorkerEnv:
         self.done_keys = [k for k in parent.done_keys if _last(k) == "done"]
         self._env = base if not len(parent.transform) else parent
         self._parent = parent
-        # One state at a time: there is nobody to wait for, nor to leave alone.
-        self.alone = self.batch_locked and not parent.batch_size
         self._reward_shape = parent.full_reward_spec[self.reward_key].shape
         self._worker = worker = transform.worker
         self._plain = is_plain(worker) and list(worker.out_keys) == self.action_keys
@@ -62,6 +62,11 @@ class WorkerEnv:
         )
         # What the env writes under "next" in a base step.
         self.written = {_first(k) for k in (*keys, *parent.done_keys, self.reward_key)}
+        # One state at a time: there is nobody to wait for, nor to leave alone. What a worker tells
+        # its next step, and options inside an option, take the way of all others.
+        memory = any(_first(key) == "next" for key in getattr(worker, "out_keys", ()))
+        nested = _first(transform.duration_key) in self.written
+        self.alone = self.batch_locked and not (parent.batch_size or memory or nested)
         self._frames = _frames_before(transform)
         self._check_worker(parent, transform)
         if transform.trajectory is not None:
@@ -74,19 +79,24 @@ class WorkerEnv:
         after = step_states(self._env, root)
         if self._writes_all_done is None:
             self._writes_all_done = self._complete.issubset(after.keys(True, True))
+            self._reshapes = self.alone and after.get(self.reward_key).shape != self._reward_shape
         if not self._writes_all_done:
             self._env._complete_done(self._done_spec, after)
-        if self.alone and after.get(self.reward_key).shape != self._reward_shape:
+        if self._reshapes:
             after.set(self.reward_key, after.get(self.reward_key).reshape(self._reward_shape))
         return after
+
+    def set_state(self, state: TensorDictBase) -> TensorDictBase:
+        """Set the env to a state, and return all that it shows there."""
+        return self.masks.show(set_states(self._env, state).update(state))
 
     def act(self, root: TensorDictBase) -> None:
         """Let the worker write its action; a plain network is called on its tensors."""
         worker = self._worker
         if self._plain and not (worker._forward_hooks or worker._forward_pre_hooks):
-            action = worker.module(*(root.get(key) for key in worker.in_keys))
-            if isinstance(action, Tensor):
-                root.set(self.action_keys[0], action)
+            action = worker.module(*[root.get(key) for key in worker.in_keys])
+            if isinstance(action, Tensor) and isinstance(self.action_keys[0], str):
+                root._set_str(self.action_keys[0], action, **_AS_IT_IS)
                 return
         worker(root)
 
@@ -107,7 +117,7 @@ class WorkerEnv:
         # What the env wrote is the next root as it stands: nobody reads the reward in it.
         following = after.copy() if self.batch_locked and not self.alone else after
         for key in carried:
-            following.set(key, root.get(key))
+            following._set_str(key, root._get_str(key, None), **_AS_IT_IS)
         return following
 
     def carried(self, root: TensorDictBase, after: TensorDictBase) -> list[NestedKey]:
