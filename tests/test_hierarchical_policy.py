@@ -147,7 +147,8 @@ class TimeLimit(StepCounter):
 def test_a_collector_gives_every_episode_a_new_plan() -> None:
     env = TransformedEnv(ChainEnv(length=9), TimeLimit(3))
     policy = HierarchicalPolicy(MCTSPlanner(ChainEnv(length=9)))
-    collector = Collector(env, policy, frames_per_batch=9, total_frames=9)
+    size = {"frames_per_batch": 9, "total_frames": 9}
+    collector = Collector(env, policy, auto_register_policy_transforms=False, **size)
     batch = next(iter(collector))
     assert {key: batch[key].flatten().tolist() for key in EPISODES} == EPISODES
     collector.shutdown()

@@ -470,6 +470,13 @@ def test_a_transform_whose_state_cannot_be_set_is_refused_by_name(
         MCTSPlanner(env)
 
 
+def test_a_normaliser_with_statistics_of_each_element_is_refused() -> None:
+    env = numbered((2,))
+    env.append_transform(norm(True))
+    with pytest.raises(ValueError, match="VecNormV2 .* with reduce_batch_dims=True"):
+        MCTSPlanner(env)
+
+
 def test_frames_that_are_kept_in_the_envs_of_a_batch_are_refused() -> None:
     def make() -> EnvBase:
         env = numbered()

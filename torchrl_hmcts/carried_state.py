@@ -36,6 +36,10 @@ from torchrl.record import TensorDictRecorder, VideoRecorder
 from torchrl_hmcts.nesting import env_name, envs_below, flat_transforms
 
 _FREEZE = "learns its statistics from every step. Freeze it first: its freeze()"
+_PER_ELEMENT = (
+    "has statistics for each element of the batch, and a wave has other states. Make it with "
+    "reduce_batch_dims=True"
+)
 _EVAL = "learns its statistics from every step. Stop that first: its eval()"
 _MAX_POOL = (
     "keeps the last observations. Stack them by CatFrames, which a planner can set, and take the "
@@ -166,6 +170,8 @@ def _refuse_states(env: EnvBase, inside: str | None) -> None:
             reason = None
             if isinstance(transform, (VecNorm, VecNormV2)) and not transform.frozen:
                 reason = _FREEZE
+            elif isinstance(transform, VecNormV2) and _is_per_element(transform, env):
+                reason = _PER_ELEMENT
             elif isinstance(transform, RNDTransform) and transform.training and _learns(transform):
                 reason = _EVAL
             elif isinstance(transform, TimeMaxPool):
@@ -259,6 +265,11 @@ def _same(one: Any, two: Any) -> bool:
     if isinstance(one, np.ndarray):
         return isinstance(two, np.ndarray) and np.array_equal(one, two)
     return len(one) != len(two) or all(a is b for a, b in zip(one, two, strict=True))
+
+
+def _is_per_element(transform: VecNormV2, env: EnvBase) -> bool:
+    reduces = transform.reduce_batch_dims or not transform.stateful
+    return not (reduces or env.batch_locked) and env.batch_size.numel() != 1
 
 
 def _learns(transform: RNDTransform) -> bool:
