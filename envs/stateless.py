@@ -28,6 +28,11 @@ class StatelessSimulator(EnvBase):
 
     Raises:
         ValueError: if the env has no such entry, or no state at all.
+        KeyError: when set to a state that lacks an entry.
+
+    Reference:
+        Freeman et al., "Brax: a differentiable physics engine for large scale rigid body
+        simulation", 2021, arXiv 2106.13281: the kind of simulator that is meant.
 
     Example:
         >>> from torchrl_hmcts.envs import StatelessSimulator

@@ -28,6 +28,7 @@ from torchrl_hmcts.trainers.configs.envs import (
     AtariRAMEnvConfig,
     GridworldMazeEnvConfig,
     LabMazeEnvConfig,
+    StatelessSimulatorConfig,
     WaterworldMazeEnvConfig,
 )
 from torchrl_hmcts.trainers.configs.losses import (
@@ -178,6 +179,7 @@ __all__ = [
     "SkillTransformConfig",
     "StallTerminationConfig",
     "StallTransformConfig",
+    "StatelessSimulatorConfig",
     "SubgoalTransformConfig",
     "TerminationNetworkConfig",
     "TorchRLScoreConfig",

@@ -160,3 +160,19 @@ class AtariRAMEnvConfig(EnvComponentConfig):
     device: Any = None
     """Of all tensors; the emulator runs on the CPU."""
     _component_: str = "torchrl_hmcts.envs.AtariRAMEnv"
+
+
+@dataclass
+class StatelessSimulatorConfig(EnvComponentConfig):
+    """Keys of :class:`~torchrl_hmcts.envs.StatelessSimulator`.
+
+    Example:
+        >>> StatelessSimulatorConfig(state_keys=["state"]).state_keys
+        ['state']
+    """
+
+    env: Any = MISSING
+    """Whose _step depends on nothing but its tensordict."""
+    state_keys: Any = None
+    """Entries that are the state; those of state_spec and the observation by default."""
+    _component_: str = "torchrl_hmcts.envs.StatelessSimulator"

@@ -112,6 +112,7 @@ GROUPS: Mapping[str, Mapping[str, type]] = {
         "atari_ram": envs.AtariRAMEnvConfig,
         "gridworld": envs.GridworldMazeEnvConfig,
         "labmaze": envs.LabMazeEnvConfig,
+        "stateless": envs.StatelessSimulatorConfig,
         "waterworld": envs.WaterworldMazeEnvConfig,
     },
     "trainer": {
