@@ -470,6 +470,7 @@ def test_a_transform_whose_state_cannot_be_set_is_refused_by_name(
         MCTSPlanner(env)
 
 
+@pytest.mark.filterwarnings(UNBATCHED)
 def test_a_normaliser_with_statistics_of_each_element_is_refused() -> None:
     env = numbered((2,))
     env.append_transform(norm(True))
