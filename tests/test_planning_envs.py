@@ -438,10 +438,10 @@ def norm(frozen: bool, kind: Any = VecNormV2) -> Transform:
     return transform
 
 
-UNBATCHED = "ignore:Support of VecNormV2 for unbatched container:UserWarning"
+VEC_NORM = "ignore:Support of VecNormV2 for:UserWarning"
 
 
-@pytest.mark.filterwarnings(UNBATCHED)
+@pytest.mark.filterwarnings(VEC_NORM)
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -470,7 +470,7 @@ def test_a_transform_whose_state_cannot_be_set_is_refused_by_name(
         MCTSPlanner(env)
 
 
-@pytest.mark.filterwarnings(UNBATCHED)
+@pytest.mark.filterwarnings(VEC_NORM)
 def test_a_normaliser_with_statistics_of_each_element_is_refused() -> None:
     env = numbered((2,))
     env.append_transform(norm(True))
@@ -537,7 +537,7 @@ def test_what_a_transform_of_ones_own_keeps_is_found_and_put_back(kind: Any, nam
         check_macro_env(env)
 
 
-@pytest.mark.filterwarnings(UNBATCHED)
+@pytest.mark.filterwarnings(VEC_NORM)
 def test_a_frozen_normaliser_and_counts_in_the_tensordict_are_planned_with() -> None:
     env = numbered()
     normaliser = VecNormV2(in_keys=["frame"])
