@@ -39,6 +39,7 @@ from torchrl_hmcts.envs.mazes import (
     wall_centers,
 )
 from torchrl_hmcts.envs.rendering import draw_maze
+from torchrl_hmcts.envs.stateless import StatelessSimulator
 from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 
 __all__ = [
@@ -60,6 +61,7 @@ __all__ = [
     "SharedMLP",
     "Snapshot",
     "SnapshotError",
+    "StatelessSimulator",
     "TorchRLGymnasiumEnv",
     "WaterworldMazeEnv",
     "check_mazes",

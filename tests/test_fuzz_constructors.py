@@ -318,6 +318,7 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(["NoveltyTest", "PlansGoals", "OptionWorker"], "a protocol"),
     **dict.fromkeys(["SkillObjective", "SkillPrior"], "a base class"),
     **dict.fromkeys(["AtariOptionPool", "AtariRAMEnv", "DeepMindLabEnv"], "starts processes"),
+    "StatelessSimulator": "takes an env, and has its own tests",
     **dict.fromkeys(
         ["ByteGoal", "FollowGoals", "JoinedWorkers", "OccasionalAction"], "belongs to an Atari game"
     ),

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
-from torchrl.envs import EnvBase
+from torch import Tensor
+from torchrl.envs import CatFrames, EnvBase, GymLikeEnv, Transform
+
+from torchrl_hmcts.carried_state import CarriedFrames, apart
+from torchrl_hmcts.direct_calls import is_plain
+from torchrl_hmcts.nesting import flat_transforms, set_states, step_states
+from torchrl_hmcts.transforms.base_masks import BaseMasks
+
+_AS_IT_IS = {"validated": True, "inplace": False, "non_blocking": False}
+
+_SPECS = (
+    *("action_spec", "full_action_spec", "action_keys", "action_key", "input_spec"),
+    *("reward_spec", "full_reward_spec", "reward_keys", "reward_key", "output_spec"),
+    *("observation_spec", "full_observation_spec", "state_spec", "full_state_spec"),
+    *("done_spec", "full_done_spec", "done_keys", "batch_size", "device", "_is_batched"),
+)
 
 if TYPE_CHECKING:
     from torchrl_hmcts.transforms.option import OptionTransform
@@ -25,8 +41,10 @@ class WorkerEnv:
     """
 
     def __init__(self, parent: EnvBase, transform: OptionTransform) -> None:
+        parent = apart(parent)  # rows come and go: their frames are in the tensordict
         base = parent.base_env
         self.batch_locked = parent.batch_locked
+        self.masks = BaseMasks(parent)
         if len(parent.reward_keys) != 1:
             raise ValueError(
                 f"OptionTransform sums one reward; {type(base).__name__} has the rewards "
@@ -37,6 +55,9 @@ class WorkerEnv:
         self.done_keys = [k for k in parent.done_keys if _last(k) == "done"]
         self._env = base if not len(parent.transform) else parent
         self._parent = parent
+        self._reward_shape = parent.full_reward_spec[self.reward_key].shape
+        self._worker = worker = transform.worker
+        self._plain = is_plain(worker) and list(worker.out_keys) == self.action_keys
         keys = [*parent.full_observation_spec.keys(True, True), *parent.state_keys]
         self._flat = all(isinstance(k, str) for k in (*keys, *parent.done_keys, self.reward_key))
         self._done_spec = parent.full_done_spec
@@ -49,19 +70,63 @@ class WorkerEnv:
         )
         # What the env writes under "next" in a base step.
         self.written = {_first(k) for k in (*keys, *parent.done_keys, self.reward_key)}
+        # One state at a time: there is nobody to wait for, nor to leave alone. What a worker tells
+        # its next step, and options inside an option, take the way of all others.
+        memory = any(_first(key) == "next" for key in getattr(worker, "out_keys", ()))
+        nested = _first(transform.duration_key) in self.written
+        self.alone = self.batch_locked and not (parent.batch_size or memory or nested)
+        self._frames = _frames_before(transform)
+        self._planning: WorkerEnv | None = None
         self._check_worker(parent, transform)
         if transform.trajectory is not None:
             self.trajectory_spec = transform.trajectory.make_spec(parent)
 
     def step(self, root: TensorDictBase) -> TensorDictBase:
         """Take a base step, without the bookkeeping of ``EnvBase.step`` where it can be spared."""
-        if self.batch_locked:
+        if self.batch_locked and not self.alone:
             return self._parent.step(root).get("next")
-        after = self._env._step(root)
+        after = step_states(self._env, root)
         if self._writes_all_done is None:
             self._writes_all_done = self._complete.issubset(after.keys(True, True))
+            self._reshapes = self.alone and after.get(self.reward_key).shape != self._reward_shape
         if not self._writes_all_done:
             self._env._complete_done(self._done_spec, after)
+        if self._reshapes:
+            after.set(self.reward_key, after.get(self.reward_key).reshape(self._reward_shape))
+        return after
+
+    def for_planning(self) -> WorkerEnv:
+        """The same, of an env that looks its specs up once: most of the cost of a GymEnv's step.
+
+        It is to be set to a state before it is stepped: what an env keeps in its attributes is in
+        another object than that which is acted in.
+        """
+        if self._planning is None:
+            self._planning = self
+            if isinstance(self._env, GymLikeEnv):
+                self._planning = copy(self)
+                self._planning._env = _with_constant_specs(self._env)
+        return self._planning
+
+    def set_state(self, state: TensorDictBase) -> TensorDictBase:
+        """Set the env to a state, and return all that it shows there."""
+        return self.masks.show(set_states(self._env, state).update(state))
+
+    def act(self, root: TensorDictBase) -> None:
+        """Let the worker write its action; a plain network is called on its tensors."""
+        worker = self._worker
+        if self._plain and not (worker._forward_hooks or worker._forward_pre_hooks):
+            action = worker.module(*[root.get(key) for key in worker.in_keys])
+            if isinstance(action, Tensor) and isinstance(self.action_keys[0], str):
+                root._set_str(self.action_keys[0], action, **_AS_IT_IS)
+                return
+        worker(root)
+
+    def leave(self, after: TensorDictBase) -> TensorDictBase:
+        """Hand the frames after an option's last base step to the CatFrames of the env itself."""
+        for frames in self._frames:
+            for in_key, out_key in zip(frames.in_keys, frames.out_keys, strict=True):
+                setattr(frames, f"_cat_buffers_{in_key}", after.get(out_key).clone())
         return after
 
     def step_mdp(
@@ -72,9 +137,9 @@ class WorkerEnv:
             root.set("next", after)
             return self._parent.step_mdp(root)
         # What the env wrote is the next root as it stands: nobody reads the reward in it.
-        following = after.copy() if self.batch_locked else after
+        following = after.copy() if self.batch_locked and not self.alone else after
         for key in carried:
-            following.set(key, root.get(key))
+            following._set_str(key, root._get_str(key, None), **_AS_IT_IS)
         return following
 
     def carried(self, root: TensorDictBase, after: TensorDictBase) -> list[NestedKey]:
@@ -133,6 +198,26 @@ class WorkerEnv:
                     f"{sorted(map(str, available))}. Put a transform that writes {key!r} before "
                     f"OptionTransform."
                 )
+
+
+def _with_constant_specs(env: EnvBase) -> EnvBase:
+    """A shallow copy of an env in which properties of its specs are attributes of its class."""
+    kind = type(env)
+    folded = {name: getattr(env, name) for name in _SPECS if hasattr(kind, name)}
+    view = copy(env)
+    view.__class__ = type(kind.__name__, (kind,), folded)
+    return view
+
+
+def _frames_before(transform: Transform) -> list[CatFrames]:
+    """The CatFrames, with buffers of their own, of the env that a transform is part of."""
+    found: list[CatFrames] = []
+    for before in flat_transforms(transform.container):
+        if before is transform:
+            break
+        if isinstance(before, CatFrames) and not isinstance(before, CarriedFrames):
+            found.append(before)
+    return found
 
 
 def _first(key: NestedKey) -> str:
