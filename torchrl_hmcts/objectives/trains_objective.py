@@ -11,7 +11,11 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
-from torchrl_hmcts.objectives.functional import run_network, takes_weights
+from torchrl_hmcts.objectives.functional import (
+    run_network,
+    takes_weights,
+    without_terminal_entries,
+)
 from torchrl_hmcts.objectives.priority import PriorityWeights
 from torchrl_hmcts.objectives.skill_objective import SkillObjective, check_reduction
 
@@ -103,6 +107,15 @@ class TrainsObjective(PriorityWeights):
         """Returns what N critics write, with N as the first dimension."""
         value = run_network(self.qvalue_network, params, tensordict)
         return TensorDict({self.qvalue_network.out_key: value}, batch_size=value.shape[:-1])
+
+    def _what_follows(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns the entries after transitions, in a copy, without those of terminal states."""
+        after = tensordict.get("next")
+        terminated = after.get(self.tensor_keys.terminated, None)
+        if terminated is None:
+            terminated = after.get(self.tensor_keys.done)
+        keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        return without_terminal_entries(after, terminated, keys)
 
     def _critic_losses(
         self, chosen: Tensor, target: Tensor, tensordict: TensorDictBase

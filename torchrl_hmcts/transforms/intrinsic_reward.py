@@ -116,6 +116,7 @@ class SkillReward(Transform):
         return next_tensordict.set(self.reward_key, reward)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = tensordict.copy()  # a storage may have handed out what it holds
         self._score(tensordict, tensordict.get("next"))
         return tensordict
 
