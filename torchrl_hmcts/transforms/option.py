@@ -6,7 +6,7 @@ Letters: *B batch of the tensordict, n its elements that still run, T ``max_step
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -17,7 +17,7 @@ from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Un
 from torchrl.envs import EnvBase, Transform
 
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
-from torchrl_hmcts.transforms.worker_env import WorkerEnv
+from torchrl_hmcts.transforms.worker_env import WorkerEnv, discounted, power, rows_of
 
 Termination = Callable[[TensorDictBase], Tensor]
 _ROOT = "_option_root_"
@@ -229,17 +229,17 @@ class OptionTransform(Transform):
                     rows = torch.arange(n, device=reward.device)
                 else:
                     out[rows[ended]] = after[ended]
-                duration[rows[ended]] = _rows(passed, ended)
+                duration[rows[ended]] = rows_of(passed, ended)
                 running = ~ended
                 rows = rows[running]
                 if not rows.numel():
                     break
                 root, after = root[running], after[running]
-                passed, last, discount = (_rows(x, running) for x in (passed, last, discount))
-            discount = discount * _power(self.gamma, last)
+                passed, last, discount = (rows_of(x, running) for x in (passed, last, discount))
+            discount = discount * power(self.gamma, last)
             root = self._advance(fit, root, after, carried)
             after = fit.step(root)
-            gained = _discounted(after.get(fit.reward_key), discount)
+            gained = discounted(after.get(fit.reward_key), discount)
             if rows is None:
                 reward += gained
             else:
@@ -280,13 +280,13 @@ class OptionTransform(Transform):
             running = running & ~self._ended(fit, root, out, passed)
             if not running.any():
                 break
-            discount = discount * _power(self.gamma, last)
+            discount = discount * power(self.gamma, last)
             root = self._advance(fit, root, out, carried)
             if batch_size and not running.all():
                 root.set("_step", running)
             after = fit.step(root)
             root = root.exclude("_step")
-            gained = _discounted(after.get(fit.reward_key), discount)
+            gained = discounted(after.get(fit.reward_key), discount)
             reward = torch.where(expand_as_right(running, reward), reward + gained, reward)
             last = fit.durations(after)
             duration = duration + running.unsqueeze(-1) * last
@@ -491,20 +491,6 @@ class OptionTransform(Transform):
             f"{type(self).__name__}(num_options={self.num_options}, max_steps={self.max_steps}, "
             f"gamma={self.gamma})"
         )
-
-
-def _rows(value: float | Tensor, mask: Tensor) -> Any:
-    return value[mask] if isinstance(value, Tensor) else value
-
-
-def _power(gamma: float, steps: int | Tensor) -> float | Tensor:
-    return gamma**steps if isinstance(steps, int) else gamma ** steps.to(torch.float64)
-
-
-def _discounted(reward: Tensor, discount: float | Tensor) -> Tensor:
-    if isinstance(discount, Tensor):
-        discount = discount.reshape(*discount.shape[:-1], *[1] * (reward.ndim - discount.ndim + 1))
-    return (reward * discount).to(reward.dtype)
 
 
 def _groups(key: NestedKey) -> list[NestedKey]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -163,7 +163,14 @@ class WorkerEnv:
                     f"OptionTransform."
                 )
         with torch.no_grad(), torch.random.fork_rng(devices=[]):  # the check draws no numbers
-            worker(td)
+            try:
+                worker(td)
+            except KeyError as error:
+                raise ValueError(
+                    f"The worker {name} reads an entry that {env_name} does not have: {error}. If "
+                    f"it is the worker's memory, append its make_tensordict_primer() before "
+                    f"OptionTransform."
+                ) from error
         for key in self.action_keys:
             action = td.get(key, None)
             spec = parent.full_action_spec[key]
@@ -187,6 +194,9 @@ class WorkerEnv:
             for key in names
             if unravel_key(key) not in below
         }
+        for key, (event, dtype) in memory.items():
+            if td.get(key, None) is None:  # begin_memory writes it
+                td.set(key, torch.zeros((*parent.batch_size, *event), dtype=dtype))
         seen = set(map(unravel_key, parent.full_observation_spec.keys(True, True)))
         lost = [key for key in memory if key not in seen]
         if lost and transform.worker_memory == "keep":
@@ -210,6 +220,23 @@ class WorkerEnv:
                     f"{sorted(map(str, available))}. Put a transform that writes {key!r} before "
                     f"OptionTransform."
                 )
+
+
+def rows_of(value: Any, mask: Tensor) -> Any:
+    """Return some rows of a tensor; a number is the same for all."""
+    return value[mask] if isinstance(value, Tensor) else value
+
+
+def power(gamma: float, steps: int | Tensor) -> float | Tensor:
+    """Return gamma ** steps, in double precision."""
+    return gamma**steps if isinstance(steps, int) else gamma ** steps.to(torch.float64)
+
+
+def discounted(reward: Tensor, discount: float | Tensor) -> Tensor:
+    """Return rewards ``[*B, ...]`` times a discount, a number or ``[*B, 1]``."""
+    if isinstance(discount, Tensor):
+        discount = discount.reshape(*discount.shape[:-1], *[1] * (reward.ndim - discount.ndim + 1))
+    return (reward * discount).to(reward.dtype)
 
 
 def _with_live_transforms(transform: Transform) -> TransformedEnv:
