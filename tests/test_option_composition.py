@@ -19,7 +19,6 @@ from torchrl.envs import (
     FrameSkipTransform,
     GymEnv,
     InitTracker,
-    ParallelEnv,
     RewardSum,
     SerialEnv,
     StepCounter,
@@ -28,9 +27,23 @@ from torchrl.envs import (
     TransformedEnv,
     VecNormV2,
 )
-from torchrl.envs.utils import check_env_specs, step_mdp
-from torchrl.modules import GRUModule, LSTMModule
+from torchrl.envs.utils import (
+    ExplorationType,
+    check_env_specs,
+    set_exploration_type,
+    step_mdp,
+)
+from torchrl.modules import GRUModule, LSTMModule, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
 
+from torchrl_hmcts.modules import (
+    ConcatSkillMLP,
+    SkillActor,
+    SkillDiscriminator,
+    SkillMLP,
+    SkillPolicy,
+)
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -290,8 +303,8 @@ class TestRecurrentWorker:
         sizes = after["trajectory", "memory"].abs().sum((-1, -2))
         assert sizes[0] == 0
         assert (sizes[1:] > 0).all()
+        base = TransformedEnv(GymEnv("Pendulum-v1"), InitTracker())
         with pytest.raises(ValueError, match=r"keep \['memory'\].*make_tensordict_primer"):
-            base = TransformedEnv(GymEnv("Pendulum-v1"), InitTracker())
             base.append_transform(OptionTransform(worker, 1, 3, worker_memory="keep"))
         with pytest.raises(ValueError, match="'reset'.*or 'keep'; got 'never'"):
             OptionTransform(worker, 1, 3, worker_memory="never")
@@ -429,3 +442,91 @@ class TestAutoReset:
         assert (data["next", "o_duration"].flatten()[done] < 6).all()
         begins = data["observation"][1:][done[:-1]]
         assert (begins.abs() < 0.06).all()  # CartPole's starts lie within 0.05
+
+
+def on_policy_worker() -> tuple[TensorDictSequential, ProbabilisticActor, ValueOperator]:
+    torch.manual_seed(0)
+    actor = ProbabilisticActor(
+        TensorDictModule(torch.nn.Linear(4, 2), ["observation"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
+        return_log_prob=True,
+    )
+    critic = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation"])
+    return TensorDictSequential(actor, critic), actor, critic
+
+
+def test_a_worker_trains_on_policy_from_what_its_options_hand_out() -> None:
+    worker, actor, critic = on_policy_worker()
+    kept = ["observation", "skill", "action", "action_log_prob", "state_value"]
+    kept += [("next", key) for key in ("observation", "reward", "done", "terminated")]
+    options = OptionTransform(worker, 1, 30, trajectory_keys=kept)
+    env, plain = TransformedEnv(cart_pole(), options), cart_pole()
+    check_env_specs(env)
+    starts = []
+    for one in (env, plain):
+        one.set_seed(0)
+        starts.append(one.reset())
+    with set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(0)
+        td = env.step(starts[0].set("option", torch.tensor(0)))
+        torch.manual_seed(0)
+        expected = plain.rollout(30, worker, auto_reset=False, tensordict=starts[1]).detach()
+    block = td["next", "trajectory"]
+    data = block[block["mask"]]
+    assert (data["skill"] == 0).all()
+    assert len(data) == len(expected) == td["next", "duration"].item()
+    loss = ClipPPOLoss(actor, critic)
+    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
+    losses = [loss(advantage(one.exclude("state_value"))) for one in (data, expected)]
+    for key in ("action_log_prob", "advantage", "value_target"):
+        kept_one, plain_one = (advantage(one.clone())[key] for one in (data, expected))
+        torch.testing.assert_close(kept_one, plain_one)
+    for key in ("loss_objective", "loss_critic", "loss_entropy"):
+        torch.testing.assert_close(losses[0][key], losses[1][key])
+
+
+@pytest.mark.parametrize(
+    ("ends", "got"),
+    [
+        (torch.zeros(2, dtype=torch.bool), r"torch.bool \[2\]"),
+        (torch.zeros((), dtype=torch.int64), r"torch.int64 \[\]"),
+        (False, "False"),
+    ],
+)
+def test_a_termination_of_another_form_is_refused(ends: Any, got: str) -> None:
+    options = level("o", "action", 4, termination=lambda td: ends)
+    env = TransformedEnv(ChainEnv(6), options)
+    message = rf"must return bool \[\] or \[1\], True where the option ends; it returned {got}"
+    with pytest.raises(ValueError, match=message):
+        env.step(env.reset().set("o", torch.tensor(1)))
+
+
+def test_more_options_than_a_worker_has_skills_are_refused() -> None:
+    actor = SkillActor(4, Categorical(2), num_skills=3, in_keys=["observation"])
+    with pytest.raises(ValueError, match="has 3 skills and is to run 4 options.*num_options=3"):
+        TransformedEnv(cart_pole(), OptionTransform(SkillPolicy(actor), 4, 5))
+
+
+@pytest.mark.parametrize(
+    ("features", "dtype", "message"),
+    [
+        (3, torch.float32, r"for 3 features of torch.float32 was given 4.*in_features=4"),
+        (4, torch.float64, r"of torch.float64 was given 4 of torch.float32.*DoubleToFloat"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["actor", "discriminator", "concatenated"])
+def test_a_network_that_does_not_fit_what_it_reads_says_so(
+    features: int, dtype: torch.dtype, message: str, kind: str
+) -> None:
+    keys = {"in_keys": ["observation"]}
+    if kind == "discriminator":
+        module: torch.nn.Module = SkillDiscriminator(features, num_skills=3, **keys)
+    else:
+        network = SkillMLP if kind == "actor" else ConcatSkillMLP
+        module = SkillActor(features, Categorical(2), num_skills=3, network=network, **keys)
+    given = 4 if features == 3 else features
+    message = message if kind != "concatenated" else "was given"
+    td = TensorDict(observation=torch.zeros(5, given), skill=torch.zeros(5, dtype=torch.int64))
+    with pytest.raises(ValueError, match=message):
+        module.to(dtype)(td.auto_batch_size_(1))

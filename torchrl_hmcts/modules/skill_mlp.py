@@ -232,7 +232,9 @@ class FeatureMLP(nn.Sequential):
         super().__init__(*hidden, linear(sizes[-2], sizes[-1]))
 
     def forward(self, *features: Tensor) -> Tensor:
-        return super().forward(_concatenate(features))
+        x = _concatenate(features)
+        check_features(x, next(self.parameters()))
+        return super().forward(x)
 
     def run(self, weights: Sequence[Tensor], *features: Tensor) -> Tensor:
         """Does what ``forward`` does, with weights in place of its own, as :meth:`SkillMLP.run`."""
@@ -254,6 +256,7 @@ def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor
     Layers are applied here, not called as modules: their weights may be stacked, and calling a
     small module costs as much as what it computes.
     """
+    check_features(x, weights[0])
     num_nets = weights[-1].shape[:-1]  # () or, stacked, (N,)
     batch = x.shape[:-1]
     if num_nets:
@@ -267,6 +270,18 @@ def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor
             x = x.relu() if type(layer) is nn.ReLU else layer(x)
     y = _linear(weights[i], weights[i + 1], x)
     return y.view(*num_nets, *batch, y.shape[-1]) if num_nets else y
+
+
+def check_features(x: Tensor, weight: Tensor) -> None:
+    """Raises ValueError unless features ``[*B, F]`` fit the weights of a first layer ``[O, F]``."""
+    if x.shape[-1] != weight.shape[-1] or x.dtype != weight.dtype:
+        fix = f"Build it with in_features={x.shape[-1]}, or give it other in_keys."
+        if x.shape[-1] == weight.shape[-1]:
+            fix = "Append DoubleToFloat() to the env, or change the network by network.to(dtype)."
+        raise ValueError(
+            f"A network for {weight.shape[-1]} features of {weight.dtype} was given "
+            f"{x.shape[-1]} of {x.dtype}, the entries of its in_keys side by side. {fix}"
+        )
 
 
 def own_weights(hidden: nn.Sequential, last: nn.Linear) -> list[Tensor]:

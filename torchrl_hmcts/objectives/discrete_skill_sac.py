@@ -72,8 +72,8 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
             ``True``.
         reduction (str, optional): ``"mean"``, ``"sum"`` or ``"none"``. Default: that of the
             objective, which must be the same.
-        skip_done_states (bool): an argument of ``DiscreteSACLoss`` without effect here: the entries after a
-            transition are never read where it terminates, and always where it is truncated.
+        skip_done_states (bool): ``DiscreteSACLoss`` has it; without effect here: what follows
+            a transition is never read where it terminates, and always where it is truncated.
             Default ``False``.
         deactivate_vmap (bool): run critics that cannot be stacked one after the other. Default
             ``False``.

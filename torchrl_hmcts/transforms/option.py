@@ -39,8 +39,8 @@ class OptionTransform(Transform):
     ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
     ``make_value_estimator``, any TorchRL loss is correct for the SMDP.
 
-    Where the env below counts base steps itself, as one with an OptionTransform does, k is their sum
-    and the rewards are discounted by it: options of options have any number of levels.
+    Where the env below counts base steps itself, as one with an OptionTransform does, k is their
+    sum and the rewards are discounted by it: options of options have any number of levels.
 
     Append it last of the transforms that must see base steps, each of which they see once; what is
     appended after it sees macro-steps. The worker is not registered as a sub-module: its owner
@@ -263,7 +263,7 @@ class OptionTransform(Transform):
         after: TensorDictBase,
         skipped: Tensor | None,
     ) -> TensorDictBase:
-        """Continue in an env of fixed batch size, which is told by ``_step`` whom to leave alone."""
+        """Continue in an env of fixed batch size; ``_step`` tells it whom to leave alone."""
         batch_size = after.batch_size
         out = after.clone()
         reward = out.get(fit.reward_key).clone()

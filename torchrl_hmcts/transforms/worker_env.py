@@ -152,6 +152,12 @@ class WorkerEnv:
         td = parent.fake_tensordict().exclude("next", *self.action_keys)
         skill = torch.zeros(self.option_shape, dtype=torch.int64, device=parent.device)
         td.set(transform.skill_key, skill)
+        known = getattr(worker, "num_skills", None)
+        if isinstance(known, int) and known < transform.num_options:
+            raise ValueError(
+                f"The worker {name} has {known} skills and is to run {transform.num_options} "
+                f"options. Make OptionTransform with num_options={known}, or a worker with more."
+            )
         own = {unravel_key(k)[1:] for k in getattr(worker, "out_keys", ()) if _first(k) == "next"}
         own = {unravel_key(k) for k in own}
         for key in getattr(worker, "in_keys", ()):
@@ -201,8 +207,8 @@ class WorkerEnv:
         lost = [key for key in memory if key not in seen]
         if lost and transform.worker_memory == "keep":
             raise ValueError(
-                f"The worker {name} is to keep {lost} from one option to the next, which {env_name} "
-                f"does not hand on. Append the worker's make_tensordict_primer() before "
+                f"The worker {name} is to keep {lost} from one option to the next, which "
+                f"{env_name} does not hand on. Append the worker's make_tensordict_primer() before "
                 f"OptionTransform, or take worker_memory='reset'."
             )
         return td, memory, lost
