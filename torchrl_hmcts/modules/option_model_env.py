@@ -19,6 +19,7 @@ from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_hmcts.modules.option_memory import OptionMemory
 from torchrl_hmcts.modules.option_model import OptionModel
+from torchrl_hmcts.nesting import known_gamma
 
 
 class OptionModelEnv(ModelBasedEnvBase):
@@ -137,6 +138,7 @@ class OptionModelEnv(ModelBasedEnvBase):
         self.min_reward = min_reward
         self.disagreement_coeff = disagreement_coeff
         self.max_disagreement = max_disagreement
+        self.gamma = known_gamma(env)  # for a planner: rewards were summed by it
         self.memory = memory
         self.readout = readout
         self.counter_keys = [unravel_key(key) for key in counter_keys]

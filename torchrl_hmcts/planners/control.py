@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -14,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_hmcts.planners.episodes import EpisodeStarts
 from torchrl_hmcts.planners.mcts import MCTSPlanner
 from torchrl_hmcts.planners.plan import Plan, extract_plans
 from torchrl_hmcts.planners.search import Search
@@ -32,11 +34,12 @@ class HierarchicalPolicy(TensorDictModuleBase):
     planner's choice is taken and planning starts anew after it.
 
     The plan lives in the tensordict, as a recurrent policy's state does: ``"plan"`` (int64
-    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made in this
-    episode (int64 ``[*B, 1]``), and with ``divergence`` ``"plan_states"`` (float32
-    ``[*B, L + 1, f]``). Where episodes follow each other in one rollout (auto-reset, collectors),
-    append TorchRL's ``InitTracker`` to the env: by its ``"is_init"`` the policy knows that a plan
-    is out of date.
+    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made so far, or
+    in this episode with TorchRL's ``InitTracker`` (int64 ``[*B, 1]``), and with ``divergence``
+    ``"plan_states"`` (float32 ``[*B, L + 1, f]``). Every episode begins with a new plan: the policy
+    looks at what the last step led to, and where it was the end, or another state than the one it
+    is to act in, the plan is out of date. Where it cannot see that, as in a tensordict that was
+    copied before the step, append TorchRL's ``InitTracker`` or ``StepCounter`` to the env.
 
     With ``reuse`` the trees are kept from one decision to the next: where the options carried out
     led to a state that the tree holds, its subtree is searched further
@@ -120,27 +123,30 @@ class HierarchicalPolicy(TensorDictModuleBase):
         if divergence is not None:
             self._plan_keys.append("plan_states")
         self.out_keys = [planner.option_key, *self._plan_keys]
+        self._starts = EpisodeStarts(self.in_keys, self._plan_keys[:4])
         self.reset()
 
     def reset(self) -> None:
-        """Forget the trees that ``reuse`` keeps; the next call plants new ones."""
+        """Forget the last step, and the trees that ``reuse`` keeps; the next call plants others."""
+        self._starts.forget()
         self._search: Search | None = None
         self._shape: torch.Size | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the next option of each row's plan, after planning where one is due."""
         shape = tensordict.batch_size
-        is_init, done, stepped = (tensordict.get(k, None) for k in ("is_init", "done", "_step"))
+        done, stepped = tensordict.get("done", None), tensordict.get("_step", None)
         kept = {key: tensordict.get(key, None) for key in self._plan_keys}
         if any(value is None for value in kept.values()):
             kept = self._no_plans(tensordict)
         else:
             kept = {key: value.clone() for key, value in kept.items()}
-        plan, length, step = kept["plan"], kept["plan_length"], kept["plan_step"]
-        if is_init is not None:
-            begins = is_init.reshape(shape)
-            for name in ("plan_length", "plan_step", "num_plans"):
+            begins, is_init = self._starts.seen(tensordict), tensordict.get("is_init", None)
+            for name in ("plan_length", "plan_step"):
                 kept[name][begins] = 0
+            if is_init is not None:
+                kept["num_plans"][is_init.reshape(shape)] = 0
+        plan, length, step = kept["plan"], kept["plan_length"], kept["plan_step"]
         needs = (step >= length).squeeze(-1)
         if self.replan_every is not None:
             needs = needs | (step >= self.replan_every).squeeze(-1)
@@ -158,7 +164,12 @@ class HierarchicalPolicy(TensorDictModuleBase):
         step += 1
         for key, value in kept.items():
             tensordict.set(key, value)
+        self._starts.remember(tensordict)
         return tensordict
+
+    def __getstate__(self) -> dict[str, Any]:
+        starts = EpisodeStarts(self.in_keys, self._plan_keys[:4])  # what was seen stays here
+        return {**super().__getstate__(), "_starts": starts}
 
     def _no_plans(self, td: TensorDictBase) -> dict[str, Tensor]:
         def zeros(*size: int, dtype: torch.dtype = torch.int64) -> Tensor:
@@ -207,6 +218,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         planner = self.planner
         if not self.reuse:
             search = planner.search(td[needs])
+            planner.simulator.leave(td)
             return extract_plans(search), torch.from_numpy(planner.choose(search))
         before, self._search = self._search, None  # an error leaves no half-moved trees behind
         if before is None or self._shape != td.batch_size:
@@ -215,6 +227,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
             search = before
             planner.advance(search, executed, td, where=needs)
         planner.resume(search, where=needs)
+        planner.simulator.leave(td)
         self._search, self._shape = search, td.batch_size
         rows = needs.reshape(-1).cpu()
         return extract_plans(search)[rows], torch.from_numpy(planner.choose(search))[rows]

@@ -12,13 +12,13 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
     TensorDictModuleBase,
     TensorDictSequential,
 )
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_hmcts.direct_calls import is_plain
 from torchrl_hmcts.planners.node_evaluation import SEED_KEY, Evaluator
 
 if TYPE_CHECKING:
@@ -195,7 +195,9 @@ class RolloutEvaluator:
     def bind(self, simulator: Simulator, gamma: float) -> None:
         """Take the simulator and the discount per base step of a planner; a planner calls this."""
         bound = self._simulator
-        if bound is not None and (bound.env is not simulator.env or gamma != self._gamma):
+        if bound is not None and (
+            bound.given_env is not simulator.given_env or gamma != self._gamma
+        ):
             raise ValueError(
                 "This RolloutEvaluator simulates for a planner with another env or discount. Give "
                 "each planner one of its own."
@@ -381,17 +383,7 @@ class _Network:
         self._inner = module
         self._index = out_keys.index(key)
         self._num_outputs = len(out_keys)
-        self._direct = (
-            isinstance(module, TensorDictModule)
-            and type(module).forward is TensorDictModule.forward
-            and type(module)._call_module is TensorDictModule._call_module
-            and module._kwargs is None
-            and module.method is None
-            and not module.method_kwargs
-            and not module._get_kwargs
-            and self.in_keys == module.in_keys
-            and out_keys == module.out_keys
-        )
+        self._direct = self.in_keys == module.in_keys and is_plain(module)
 
     def __call__(self, td: TensorDictBase) -> Tensor:
         inner = self._inner

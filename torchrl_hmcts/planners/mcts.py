@@ -15,8 +15,9 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase
+from torchrl.envs import EnvBase
 
+from torchrl_hmcts.nesting import option_gamma
 from torchrl_hmcts.planners.backups import Backup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
 from torchrl_hmcts.planners.chance import ProgressiveWidening
@@ -62,9 +63,12 @@ class MCTSPlanner(TensorDictModuleBase):
         env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or
             any env with a discrete action, that is stateless (``batch_locked=False``, its state in
             the tensordict) or can be set to a state by ``reset(td, set_state=True)``. The planner
-            changes the state of an env of the second kind: give it one of its own.
+            steps an env of the second kind away from its state, and sets it back to the state of
+            the call after a search. Transforms that remember something outside the tensordict
+            are refused, except ``CatFrames``: every node has its own frames, and planning changes
+            none of those of the env that is acted in.
         gamma (float, optional): discount per base step. Default: that of the env's
-            ``OptionTransform``, else 0.99.
+            ``OptionTransform``, through any nesting of envs; 0.99 for an env without durations.
         tree_policy: :class:`UCT` (default, ``c=1``), :class:`PUCT`, :class:`Gumbel`,
             :class:`TorchRLScore`, or a callable over :class:`NodeStatistics`.
         novelty (NoveltyTest, optional): which new nodes are worth searching, e.g.
@@ -100,8 +104,9 @@ class MCTSPlanner(TensorDictModuleBase):
             back its known value up once more, at no simulator's cost, so that visits and mean
             values are those of the textbook. Always ``"revisit"`` with ``chance`` or ``Gumbel``.
         duration_key, mask_key (NestedKey): entries of the env with the base steps of a step, int64
-            ``[*B, 1]`` (1 if the env has none), and the options that may be taken, bool ``[*B,
-            A]`` (all if it has none).
+            ``[*B, 1]`` (1 if the env has none or None is named), and the options that may be taken,
+            bool ``[*B, A]`` (all if it has none or None is named). Under an ``OptionTransform``
+            the mask of the base actions goes by another name, and is not that of the options.
         reward_key (NestedKey, optional): which reward, if the env has several.
         seed (int, optional): of the planner's random numbers; every call moves on from it. Default:
             drawn from torch's global generator when first needed.
@@ -148,16 +153,14 @@ class MCTSPlanner(TensorDictModuleBase):
         leaves_per_wave: int = 1,
         waves_in_flight: int = 1,
         exhausted: Literal["skip", "revisit"] = "skip",
-        duration_key: NestedKey = "duration",
-        mask_key: NestedKey = "action_mask",
+        duration_key: NestedKey | None = "duration",
+        mask_key: NestedKey | None = "action_mask",
         reward_key: NestedKey | None = None,
         seed: int | None = None,
         progress: Callable[[SearchProgress], None] | None = None,
     ) -> None:
         super().__init__()
-        if gamma is None:
-            gamma = _option_gamma(env)
-        if not 0.0 < gamma <= 1.0:
+        if gamma is not None and not 0.0 < gamma <= 1.0:
             raise ValueError(f"MCTSPlanner needs a discount gamma in (0, 1]; got {gamma}.")
         tree_policy = UCT() if tree_policy is None else tree_policy
         budget = SearchBudget() if budget is None else budget
@@ -191,6 +194,8 @@ class MCTSPlanner(TensorDictModuleBase):
             mask_key=mask_key,
             reward_key=reward_key,
         )
+        if gamma is None:  # after the simulator's check: it must be an env
+            gamma = option_gamma(env, self.simulator.duration_key)
         self.gamma = gamma
         self.tree_policy = tree_policy
         self.novelty = novelty
@@ -275,7 +280,10 @@ class MCTSPlanner(TensorDictModuleBase):
         """
         begin = time.perf_counter()
         search = self.plant(td, seed=seed)
-        return Growth(self, search).run(begin, np.arange(search.num_roots))
+        try:
+            return self._grow(search, begin, np.arange(search.num_roots))
+        finally:
+            self.simulator.leave(td)
 
     def plant(self, td: TensorDictBase, *, seed: int | None = None) -> Search:
         """Plant a tree at every state of ``td``; nothing is simulated until :meth:`resume`."""
@@ -314,7 +322,11 @@ class MCTSPlanner(TensorDictModuleBase):
 
         Only the roots ``where`` (bool ``[*B]``) are searched, all by default.
         """
-        return Growth(self, search).run(time.perf_counter(), _rows(search, where))
+        return self._grow(search, time.perf_counter(), _rows(search, where))
+
+    def _grow(self, search: Search, begin: float, rows: np.ndarray) -> Search:
+        with self.simulator.searching():
+            return Growth(self, search).run(begin, rows)
 
     def advance(
         self,
@@ -415,7 +427,7 @@ class MCTSPlanner(TensorDictModuleBase):
         """Plant the roots ``rows`` of a search, all by default, at the states ``root``."""
         simulator = self.simulator
         where = np.arange(search.num_roots) if rows is None else rows
-        with torch.no_grad():
+        with torch.no_grad(), simulator.searching():
             done = simulator.done(root)
             masks = simulator.masks(root)
             if len(masks) and not (masks.any(-1) | done).all():
@@ -461,14 +473,3 @@ def _rows(search: Search, where: Tensor | None) -> np.ndarray:
             f"{list(where.shape)}."
         )
     return np.flatnonzero(where.reshape(-1).cpu().numpy())
-
-
-def _option_gamma(env: EnvBase) -> float:
-    """The discount of the env's last OptionTransform, or of an env with options; else 0.99."""
-    transform = getattr(env, "transform", None)
-    transforms = transform if isinstance(transform, Compose) else [transform]
-    for candidate in (*reversed(list(transforms)), getattr(env, "base_env", env)):
-        gamma = getattr(candidate, "gamma", None)
-        if gamma is not None and hasattr(candidate, "num_options"):
-            return float(gamma)
-    return 0.99

@@ -6,6 +6,7 @@ Letters: *B batch of the tensordict.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
@@ -13,7 +14,9 @@ from tensordict.utils import NestedKey
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
+from torchrl_hmcts.nesting import env_name
 from torchrl_hmcts.planners.control import HierarchicalPolicy
+from torchrl_hmcts.planners.episodes import EpisodeStarts
 from torchrl_hmcts.planners.mcts import MCTSPlanner
 
 StateMap = Callable[[TensorDictBase], TensorDictBase]
@@ -77,11 +80,12 @@ class ModelBasedControl(TensorDictModuleBase):
         self.out_keys = list(self.policy.out_keys)
         read = self.policy.in_keys if state_map is None else getattr(state_map, "in_keys", [])
         self.in_keys = [unravel_key(key) for key in read]
+        self._starts = EpisodeStarts(self.in_keys, self.policy._plan_keys[:4])
         if env is not None:
             self._check(env, planner)
 
     def _check(self, env: EnvBase, planner: MCTSPlanner) -> None:
-        name, key = type(getattr(env, "base_env", env)).__name__, planner.option_key
+        name, key = env_name(env), planner.option_key
         model = planner.simulator.env
         theirs: TensorSpec | None = env.full_action_spec.get(key, None)
         ours = model.full_action_spec[key]
@@ -105,6 +109,7 @@ class ModelBasedControl(TensorDictModuleBase):
     def reset(self) -> None:
         """Forget what the policy keeps between decisions."""
         self.policy.reset()
+        self._starts.forget()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the option to take, and the plan that it begins."""
@@ -124,10 +129,19 @@ class ModelBasedControl(TensorDictModuleBase):
             value = tensordict.get(key, None)
             if value is not None:  # the plan so far, and who needs none
                 state.set(key, value)
+        length = state.get("plan_length", None)
+        if length is not None:  # the real env sees more starts than the model's state shows
+            begins = self._starts.seen(tensordict).unsqueeze(-1)
+            state.set("plan_length", length.masked_fill(begins, 0))
         self.policy(state)
         for key in self.out_keys:
             tensordict.set(key, state.get(key))
+        self._starts.remember(tensordict)
         return tensordict
+
+    def __getstate__(self) -> dict[str, Any]:
+        starts = EpisodeStarts(self.in_keys, self.policy._plan_keys[:4])  # what was seen stays
+        return {**super().__getstate__(), "_starts": starts}
 
 
 def _missing(keys: Sequence[NestedKey], available: set[NestedKey]) -> list[NestedKey]:

@@ -12,7 +12,8 @@ Letters: ``m`` states of one call, ``A`` options.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,11 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Categorical, OneHot
-from torchrl.envs import EnvBase
+from torchrl.data import Categorical, OneHot, TensorSpec
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_hmcts.carried_state import ForeignStates, planning_env
+from torchrl_hmcts.nesting import env_name, flat_transforms, set_states, step_states
 
 _BESIDE = ("step_async", "step_wait", "step_abandon")
 
@@ -32,8 +36,8 @@ class Simulator:
     Args:
         env: the macro environment.
         extra_keys: further entries that novelty tests and evaluators read.
-        duration_key: base steps of a macro-step.
-        mask_key: options that may be taken.
+        duration_key: base steps of a macro-step. None: 1.
+        mask_key: options that may be taken. None: all.
         reward_key: Default: the env's only reward.
 
     Raises:
@@ -45,16 +49,16 @@ class Simulator:
         env: EnvBase,
         *,
         extra_keys: Sequence[NestedKey] = (),
-        duration_key: NestedKey = "duration",
-        mask_key: NestedKey = "action_mask",
+        duration_key: NestedKey | None = "duration",
+        mask_key: NestedKey | None = "action_mask",
         reward_key: NestedKey | None = None,
     ) -> None:
-        name = type(getattr(env, "base_env", env)).__name__
         if not isinstance(env, EnvBase):
             raise TypeError(
                 f"MCTSPlanner plans in a TorchRL env; got {type(env).__name__}. Wrap a Gymnasium "
                 f"env as described in TorchRL's GymWrapper, with a state that can be set."
             )
+        name = env_name(env)
         self.stateless = not env.batch_locked
         if not (env._supports_set_state or self.stateless):
             raise ValueError(
@@ -62,14 +66,23 @@ class Simulator:
                 f"(_supports_set_state={env._supports_set_state}, "
                 f"batch_locked={env.batch_locked}). Use one that is stateless, e.g. "
                 f"WaterworldMazeEnv() or GridworldMazeEnv(), or one whose reset(td, "
-                f"set_state=True) restores the state in td."
+                f"set_state=True) restores the state in td. If all that its step reads is in the "
+                f"tensordict already, say so by StatelessSimulator(env)."
             )
         if len(env.action_keys) != 1:
             raise ValueError(
                 f"MCTSPlanner chooses one option per step; {name} has the actions "
                 f"{env.action_keys}."
             )
-        self.env = env
+        if not list(env.full_state_spec.keys(True, True)):
+            raise ValueError(
+                f"{name} has an empty state_spec, so its state cannot be stored in a tree. Declare "
+                f"in state_spec every entry that its _step reads or that reset(td, set_state=True) "
+                f"restores (for TorchRL's MujocoEnv qpos and qvel, by a transform)."
+            )
+        self.given_env, self.env = env, planning_env(env)
+        self._foreign = ForeignStates(env)
+        env = self.env
         # Of the type: a TransformedEnv hands on attributes, which would go past its transforms.
         self.works_beside = self.stateless and all(hasattr(type(env), name) for name in _BESIDE)
         self.option_key = env.action_keys[0]
@@ -77,39 +90,84 @@ class Simulator:
         self._one_hot = isinstance(spec, OneHot)
         self._option_dtype = spec.dtype
         boxes = getattr(spec.space, "boxes", [spec.space])  # the Multi specs have one per entry
-        if not isinstance(spec, (Categorical, OneHot)) or len(boxes) != 1:
+        # [] for most envs, [1] under an ActionDiscretizer
+        shape = () if self._one_hot else tuple(spec.shape[env.batch_dims :])
+        single = len(boxes) == 1 and _one_number(
+            spec.shape[:-1] if self._one_hot else spec.shape, env
+        )
+        if not isinstance(spec, (Categorical, OneHot)) or not single:
             raise ValueError(
                 f"MCTSPlanner searches one discrete action; {name} has {spec}. Put the env under "
                 f"an OptionTransform, or discretise its action with torchrl's ActionDiscretizer."
             )
         self.num_options = int(boxes[0].n)
-        # [] for most envs, [1] under an ActionDiscretizer
-        self._option_shape = () if self._one_hot else tuple(spec.shape[env.batch_dims :])
+        self._option_shape = shape
         self.state_keys = [unravel_key(k) for k in env.full_state_spec.keys(True, True)]
-        if not self.state_keys:
-            raise ValueError(
-                f"{name} has an empty state_spec, so its state cannot be stored in a tree. Declare "
-                f"in state_spec every entry that its _step reads or that reset(td, set_state=True) "
-                f"restores (for TorchRL's MujocoEnv qpos and qvel, by a transform)."
-            )
         available = {unravel_key(k) for k in env.full_observation_spec.keys(True, True)}
         available |= set(self.state_keys)
         self._available, self._name = available, name
         extra = [unravel_key(k) for k in extra_keys]
         self._check_available(extra, "The novelty test or an evaluator")
         self.kept_keys = list(self.state_keys)
-        self.duration_key = unravel_key(duration_key) if duration_key in available else None
-        self.mask_key = unravel_key(mask_key) if mask_key in available else None
+        shown = [None if key is None else unravel_key(key) for key in (duration_key, mask_key)]
+        self.duration_key, self.mask_key = (k if k in available else None for k in shown)
         self.root_keys = list(dict.fromkeys([*self.state_keys, *extra]))
         if self.mask_key is not None:
             self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))
         self._reward_key = _reward_key(env, name, reward_key)
         self._done_spec = env.full_done_spec_unbatched  # a call has m states, not env.batch_size
-        leaves = self._done_keys = [unravel_key(k) for k in env.done_keys]
-        self._done_key = next(k for k in leaves if _last(k) == "done")
-        self._terminated_key = next((k for k in leaves if _last(k) == "terminated"), self._done_key)
+        self._done_keys = [unravel_key(k) for k in env.done_keys]
+        self._done_key, self._terminated_key = _done_keys(env, name)
+        self._check_specs(env)
+        last = flat_transforms(env)[-1:] if type(env) is TransformedEnv else []
+        self._run_from = getattr(last[0], "run_from", None) if last else None
         self._ones = np.ones(0, np.int64)
         self._no_masks = np.zeros((0, self.num_options), np.bool_)
+
+    def _check_specs(self, env: EnvBase) -> None:
+        """Refuse entries of which a search would read other numbers than are meant."""
+        name = self._name
+        reward = env.full_reward_spec[self._reward_key]
+        if not _one_number(reward.shape, env) or reward.dtype.is_complex:
+            raise ValueError(
+                f"MCTSPlanner plans for one reward, a real number per step; the reward "
+                f"{self._reward_key!r} of {name} is {_described(reward, env)}. Make one number of "
+                f"it, e.g. by torchrl's LineariseRewards or a transform of your own."
+            )
+        for key in (self._done_key, self._terminated_key):
+            done = env.full_done_spec[key]
+            if not _one_number(done.shape, env) or done.dtype != torch.bool:
+                raise ValueError(
+                    f"MCTSPlanner needs one end per state, a bool [1]; {key!r} of {name} is "
+                    f"{_described(done, env)}. Reduce it, e.g. by any(-1, keepdim=True), in a "
+                    f"transform."
+                )
+        shown = env.full_observation_spec
+        if self.duration_key is not None:
+            duration = shown[self.duration_key]
+            integer = not (duration.dtype.is_floating_point or duration.dtype.is_complex)
+            if not _one_number(duration.shape, env) or not integer or duration.dtype == torch.bool:
+                raise ValueError(
+                    f"MCTSPlanner reads the base steps of a step, an int64 [1], from "
+                    f"{self.duration_key!r}; in {name} that is {_described(duration, env)}. Name "
+                    f"another entry by duration_key, or None if every step is one."
+                )
+        if self.mask_key is not None:
+            mask = shown[self.mask_key]
+            if mask.shape[env.batch_dims :].numel() != self.num_options:
+                raise ValueError(
+                    f"MCTSPlanner reads which of the {self.num_options} options may be taken, bool "
+                    f"[{self.num_options}], from {self.mask_key!r}; in {name} that is "
+                    f"{_described(mask, env)}. Name the options' own mask by mask_key, or None if "
+                    f"all may be taken."
+                )
+            below = _masks_actions_below_options(env, self.mask_key)
+            if below:
+                raise ValueError(
+                    f"MCTSPlanner reads which options may be taken from {self.mask_key!r}, which "
+                    f"{name} writes of its {below} base actions, below the OptionTransform. Write "
+                    f"the options' own mask in a transform behind it, or pass mask_key=None."
+                )
 
     def root(self, td: TensorDictBase) -> TensorDictBase:
         """Return the root states in one batch dimension, after checking them."""
@@ -152,7 +210,10 @@ class Simulator:
     def step(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Take option ``options[i]`` in state ``i``; return what the env writes as next."""
         self._choose(states, options)
-        after = self.env._step(states) if self.stateless else self._step_in_turn(states)
+        if self.stateless:
+            after = step_states(self.env, states)
+        else:
+            after = self._step_in_turn(states, options)
         return self._completed(states, after)
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
@@ -189,9 +250,11 @@ class Simulator:
                 after.set(key, states.get(key))
         return after
 
-    def _step_in_turn(self, states: TensorDictBase) -> TensorDictBase:
+    def _step_in_turn(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Set an env with a state of its own to as many states as it holds at a time, and step."""
         env, m = self.env, len(states)
+        if not env.batch_dims:
+            return self._step_one_by_one(states, options)
         size = env.batch_size.numel()
         parts = []
         for begin in range(0, m, size):
@@ -202,6 +265,54 @@ class Simulator:
             after = env.step(before.update(part)).get("next")
             parts.append(after.reshape(-1)[: min(size, m - begin)])
         return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    def _step_one_by_one(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
+        """Set an env of one state to each of the states, and step."""
+        parts = []
+        alone = states.select(*self.state_keys).unbind(0)
+        for state, option in zip(alone, torch.from_numpy(options), strict=True):
+            after = None if self._run_from is None else self._run_from(state, option)
+            if after is None:
+                root = set_states(self.env, state).update(state)
+                _put(root, self.option_key, self.encode(option))
+                after = step_states(self.env, root)
+            parts.append(after)
+        stacked: TensorDictBase = torch.stack(parts)
+        return stacked
+
+    @contextmanager
+    def searching(self) -> Iterator[None]:
+        """Let nothing that a search does stay in the transforms of the env.
+
+        Raises:
+            ValueError: at the end, if a transform of another project kept something.
+        """
+        before = self._foreign.read()
+        try:
+            yield
+        finally:
+            changed = self._foreign.changed(before)
+            if changed is not None:
+                self._foreign.put_back(before)
+        if changed is not None:
+            raise ValueError(
+                f"{changed} of {self._name} changed while MCTSPlanner searched: a transform keeps "
+                f"a state in itself, which cannot be set, so that nodes of the tree see each "
+                f"other's. Keep it in the tensordict: read it from the first argument of _step, "
+                f"write it to the second, and declare it in the state and observation specs."
+            )
+
+    def leave(self, td: TensorDictBase) -> None:
+        """Set an env with a state of its own back to ``td``, if that is a state of all of it."""
+        if self.stateless or td.batch_size != self.env.batch_size:
+            return
+        goes_on = ~torch.from_numpy(self.done(td.reshape(-1))).reshape(*td.batch_size, 1)
+        if goes_on.any():  # a state at its end is reset by whoever acts
+            state = td.select(*self.state_keys)
+            if not goes_on.all():
+                for key in self.env.reset_keys:
+                    state.set(key, goes_on.to(self.env.device))
+            self.env.reset(state, set_state=True)
 
     def encode(self, options: Tensor) -> Tensor:
         """Return option indices ``[*B]`` in the form of the env's action spec."""
@@ -242,13 +353,15 @@ class Simulator:
             if len(self._ones) != after.batch_size[0]:
                 self._ones = np.ones(after.batch_size[0], np.int64)
             return self._ones
-        return _array(_required(after, self.duration_key))
+        durations = _array(_required(after, self.duration_key))
+        return durations if durations.dtype == np.int64 else durations.astype(np.int64)
 
     def masks(self, td: TensorDictBase) -> np.ndarray:
         """Return which options may be taken, bool ``[m, A]``, or ``[0, A]`` for all."""
         if self.mask_key is None:
             return self._no_masks
-        return _array(_required(td, self.mask_key)).reshape(-1, self.num_options)
+        masks = _array(_required(td, self.mask_key)).reshape(-1, self.num_options)
+        return masks if masks.dtype == np.bool_ else masks.astype(np.bool_)
 
     def _flag(self, td: TensorDictBase, key: NestedKey) -> np.ndarray:
         flag = _entry(td, key)
@@ -297,6 +410,45 @@ def _reward_key(env: EnvBase, name: str, reward_key: NestedKey | None) -> Nested
             f"{reward_key!r}. Name one of them, e.g. reward_key={keys[0]!r}."
         )
     return keys[0]
+
+
+def _masks_actions_below_options(env: EnvBase, mask_key: NestedKey) -> int:
+    """The number of base actions if the mask is theirs and nobody behind the options wrote it."""
+    transforms = flat_transforms(env) if isinstance(env, TransformedEnv) else []
+    for transform in reversed(transforms):
+        if mask_key in map(unravel_key, transform.out_keys):
+            return 0
+        if hasattr(transform, "num_options"):  # the options are made here
+            parent = transform.parent
+            if mask_key not in map(unravel_key, parent.full_observation_spec.keys(True, True)):
+                return 0
+            actions = [getattr(s.space, "n", 0) for s in parent.full_action_spec.values(True, True)]
+            numel = parent.full_observation_spec[mask_key].shape[parent.batch_dims :].numel()
+            return next((int(n) for n in actions if n == numel), 0)
+    return 0
+
+
+def _done_keys(env: EnvBase, name: str) -> tuple[NestedKey, NestedKey]:
+    """The entries that say that a state is the last of its episode, and that it is terminal."""
+    keys = [unravel_key(k) for k in env.done_keys]
+    ends = [k for k in keys if _last(k) == "done"]
+    if "done" not in ends and len(ends) != 1:
+        raise ValueError(
+            f"MCTSPlanner needs one entry that says that an episode is over; {name} has {ends}. "
+            f'Write "done" in a transform, e.g. where all of them are.'
+        )
+    done = "done" if "done" in ends else ends[0]
+    terminated = "terminated" if isinstance(done, str) else (*done[:-1], "terminated")
+    return done, terminated if terminated in keys else done
+
+
+def _one_number(shape: torch.Size, env: EnvBase) -> bool:
+    """Whether an entry has one number per element of the env's batch."""
+    return shape[: env.batch_dims] == env.batch_size and shape[env.batch_dims :].numel() == 1
+
+
+def _described(spec: TensorSpec, env: EnvBase) -> str:
+    return f"{spec.dtype} {list(spec.shape[env.batch_dims :])}"
 
 
 def _last(key: NestedKey) -> str:

@@ -43,6 +43,7 @@ class TableEnv(EnvBase):
 
     batch_locked = False
     _supports_set_state = True
+    gamma = 0.99  # per base step: what a planner takes where it is told nothing else
 
     def __init__(
         self,

@@ -16,8 +16,9 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
+from torchrl_hmcts.transforms.env_below import discounted, power, rows_of
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
-from torchrl_hmcts.transforms.worker_env import WorkerEnv, discounted, power, rows_of
+from torchrl_hmcts.transforms.worker_env import WorkerEnv
 
 Termination = Callable[[TensorDictBase], Tensor]
 _ROOT = "_option_root_"
@@ -34,6 +35,10 @@ class OptionTransform(Transform):
 
     the done flags, and observation and state after the last base step. Every batch element has its
     own option and its own end; an element that has ended does not step any more.
+
+    The base env's ``"action_mask"`` forbids base actions and no options: worker and termination
+    read it by its name, above it is ``"base_action_mask"``. A transform behind this one may write
+    the options' own ``"action_mask"``, e.g. :class:`SkillMaskTransform`.
 
     TorchRL's estimators discount by ``gamma ** steps_to_next_obs``. With
     ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
@@ -172,12 +177,12 @@ class OptionTransform(Transform):
                 f"planner or policy, or with env.rand_action(td)."
             )
         private = [key for key in tensordict.keys() if str(key).startswith(_ROOT)]
-        inner = tensordict.exclude("_step", "next", *private)
+        inner = fit.masks.show(tensordict).exclude("_step", "next", *private)
         inner.set(self.skill_key, self._skill(option, fit.option_shape, tensordict.batch_size))
         if self.worker_memory == "reset":
             fit.begin_memory(inner)
         with torch.no_grad():
-            self.worker(inner)
+            fit.act(inner)
         for key in (self.skill_key, *fit.action_keys):
             tensordict.set(key, inner.get(key))
         # For _step: all that the worker wrote, as it wrote it.
@@ -204,11 +209,13 @@ class OptionTransform(Transform):
         if flatten:
             root, next_tensordict = root.reshape(-1), next_tensordict.reshape(-1)
         with torch.no_grad():
-            if fit.batch_locked or not batch_size:
+            if fit.alone and self.trajectory is None:
+                out = self._run_alone(fit, root, next_tensordict)
+            elif fit.batch_locked or not batch_size:
                 out = self._run_locked(fit, root, next_tensordict, skipped)
             else:
                 out = self._run(fit, root, next_tensordict)
-        return out.reshape(batch_size) if flatten else out
+        return fit.leave(out.reshape(batch_size) if flatten else out)
 
     def _run(self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
         """Continue in a stateless env, with fewer rows whenever some have ended."""
@@ -256,6 +263,50 @@ class OptionTransform(Transform):
             duration[rows] = passed
         return self._finish(fit, out, reward, duration, trajectory)
 
+    def run_from(self, state: TensorDictBase, option: Tensor) -> TensorDictBase | None:
+        """Run an option from a state of an env that holds one; what ``step`` writes as next.
+
+        A planner's short way past the bookkeeping of ``reset(set_state=True)`` and ``step``.
+
+        Args:
+            state (TensorDictBase): the env's ``state_spec``, without a batch dimension.
+            option (Tensor): int64, without a dimension.
+
+        Returns:
+            The outcome, or None where ``reset`` and ``step`` are needed.
+        """
+        fit = self._fitted()
+        if not fit.alone or self.trajectory is not None:
+            return None
+        with torch.no_grad():
+            root = fit.set_state(state)
+            root.set(self.skill_key, option)
+            fit.act(root)
+            return self._run_alone(fit, root, fit.step(root))
+
+    def _run_alone(
+        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase
+    ) -> TensorDictBase:
+        """Continue in an env of one state, whose rows need no masks."""
+        reward = after.get(fit.reward_key)
+        carried = fit.carried(root, after)
+        discount, taken = 1.0, 1
+        while taken < self.max_steps and not self._has_ended(fit, root, after, taken):
+            discount *= self.gamma
+            root = self._advance(fit, root, after, carried)
+            after = fit.step(root)
+            reward = reward + discount * after.get(fit.reward_key)
+            taken += 1
+        duration = torch.full((1,), taken, dtype=torch.int64, device=reward.device)
+        return self._finish(fit, after.copy(), reward, duration, None)
+
+    def _has_ended(
+        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, taken: int
+    ) -> bool:
+        if self.termination is None and len(fit.done_keys) == 1:
+            return after.get(fit.done_keys[0]).item()
+        return self._ended(fit, root, after, taken).item()
+
     def _run_locked(
         self,
         fit: WorkerEnv,
@@ -300,7 +351,7 @@ class OptionTransform(Transform):
     ) -> TensorDictBase:
         """The next root: what the env wrote becomes its input, and the worker acts on it."""
         root = fit.step_mdp(root, after, carried)
-        self.worker(root)
+        fit.act(root)
         return root
 
     def _ended(
@@ -353,15 +404,20 @@ class OptionTransform(Transform):
     ) -> TensorDictBase:
         if fit.unannounced:
             out = out.exclude(*fit.unannounced)
+        fit.masks.hide(out)
         out.set(fit.reward_key, reward)
         out.set(self.duration_key, duration)
         if trajectory is not None:
             out.set(OptionTrajectory.KEY, trajectory.data)
         return out
 
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+        return tensordict if tensordict is None else self._fitted().masks.show(tensordict.copy())
+
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        self._fitted().masks.hide(tensordict_reset)
         shape, device = tensordict_reset.batch_size, tensordict_reset.device
         zero = torch.zeros((*shape, 1), dtype=torch.int64, device=device)
         tensordict_reset.set(self.duration_key, zero)
@@ -415,14 +471,18 @@ class OptionTransform(Transform):
             spec[group] = Composite(shape=shape, device=device)
         spec[self.option_key] = option
         input_spec["full_action_spec"] = spec
+        masks = self._fitted().masks
         state = input_spec.get("full_state_spec", None)
+        if state is not None:
+            masks.hide_specs(state)
         if not self._fitted().batch_locked and state is not None and not state.is_empty():
             # The first step reads and hands out what the env showed: a stored state needs it.
             observed = self.parent.full_observation_spec
             handed = () if self.trajectory is None else self.trajectory.keys
             for key in map(unravel_key, (*getattr(self.worker, "in_keys", ()), *handed)):
-                if key in observed.keys(True, True) and key not in state.keys(True, True):
-                    state[key] = observed[key].clone()
+                above = masks.name(key)
+                if key in observed.keys(True, True) and above not in state.keys(True, True):
+                    state[above] = observed[key].clone()
         return input_spec
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
@@ -433,7 +493,7 @@ class OptionTransform(Transform):
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        observation_spec = observation_spec.clone()
+        observation_spec = self._fitted().masks.hide_specs(observation_spec.clone())
         shape, device = observation_spec.shape, observation_spec.device
         observation_spec[self.duration_key] = Bounded(
             0,

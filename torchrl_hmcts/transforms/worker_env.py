@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
-from torchrl.data import Bounded, Composite, TensorSpec
-from torchrl.envs import (
-    AutoResetTransform,
-    Compose,
-    EnvBase,
-    FrameSkipTransform,
-    Transform,
-    TransformedEnv,
-    VecGymEnvTransform,
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs import CatFrames, EnvBase, Transform
+
+from torchrl_hmcts.carried_state import CarriedFrames
+from torchrl_hmcts.direct_calls import is_plain
+from torchrl_hmcts.nesting import flat_transforms, set_states, step_states
+from torchrl_hmcts.transforms.base_masks import BaseMasks
+from torchrl_hmcts.transforms.env_below import (
+    check_after,
+    check_holds_elements,
+    duration_key,
+    env_below,
+    group_shape,
+    transforms_before,
 )
-from torchrl.envs.gym_like import GymLikeEnv
+
+_AS_IT_IS = {"validated": True, "inplace": False, "non_blocking": False}
 
 if TYPE_CHECKING:
     from torchrl_hmcts.transforms.option import OptionTransform
@@ -36,31 +42,35 @@ class WorkerEnv:
     """
 
     def __init__(self, transform: OptionTransform) -> None:
-        parent = _with_live_transforms(transform)
+        parent = env_below(transform)
         base = parent.base_env
         self.batch_locked = parent.batch_locked
+        self.masks = BaseMasks(parent)
         if len(parent.reward_keys) != 1:
             raise ValueError(
                 f"OptionTransform sums one reward; {type(base).__name__} has the rewards "
                 f"{parent.reward_keys}. Reduce them to one with a transform before it."
             )
         if transform.max_steps > 1:
-            _check_holds_elements(parent)
-        _check_after(transform)
+            check_holds_elements(parent)
+        check_after(transform)
         self.reward_key = parent.reward_keys[0]
         self.action_keys = list(parent.action_keys)
         self.done_keys = [k for k in parent.done_keys if _last(k) == "done"]
-        self.duration_key = _duration_key(parent, transform)
+        self.duration_key = duration_key(parent, transform)
         self._env = base if not len(parent.transform) else parent
         self._parent = parent
-        self.option_shape = _group_shape(parent, transform.option_key)
+        self.option_shape = group_shape(parent, transform.option_key)
+        self._reward_shape = parent.full_reward_spec[self.reward_key].shape
+        self._worker = worker = transform.worker
+        self._plain = is_plain(worker) and list(worker.out_keys) == self.action_keys
         keys = [*parent.full_observation_spec.keys(True, True), *parent.state_keys]
         self._done_spec = parent.full_done_spec
         self._complete = set(map(unravel_key, parent.done_keys))
         self._writes_all_done: bool | None = None  # known after the first step
         hooks = Transform._post_step_mdp_hooks
         self._has_hooks = parent.base_env._post_step_mdp_hooks is not None or any(
-            type(t)._post_step_mdp_hooks is not hooks for t in _flat(parent.transform)
+            type(t)._post_step_mdp_hooks is not hooks for t in flat_transforms(parent)
         )
         self._check_termination(parent, transform)
         root, self.memory, self.unannounced = self._try_worker(parent, transform)
@@ -73,22 +83,55 @@ class WorkerEnv:
         )
         # What the env writes under "next" in a base step.
         self.written = {_first(k) for k in (*keys, *parent.done_keys, self.reward_key)}
+        # One state at a time: there is nobody to wait for, nor to leave alone. What a worker tells
+        # its next step, and options inside an option, take the way of all others.
+        alone = self.batch_locked and not parent.batch_size
+        self.alone = alone and not self.memory and self.duration_key is None
+        self._frames = [  # with buffers of their own
+            t
+            for t in transforms_before(transform)
+            if isinstance(t, CatFrames) and not isinstance(t, CarriedFrames)
+        ]
         if transform.trajectory is not None:
             self.trajectory_spec = transform.trajectory.make_spec(parent, root, self.memory)
 
     def step(self, root: TensorDictBase) -> TensorDictBase:
         """Take a base step, without the bookkeeping of ``EnvBase.step`` where it can be spared."""
-        if self.batch_locked:
+        if self.batch_locked and not self.alone:
             return self._parent.step(root).get("next")
-        after = self._env._step(root)
+        after = step_states(self._env, root)
         if self._writes_all_done is None:
             self._writes_all_done = self._complete.issubset(after.keys(True, True))
+            self._reshapes = self.alone and after.get(self.reward_key).shape != self._reward_shape
         if not self._writes_all_done:
             self._env._complete_done(self._done_spec, after)
+        if self._reshapes:
+            after.set(self.reward_key, after.get(self.reward_key).reshape(self._reward_shape))
         if self.memory:
             kept = root.get("next", None)
-            if kept is not None:
-                after.update(kept.exclude(*after.keys(True, True)))
+            if kept is not None:  # a primer has written the memory of before
+                after.update(kept.select(*self.memory))
+        return after
+
+    def set_state(self, state: TensorDictBase) -> TensorDictBase:
+        """Set the env to a state, and return all that it shows there."""
+        return self.masks.show(set_states(self._env, state).update(state))
+
+    def act(self, root: TensorDictBase) -> None:
+        """Let the worker write its action; a plain network is called on its tensors."""
+        worker = self._worker
+        if self._plain and not (worker._forward_hooks or worker._forward_pre_hooks):
+            action = worker.module(*[root.get(key) for key in worker.in_keys])
+            if isinstance(action, Tensor) and isinstance(self.action_keys[0], str):
+                root._set_str(self.action_keys[0], action, **_AS_IT_IS)
+                return
+        worker(root)
+
+    def leave(self, after: TensorDictBase) -> TensorDictBase:
+        """Hand the frames after an option's last base step to the CatFrames of the env itself."""
+        for frames in self._frames:
+            for in_key, out_key in zip(frames.in_keys, frames.out_keys, strict=True):
+                setattr(frames, f"_cat_buffers_{in_key}", after.get(out_key).clone())
         return after
 
     def step_mdp(
@@ -102,9 +145,9 @@ class WorkerEnv:
                 _, following = self._parent._post_step_mdp_hooks(root, following)
             return following
         # What the env wrote is the next root as it stands: nobody reads the reward in it.
-        following = after.copy() if self.batch_locked else after
+        following = after.copy() if self.batch_locked and not self.alone else after
         for key in carried:
-            following.set(key, root.get(key))
+            following._set_str(key, root._get_str(key, None), **_AS_IT_IS)
         return following
 
     def carried(self, root: TensorDictBase, after: TensorDictBase) -> list[NestedKey]:
@@ -226,122 +269,6 @@ class WorkerEnv:
                     f"{sorted(map(str, available))}. Put a transform that writes {key!r} before "
                     f"OptionTransform."
                 )
-
-
-def rows_of(value: Any, mask: Tensor) -> Any:
-    """Return some rows of a tensor; a number is the same for all."""
-    return value[mask] if isinstance(value, Tensor) else value
-
-
-def power(gamma: float, steps: int | Tensor) -> float | Tensor:
-    """Return gamma ** steps, in double precision."""
-    return gamma**steps if isinstance(steps, int) else gamma ** steps.to(torch.float64)
-
-
-def discounted(reward: Tensor, discount: float | Tensor) -> Tensor:
-    """Return rewards ``[*B, ...]`` times a discount, a number or ``[*B, 1]``."""
-    if isinstance(discount, Tensor):
-        discount = discount.reshape(*discount.shape[:-1], *[1] * (reward.ndim - discount.ndim + 1))
-    return (reward * discount).to(reward.dtype)
-
-
-def _with_live_transforms(transform: Transform) -> TransformedEnv:
-    """The env below a transform, stepped by the transforms themselves.
-
-    TorchRL makes it of copies, so that what a transform learns or counts (``VecNormV2``,
-    ``CatFrames``) in the steps inside an option would be lost to the one that is saved and frozen.
-    """
-    parent = transform.parent
-    below: list[Transform] = []
-    inside, container = transform, transform.__dict__["_container"]()
-    while isinstance(container, Compose):
-        parts = list(container.transforms)
-        below = parts[: [part is inside for part in parts].index(True)] + below
-        inside, container = container, container.__dict__["_container"]()
-    if below:
-        parent.transform.transforms = nn.ModuleList(below)
-    return parent
-
-
-def _flat(transform: Transform) -> list[Transform]:
-    """The transforms within a transform, first to last."""
-    if not isinstance(transform, Compose):
-        return [transform]
-    return [part for inner in transform.transforms for part in _flat(inner)]
-
-
-def _check_holds_elements(env: EnvBase) -> None:
-    """Refuse an env of several elements that steps or resets them all at once."""
-    parts: list[Transform] = []
-    while isinstance(env, TransformedEnv):
-        parts += _flat(env.transform)
-        env = env.base_env
-    resets = any(isinstance(part, (AutoResetTransform, VecGymEnvTransform)) for part in parts)
-    if env.batch_size.numel() > 1 and (resets or isinstance(env, GymLikeEnv)):
-        n = env.batch_size.numel()
-        raise ValueError(
-            f"OptionTransform lets the elements of a batch whose option has ended wait for the "
-            f"others; {type(env).__name__} steps, and at their end resets, all its {n} at once, so "
-            f"that episodes would go on unseen inside an option. Make {n} envs of one each: "
-            f"SerialEnv({n}, make_env) or ParallelEnv({n}, make_env)."
-        )
-
-
-def _check_after(transform: Transform) -> None:
-    """Refuse a FrameSkipTransform after the options: it repeats them without discount."""
-    container = transform.__dict__["_container"]()
-    if not isinstance(container, Compose):
-        return
-    behind = False
-    for part in _flat(container):
-        if behind and isinstance(part, FrameSkipTransform):
-            raise ValueError(
-                "FrameSkipTransform after an OptionTransform would add up the rewards of options "
-                "without discount and count the base steps of the last one only. Put it before the "
-                "OptionTransform, or repeat options by a second OptionTransform, whose worker "
-                f"writes the option again: max_steps={part.frame_skip}."
-            )
-        behind = behind or part is transform
-
-
-def _duration_key(env: EnvBase, transform: OptionTransform) -> NestedKey | None:
-    """The entry in which the env below counts base steps, if it does."""
-    spec = env.full_observation_spec
-    available = set(map(unravel_key, spec.keys(True, True)))
-    told = transform.base_duration_key
-    if told is not None and told not in available:
-        raise ValueError(
-            f"OptionTransform is to read base steps from {told!r}, which "
-            f"{type(env.base_env).__name__} does not write; it writes "
-            f"{sorted(map(str, available))}."
-        )
-    names: list[NestedKey] = [] if told is None else [told]
-    below: EnvBase = env
-    while not names and isinstance(below, TransformedEnv):
-        names = [
-            part.duration_key
-            for part in reversed(_flat(below.transform))
-            if hasattr(part, "duration_key") and hasattr(part, "num_options")
-        ][:1]
-        below = below.base_env
-    names += [transform.duration_key, "duration"]
-    for name in names:
-        if name in available and _counts(spec[name]):
-            return name
-    return None
-
-
-def _counts(spec: TensorSpec) -> bool:
-    return spec.dtype in (torch.int32, torch.int64) and spec.shape[-1:] == (1,)
-
-
-def _group_shape(env: EnvBase, option_key: NestedKey) -> torch.Size:
-    """The shape of the options: that of the group of agents in which they are, or the batch's."""
-    specs: Composite = env.full_action_spec
-    group = () if isinstance(option_key, str) else option_key[:-1]
-    if group and unravel_key(group) in specs.keys(True):
-        return specs[unravel_key(group)].shape
-    return env.batch_size
 
 
 def _first(key: NestedKey) -> str:

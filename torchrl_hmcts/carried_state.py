@@ -1,0 +1,257 @@
+"""Transforms that keep a state outside the tensordict, and what a planner does about them.
+
+A planner sets an env to states that are tensordicts. What a transform remembers in itself, e.g. the
+last frames, is not set with them: frames of other nodes would leak into a node, and frames of
+simulated steps into the env that is acted in.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    EnvBase,
+    NoopResetEnv,
+    RandomTruncationTransform,
+    TimeMaxPool,
+    Transform,
+    TransformedEnv,
+    VecNorm,
+    VecNormV2,
+)
+from torchrl.envs.transforms import RNDTransform
+from torchrl.record import TensorDictRecorder, VideoRecorder
+
+from torchrl_hmcts.nesting import env_name, envs_below, flat_transforms
+
+_FREEZE = "learns its statistics from every step. Freeze it first: its freeze()"
+_EVAL = "learns its statistics from every step. Stop that first: its eval()"
+_MAX_POOL = (
+    "keeps the last observations. Stack them by CatFrames, which a planner can set, and take the "
+    "maximum over the stack in a transform behind it"
+)
+_HORIZON = "draws a horizon for each episode and keeps it. Use StepCounter(max_steps=...)"
+_RECORDERS = (VideoRecorder, TensorDictRecorder)
+_NOOPS = "steps the env after a reset, away from the state that it was set to. Leave it out"
+
+
+class CarriedFrames(CatFrames):
+    """CatFrames whose last frames are its own output in the tensordict, and not in a buffer."""
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            frame, stack = next_tensordict.get(in_key), tensordict.get(out_key)
+            size = frame.size(self.dim)
+            older = stack.narrow(self.dim, size, stack.size(self.dim) - size)
+            next_tensordict.set(out_key, torch.cat((older, frame), self.dim))
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        begins = any(_last(key) == "_reset" for key in tensordict.keys(True, True))
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            stack = tensordict.get(out_key, None)
+            if stack is None or begins:
+                frame = tensordict_reset.get(in_key)
+                older = [frame] * (self.N - 1)
+                if self.padding == "constant":
+                    older = [torch.full_like(frame, self.padding_value)] * (self.N - 1)
+                stack = torch.cat((*older, frame), self.dim)
+            tensordict_reset.set(out_key, stack)
+        return tensordict_reset
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        stacked = self.transform_observation_spec(self.parent.full_observation_spec.clone())
+        for key in self.out_keys:
+            state_spec[key] = stacked[key].clone()
+        return state_spec
+
+
+def carried(transform: Transform) -> Transform:
+    """Return a copy of a transform for another env; of CatFrames, one that keeps no buffer."""
+    if isinstance(transform, CatFrames):
+        return CarriedFrames(
+            transform.N,
+            transform.dim,
+            in_keys=transform.in_keys,
+            out_keys=transform.out_keys,
+            padding=transform.padding,
+            padding_value=transform.padding_value,
+            reset_key=transform.__dict__.get("_reset_key"),
+        )
+    copy = transform.clone()
+    copy.reset_parent()
+    if _is_foreign(transform):  # what it keeps stays in one place, for both envs
+        for name in ("_step", "_call", "_inv_call"):
+            copy.__dict__[name] = getattr(transform, name)
+    return copy
+
+
+def apart(env: EnvBase, *, recorders: bool = True) -> EnvBase:
+    """Return an env whose CatFrames keep no buffer; an env without CatFrames as it is.
+
+    With ``recorders=False`` TorchRL's recorders are left out.
+    """
+    if not isinstance(env, TransformedEnv):
+        return env
+    base, transforms = apart(env.base_env, recorders=recorders), flat_transforms(env)
+    kept = [t for t in transforms if recorders or not isinstance(t, _RECORDERS)]
+    frames = any(isinstance(t, CatFrames) for t in kept)
+    if base is env.base_env and len(kept) == len(transforms) and not frames:
+        return env
+    return TransformedEnv(base, Compose(*map(carried, kept)), auto_unwrap=False)
+
+
+def planning_env(env: EnvBase) -> EnvBase:
+    """Return an env to plan in, which shares with ``env`` no state of a transform.
+
+    Raises:
+        ValueError: if a transform keeps a state that cannot be set, and which.
+    """
+    _refuse_states(env, inside=None)
+    plan = apart(env, recorders=False)  # simulated steps are not to be filmed
+    if plan is not env and type(env) is not TransformedEnv:
+        raise ValueError(
+            f"MCTSPlanner plans in a copy of the transforms of an env with CatFrames or a "
+            f"recorder, and cannot make one of {type(env).__name__}. Use a plain TransformedEnv."
+        )
+    shown = set(map(unravel_key, plan.full_observation_spec.keys(True, True)))
+    for layer in _transformed(plan):
+        transforms = flat_transforms(layer)
+        for i, transform in enumerate(transforms):
+            if not isinstance(transform, CarriedFrames):
+                continue
+            for key in map(unravel_key, transform.out_keys):
+                behind = [t for t in transforms[i + 1 :] if key in map(unravel_key, t.out_keys)]
+                if key not in shown or behind:
+                    what = f"is written again by {_name(behind[0])}" if behind else "is taken away"
+                    raise ValueError(
+                        f"MCTSPlanner sets the frames of CatFrames by their stack, the entry "
+                        f"{key!r}, which {what} behind it. Leave it in the observation as it is: "
+                        f"let what is behind CatFrames write to another key, or move it before it."
+                    )
+    return plan
+
+
+def _refuse_states(env: EnvBase, inside: str | None) -> None:
+    """Raise a ValueError that names the first transform whose state cannot be set."""
+    if isinstance(env, TransformedEnv):
+        for transform in flat_transforms(env):
+            reason = None
+            if isinstance(transform, (VecNorm, VecNormV2)) and not transform.frozen:
+                reason = _FREEZE
+            elif isinstance(transform, RNDTransform) and transform.training and _learns(transform):
+                reason = _EVAL
+            elif isinstance(transform, TimeMaxPool):
+                reason = _MAX_POOL
+            elif isinstance(transform, RandomTruncationTransform):
+                reason = _HORIZON
+            elif isinstance(transform, NoopResetEnv) and env.batch_locked:
+                reason = _NOOPS
+            elif isinstance(transform, CatFrames) and inside is not None:
+                reason = f"keeps its frames inside {inside}. Append it to that instead"
+            if reason is not None:
+                raise ValueError(
+                    f"MCTSPlanner sets {env_name(env)} to states in the tensordict, and its "
+                    f"{_name(transform)} keeps a state elsewhere: it {reason}."
+                )
+    for below in envs_below(env):
+        _refuse_states(below, inside if isinstance(env, TransformedEnv) else _name(env))
+
+
+def _transformed(env: EnvBase) -> list[TransformedEnv]:
+    """The TransformedEnvs on the way to the env below all transforms."""
+    found = []
+    while isinstance(env, TransformedEnv):
+        found.append(env)
+        env = env.base_env
+    return found
+
+
+class ForeignStates:
+    """What transforms of other projects keep in themselves: seen to change, and put back.
+
+    Args:
+        env: whose transforms, through any nesting but that of other processes.
+    """
+
+    def __init__(self, env: EnvBase) -> None:
+        self._transforms: list[Transform] = []
+        for layer in _transformed(env):
+            self._transforms += [t for t in flat_transforms(layer) if _is_foreign(t)]
+        self._transforms = [t for t in self._transforms if not isinstance(t, CatFrames)]
+
+    def read(self) -> list[dict[str, Any]]:
+        """Return copies of all tensors, arrays and stacks of them that the transforms hold."""
+        return [_held(transform) for transform in self._transforms]
+
+    def changed(self, before: list[dict[str, Any]]) -> str | None:
+        """Return the first attribute that is not as it was, ``"MyStack.frames"``, or None."""
+        for transform, old in zip(self._transforms, before, strict=True):
+            now = _held(transform)
+            for name, value in old.items():
+                if name in now and not _same(value, now[name]):
+                    return f"{_name(transform)}.{name}"
+        return None
+
+    def put_back(self, before: list[dict[str, Any]]) -> None:
+        """Write what :meth:`read` returned into the transforms."""
+        for transform, old in zip(self._transforms, before, strict=True):
+            for name, value in old.items():
+                buffers = transform.__dict__["_buffers"]
+                (buffers if name in buffers else transform.__dict__)[name] = value
+
+
+def _held(transform: Transform) -> dict[str, Any]:
+    copies: dict[type, Callable[[Any], Any]] = {
+        torch.Tensor: torch.Tensor.clone,
+        np.ndarray: np.ndarray.copy,
+        list: list,
+        deque: lambda stack: deque(stack, stack.maxlen),
+    }
+    found = {}
+    own = {**transform.__dict__, **transform.__dict__["_buffers"]}
+    for name, value in own.items():
+        if isinstance(value, (list, deque)) and not any(isinstance(x, Tensor) for x in value):
+            continue  # keys and the like
+        if type(value) in copies:
+            found[name] = copies[type(value)](value)
+    return found
+
+
+def _same(one: Any, two: Any) -> bool:
+    """Whether two values are equal; stacks of another length are records, which may grow."""
+    if isinstance(one, Tensor):
+        return isinstance(two, Tensor) and one.shape == two.shape and torch.equal(one, two)
+    if isinstance(one, np.ndarray):
+        return isinstance(two, np.ndarray) and np.array_equal(one, two)
+    return len(one) != len(two) or all(a is b for a, b in zip(one, two, strict=True))
+
+
+def _learns(transform: RNDTransform) -> bool:
+    return bool(transform.normalize_obs or transform.normalize_reward)
+
+
+def _is_foreign(transform: Transform) -> bool:
+    """Whether neither TorchRL nor the transforms that run an env of their own made it."""
+    package = type(transform).__module__.split(".")[0]
+    return package != "torchrl" and not hasattr(transform, "num_options")
+
+
+def _name(transform: Transform | EnvBase) -> str:
+    return type(transform).__name__
+
+
+def _last(key: NestedKey) -> str:
+    return key if isinstance(key, str) else key[-1]

@@ -1,0 +1,132 @@
+"""The envs and transforms that an env is made of, through any nesting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+_DEFAULT_GAMMA = 0.99
+
+
+def innermost(env: EnvBase) -> EnvBase:
+    """Return the env below all transforms; it asks no env for an attribute that it may lack."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def env_name(env: EnvBase) -> str:
+    """Return the type of the env below all transforms, for an error."""
+    return type(innermost(env)).__name__
+
+
+def flat_transforms(env: TransformedEnv) -> list[Transform]:
+    """Return the transforms of one TransformedEnv, first to last, those within a Compose too."""
+    found: list[Transform] = []
+
+    def collect(transform: Transform) -> None:
+        if isinstance(transform, Compose):
+            for part in transform:
+                collect(part)
+        else:
+            found.append(transform)
+
+    collect(env.transform)
+    return found
+
+
+def envs_below(env: EnvBase) -> Iterator[EnvBase]:
+    """Yield the envs that an env is made of: below its transforms, in a wrapper, of a batch.
+
+    Of a ``SerialEnv`` or ``ParallelEnv`` that is one of each kind. Those of other processes cannot
+    be looked at: one is made for that and closed afterwards, as TorchRL does.
+    """
+    if isinstance(env, TransformedEnv):
+        yield env.base_env
+    elif isinstance(env, BatchedEnvBase):
+        started = vars(env).get("_envs") or []
+        seen = set()
+        for i, make in enumerate(env.create_env_fn):
+            if id(make) in seen:
+                continue
+            seen.add(id(make))
+            one = started[i] if started else make(**env.create_env_kwargs[i])
+            yield one
+            if not started and not one.is_closed:
+                one.close()
+    else:
+        for part in (*vars(env).get("_modules", {}).values(), *vars(env).values()):
+            if isinstance(part, EnvBase):
+                yield part
+
+
+def step_states(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+    """Take a step and return what is written as next, of any number of states if it is stateless.
+
+    ``TransformedEnv.step`` without its checks, and without the shape of the env's own batch.
+    """
+    if type(env)._step is not TransformedEnv._step:
+        return env._step(states)
+    inner = env.transform._inv_call(states.copy())
+    after = step_states(env.base_env, inner)
+    complete_done(env.base_env, after)
+    return env.transform._step(inner, after)
+
+
+def set_states(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
+    """Set an env to states; ``env.reset(states, set_state=True)`` without its checks."""
+    if type(env)._reset is not TransformedEnv._reset:
+        return env._reset(states, set_state=True)
+    inner = env.transform._reset_env_preprocess(states.copy())
+    shown = set_states(env.base_env, inner)
+    complete_done(env.base_env, shown)
+    return env.transform._reset(inner, shown)
+
+
+def complete_done(env: EnvBase, after: TensorDictBase) -> None:
+    """Write the done entries that an env left out, in place."""
+    if any(after.get(key, None) is None for key in env.done_keys):
+        env._complete_done(env.full_done_spec_unbatched, after)
+
+
+def known_gamma(env: EnvBase) -> float | None:
+    """Return the discount per base step of the outermost options that an env has, or None.
+
+    Raises:
+        ValueError: if the envs of a batch have options of several discounts.
+    """
+    parts = reversed(flat_transforms(env)) if isinstance(env, TransformedEnv) else [env]
+    for part in parts:
+        gamma = vars(part).get("gamma", getattr(type(part), "gamma", None))
+        options = "num_options" in vars(part) or hasattr(type(part), "num_options")
+        if isinstance(gamma, (int, float)) and (options or isinstance(part, EnvBase)):
+            return float(gamma)
+    gammas = sorted({g for g in map(known_gamma, envs_below(env)) if g is not None})
+    if len(gammas) > 1:
+        raise ValueError(
+            f"The envs of this {env_name(env)} have options of the discounts {gammas}. Make them "
+            f"with one, or name yours: MCTSPlanner(env, gamma={gammas[0]})."
+        )
+    return gammas[0] if gammas else None
+
+
+def option_gamma(env: EnvBase, duration_key: NestedKey | None) -> float:
+    """Return the discount of an env's options; 0.99 for one that writes no ``duration_key``.
+
+    Raises:
+        ValueError: if the env writes durations and none of its parts tells its discount.
+    """
+    gamma = known_gamma(env)
+    if gamma is not None:
+        return gamma
+    if duration_key is not None:
+        raise ValueError(
+            f"{env_name(env)} writes {duration_key!r}, base steps by which values are discounted, "
+            f"and no OptionTransform tells the discount of a base step. Name the one by which its "
+            f"rewards are summed: MCTSPlanner(env, gamma=0.99)."
+        )
+    return _DEFAULT_GAMMA

@@ -1,0 +1,69 @@
+"""Masks of the base actions, under a name at which nobody takes them for the options'."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torchrl.data import Composite
+from torchrl.envs import ActionMask, EnvBase
+
+from torchrl_hmcts.nesting import flat_transforms
+
+_CONVENTION = "action_mask"  # TorchRL's name
+
+
+class BaseMasks:
+    """Renames the masks of an env's actions, ``"action_mask"`` to ``"base_action_mask"``.
+
+    Above an OptionTransform the action is the option, and what is written under ``"action_mask"``
+    there is the mask of the options. Below it, worker, termination and env see the base env's.
+
+    Args:
+        env: with all transforms below the OptionTransform.
+    """
+
+    def __init__(self, env: EnvBase) -> None:
+        shown = list(map(unravel_key, env.full_observation_spec.keys(True, True)))
+        masks = {key for key in shown if _parts(key)[-1] == _CONVENTION}
+        for transform in flat_transforms(env):
+            if isinstance(transform, ActionMask):
+                masks |= {unravel_key(transform.in_keys[1])} & set(shown)
+        self.renamed: dict[NestedKey, NestedKey] = {}
+        for key in (key for key in shown if key in masks):
+            *path, last = _parts(key)
+            while (new := unravel_key((*path, f"base_{last}"))) in shown or new in masks:
+                last = f"base_{last}"
+            self.renamed[key] = new
+
+    def hide(self, td: TensorDictBase) -> TensorDictBase:
+        """Rename the base masks in what the env wrote, for those above; in place."""
+        for key, new in self.renamed.items():
+            mask = td.get(key, None)
+            if mask is not None:
+                del td[key]
+                td.set(new, mask)
+        return td
+
+    def show(self, td: TensorDictBase) -> TensorDictBase:
+        """Write them under their own name for the env and the worker; in place."""
+        for key, new in self.renamed.items():
+            mask = td.get(new, None)
+            if mask is not None:
+                td.set(key, mask)
+        return td
+
+    def hide_specs(self, spec: Composite) -> Composite:
+        """Rename them in a spec; in place."""
+        for key, new in self.renamed.items():
+            if key in spec.keys(True, True):
+                spec[new] = spec[key]
+                del spec[key]
+        return spec
+
+    def name(self, key: NestedKey) -> NestedKey:
+        """Return the name of an entry of the base env above the OptionTransform."""
+        return self.renamed.get(key, key)
+
+
+def _parts(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key
