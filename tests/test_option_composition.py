@@ -22,6 +22,7 @@ from torchrl.envs import (
     RewardSum,
     SerialEnv,
     StepCounter,
+    TensorDictPrimer,
     TimeMaxPool,
     Transform,
     TransformedEnv,
@@ -44,7 +45,7 @@ from torchrl_hmcts.modules import (
     SkillMLP,
     SkillPolicy,
 )
-from torchrl_hmcts.testing import ChainEnv, TableEnv
+from torchrl_hmcts.testing import ChainEnv, ContractError, TableEnv, check_worker
 from torchrl_hmcts.transforms import OptionTransform
 
 GAMMA = 0.9
@@ -308,6 +309,42 @@ class TestRecurrentWorker:
             base.append_transform(OptionTransform(worker, 1, 3, worker_memory="keep"))
         with pytest.raises(ValueError, match="'reset'.*or 'keep'; got 'never'"):
             OptionTransform(worker, 1, 3, worker_memory="never")
+
+
+class Counting(torch.nn.Module):
+    """Steps to one side and to the other; how many steps it took it keeps as ``where`` says."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__()
+        self.where, self.taken = where, 0
+        self.in_keys = ["skill", *([] if where == "itself" else ["taken"])]
+        self.out_keys = ["action"]
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        taken = self.taken if self.where == "itself" else td["taken"]
+        if self.where == "itself":
+            self.taken = taken + 1
+        else:
+            td.set("taken" if self.where == "root" else ("next", "taken"), taken + 1)
+        return td.set("action", (td["skill"] + taken) % 2)
+
+
+@pytest.mark.parametrize("where", ["root", "next"])
+def test_a_worker_may_keep_its_memory_in_the_tensordict(where: str) -> None:
+    primer = TensorDictPrimer(taken=Unbounded((), dtype=torch.int64), expand_specs=True)
+    env = TransformedEnv(cart_pole(), primer)
+    worker = Counting(where)
+    if where == "next":  # at the root it changes what it is given
+        check_worker(worker, env, num_options=2)
+    env.append_transform(OptionTransform(worker, 2, 4, trajectory_keys=["action"]))
+    after = env.step(env.reset().set("option", torch.tensor(1)))["next"]
+    assert after["trajectory", "action"].tolist() == [1, 0, 1, 0]
+    assert after["taken"].item() == 4
+
+
+def test_a_worker_that_keeps_its_memory_in_itself_fails_the_check() -> None:
+    with pytest.raises(ContractError, match="keep nothing in itself|of two calls"):
+        check_worker(Counting("itself"), cart_pole(), num_options=2)
 
 
 class AgentsEnv(EnvBase):

@@ -140,7 +140,7 @@ class TrainsObjective(PriorityWeights):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         loss_qvalue, critics, loss_actor, policy = self._sac_losses(tensordict)
-        skills = self.objective.losses(tensordict)
+        skills = self.objective.losses(self.objective.without_empty_states(tensordict))
         weights = self._maybe_get_priority_weight(tensordict)
         log_prob = policy["log_prob"]
         loss_alpha = self._reduce_loss(

@@ -98,7 +98,7 @@ class SkillReward(Transform):
     def _intrinsic(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
         if tensordict.get("next", None) is not next_tensordict:
             tensordict = tensordict.copy().set("next", next_tensordict)
-        return self.objective.reward(tensordict)
+        return self.objective.finite_reward(tensordict)
 
     def _score(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = self._intrinsic(tensordict, next_tensordict)

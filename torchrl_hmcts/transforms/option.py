@@ -183,7 +183,7 @@ class OptionTransform(Transform):
             fit.begin_memory(inner)
         with torch.no_grad():
             fit.act(inner)
-        for key in (self.skill_key, *fit.action_keys):
+        for key in (self.skill_key, *fit.worker_writes):
             tensordict.set(key, inner.get(key))
         # For _step: all that the worker wrote, as it wrote it.
         return tensordict.set(self._root_key, inner)

@@ -13,7 +13,7 @@ from torchrl.envs import CatFrames, EnvBase, Transform
 
 from torchrl_hmcts.carried_state import CarriedFrames
 from torchrl_hmcts.direct_calls import is_plain
-from torchrl_hmcts.nesting import flat_transforms, set_states, step_states
+from torchrl_hmcts.nesting import flat_transforms, innermost, set_states, step_states
 from torchrl_hmcts.transforms.base_masks import BaseMasks
 from torchrl_hmcts.transforms.env_below import (
     check_after,
@@ -211,6 +211,7 @@ class WorkerEnv:
                     f"worker's in_keys, or add a transform that writes {key!r} before "
                     f"OptionTransform."
                 )
+        before = {key: id(value) for key, value in td.items(True, True)}
         with torch.no_grad(), torch.random.fork_rng(devices=[]):  # the check draws no numbers
             try:
                 worker(td)
@@ -234,10 +235,15 @@ class WorkerEnv:
                     f"values up to {action.max().item():g}, which does not fit the env's action "
                     f"spec {spec}. Build the worker from env.action_spec."
                 )
+        self.worker_writes = [
+            key
+            for key, value in td.items(True, True)
+            if _first(key) != "next" and before.get(key) != id(value)
+        ]
         ndim = len(parent.batch_size)
         kept = td.get("next", None)
         names = () if kept is None else kept.keys(True, True)
-        below = set(map(unravel_key, parent.base_env.full_observation_spec.keys(True, True)))
+        below = set(map(unravel_key, innermost(parent).full_observation_spec.keys(True, True)))
         memory = {
             unravel_key(key): (kept.get(key).shape[ndim:], kept.get(key).dtype)
             for key in names
