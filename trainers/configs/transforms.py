@@ -46,6 +46,10 @@ class OptionTransformConfig(TransformComponentConfig):
     """Base transitions to hand out, e.g. to train the worker: entries as "position", "action" or
     ("next", "reward"), as ("next", "trajectory", ...) of shape [*B, T], zero after the option's
     end, with ("next", "trajectory", "mask")."""
+    base_duration_key: Any = None
+    """The entry, int64 [*B, 1], in which the env below counts the base steps of its steps."""
+    worker_memory: str = "reset"
+    """"reset", so that a recurrent worker begins each option with zeros, or "keep"."""
     _component_: str = "torchrl_hmcts.transforms.OptionTransform"
 
 
