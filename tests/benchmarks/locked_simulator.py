@@ -90,9 +90,16 @@ def per_step_of_planner(env: EnvBase, expansions: int) -> tuple[float, float]:
 def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
+    env = SettableCartPole()
+    td = env.rand_action(env.reset())
+    begin = time.process_time()
+    for _ in range(5_000):
+        env._step(td)
+    gym_env = (time.process_time() - begin) / 5_000
     print("| | CPU us per base step | base steps per option |")
     print("|---|---|---|")
     print(f"| bare Gymnasium env | {1e6 * per_step_of_bare_env(20_000):.0f} | |")
+    print(f"| `_step` of the GymEnv around it | {1e6 * gym_env:.0f} | |")
     for name, max_steps, counter in (
         ("planner, options of 8", 8, False),
         ("planner, options of 1", 1, False),

@@ -229,6 +229,7 @@ class OptionTransform(Transform):
         fit = self._fitted()
         if not fit.alone or self.trajectory is not None:
             return None
+        fit = fit.for_planning()
         with torch.no_grad():
             root = fit.set_state(state)
             root.set(self.skill_key, option)

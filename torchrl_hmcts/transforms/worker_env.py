@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import CatFrames, EnvBase, Transform
+from torchrl.envs import CatFrames, EnvBase, GymLikeEnv, Transform
 
 from torchrl_hmcts.carried_state import CarriedFrames, apart
 from torchrl_hmcts.direct_calls import is_plain
@@ -16,6 +17,13 @@ from torchrl_hmcts.nesting import flat_transforms, set_states, step_states
 from torchrl_hmcts.transforms.base_masks import BaseMasks
 
 _AS_IT_IS = {"validated": True, "inplace": False, "non_blocking": False}
+
+_SPECS = (
+    *("action_spec", "full_action_spec", "action_keys", "action_key", "input_spec"),
+    *("reward_spec", "full_reward_spec", "reward_keys", "reward_key", "output_spec"),
+    *("observation_spec", "full_observation_spec", "state_spec", "full_state_spec"),
+    *("done_spec", "full_done_spec", "done_keys", "batch_size", "device", "_is_batched"),
+)
 
 if TYPE_CHECKING:
     from torchrl_hmcts.transforms.option import OptionTransform
@@ -68,6 +76,7 @@ class WorkerEnv:
         nested = _first(transform.duration_key) in self.written
         self.alone = self.batch_locked and not (parent.batch_size or memory or nested)
         self._frames = _frames_before(transform)
+        self._planning: WorkerEnv | None = None
         self._check_worker(parent, transform)
         if transform.trajectory is not None:
             self.trajectory_spec = transform.trajectory.make_spec(parent)
@@ -85,6 +94,19 @@ class WorkerEnv:
         if self._reshapes:
             after.set(self.reward_key, after.get(self.reward_key).reshape(self._reward_shape))
         return after
+
+    def for_planning(self) -> WorkerEnv:
+        """The same, of an env that looks its specs up once: most of the cost of a GymEnv's step.
+
+        It is to be set to a state before it is stepped: what an env keeps in its attributes is in
+        another object than that which is acted in.
+        """
+        if self._planning is None:
+            self._planning = self
+            if isinstance(self._env, GymLikeEnv):
+                self._planning = copy(self)
+                self._planning._env = _with_constant_specs(self._env)
+        return self._planning
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
         """Set the env to a state, and return all that it shows there."""
@@ -176,6 +198,15 @@ class WorkerEnv:
                     f"{sorted(map(str, available))}. Put a transform that writes {key!r} before "
                     f"OptionTransform."
                 )
+
+
+def _with_constant_specs(env: EnvBase) -> EnvBase:
+    """A shallow copy of an env in which properties of its specs are attributes of its class."""
+    kind = type(env)
+    folded = {name: getattr(env, name) for name in _SPECS if hasattr(kind, name)}
+    view = copy(env)
+    view.__class__ = type(kind.__name__, (kind,), folded)
+    return view
 
 
 def _frames_before(transform: Transform) -> list[CatFrames]:
