@@ -250,7 +250,7 @@ class OptionTransform(Transform):
             reward = reward + discount * after.get(fit.reward_key)
             taken += 1
         duration = torch.full((1,), taken, dtype=torch.int64, device=reward.device)
-        return self._finish(fit, after.copy(), reward, duration, None)
+        return self._finish(fit, after, reward, duration, None)
 
     def _has_ended(
         self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, taken: int
