@@ -22,9 +22,9 @@ class StatelessSimulator(EnvBase):
 
     Args:
         env (EnvBase): whose ``_step`` depends on nothing but its tensordict.
-        state_keys (sequence of NestedKey, optional): entries that are the state, and what transforms
-            and workers above read right after a reset to a state. A tree stores them for every
-            node. Default: the env's ``state_spec`` and all of its observation.
+        state_keys (sequence of NestedKey, optional): entries that are the state, and those that
+            transforms and workers above read right after a reset to a state. A tree stores them for
+            every node. Default: the env's ``state_spec`` and all of its observation.
 
     Raises:
         ValueError: if the env has no such entry, or no state at all.

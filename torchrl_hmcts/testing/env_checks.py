@@ -128,6 +128,15 @@ def check_macro_env(
     name = _name(env)
     with during(name, "as the simulator of a planner"):
         simulator = Simulator(env, duration_key=duration_key, mask_key=mask_key)
+    foreign = ForeignStates(env)
+    before = foreign.read()
+    _rollout(env, num_steps, seed, _Random(env, mask_key))
+    changed = foreign.changed(before)
+    require(
+        changed is None,
+        f"{name}: {changed} changes as the env is stepped. A planner cannot set it: keep that "
+        "state in the tensordict, and declare it in the state and observation specs.",
+    )
     check_env(
         env,
         num_steps=num_steps,
@@ -136,15 +145,7 @@ def check_macro_env(
         mask_key=mask_key,
         redrawn_keys=redrawn_keys,
     )
-    foreign = ForeignStates(env)
-    before = foreign.read()
     data = _rollout(env, num_steps, seed, _Random(env, mask_key))
-    changed = foreign.changed(before)
-    require(
-        changed is None,
-        f"{name}: {changed} changes as the env is stepped. A planner cannot set it: keep that state "
-        "in the tensordict, and declare it in the state and observation specs.",
-    )
     duration_key, mask_key = unravel_key(duration_key), unravel_key(mask_key)
     if simulator.duration_key is not None:
         duration = data.get("next").get(duration_key)
