@@ -32,6 +32,7 @@ from torchrl_hmcts.envs.mazes import (
     wall_centers,
 )
 from torchrl_hmcts.envs.rendering import draw_maze
+from torchrl_hmcts.envs.stateless import StatelessSimulator
 from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 
 __all__ = [
@@ -48,6 +49,7 @@ __all__ = [
     "OptionWorker",
     "RepeatActions",
     "SharedMLP",
+    "StatelessSimulator",
     "TorchRLGymnasiumEnv",
     "WaterworldMazeEnv",
     "check_mazes",

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.envs import InitTracker, StepCounter, TransformedEnv
 
-from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, Search, SearchBudget
+from torchrl_hmcts.planners import (
+    HierarchicalPolicy,
+    MCTSPlanner,
+    ModelBasedControl,
+    Search,
+    SearchBudget,
+)
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
 FOREVER = SearchBudget(expansions=10_000, until_plan=False)
@@ -108,6 +115,81 @@ def test_a_new_episode_is_planned_for_although_the_old_plan_is_not_at_its_end() 
     td = policy(td)
     assert planner.asked == [[1], [0]]
     assert (td["plan_length"].item(), td["plan_step"].item()) == (5, 1)
+
+
+# ---------------------------------------------------------------------- starts of episodes
+
+EPISODES = {"plan_step": [1, 2, 3] * 3, "num_plans": [1] * 3 + [2] * 3 + [3] * 3}
+
+
+@pytest.mark.parametrize("reuse", [False, True])
+@pytest.mark.parametrize("shape", [(), (2,)])
+@pytest.mark.parametrize("kind", [HierarchicalPolicy, ModelBasedControl])
+def test_every_episode_begins_with_a_new_plan_without_an_init_tracker(
+    kind: Any, shape: tuple[int, ...], reuse: bool
+) -> None:
+    # A plan of 8 options, of which an episode of 3 takes the first three.
+    env = TransformedEnv(ChainEnv(length=9, batch_size=shape), TimeLimit(3))
+    kwargs = {"reuse": reuse} if kind is HierarchicalPolicy else {"replan_every": None}
+    policy = kind(MCTSPlanner(ChainEnv(length=9)), **kwargs)
+    run = env.rollout(9, policy, break_when_any_done=False)
+    for key, values in EPISODES.items():
+        assert run[key].reshape(-1, 9).tolist() == [values] * torch.Size(shape).numel()
+
+
+class TimeLimit(StepCounter):
+    """Truncates episodes, by a count that goes by a name that no policy knows."""
+
+    def __init__(self, max_steps: int) -> None:
+        super().__init__(max_steps, step_count_key="clock")
+
+
+def test_a_collector_gives_every_episode_a_new_plan() -> None:
+    env = TransformedEnv(ChainEnv(length=9), TimeLimit(3))
+    policy = HierarchicalPolicy(MCTSPlanner(ChainEnv(length=9)))
+    collector = Collector(env, policy, frames_per_batch=9, total_frames=9)
+    batch = next(iter(collector))
+    assert {key: batch[key].flatten().tolist() for key in EPISODES} == EPISODES
+    collector.shutdown()
+
+
+def test_only_the_elements_that_begin_again_plan_again() -> None:
+    env, planner = ChainEnv(9), CountingPlanner(ChainEnv(9))
+    policy = HierarchicalPolicy(planner)
+    td = at(env, [0, 2, 4])
+    for _ in range(4):  # the last one reaches the end, and is reset to 0
+        _, td = env.step_and_maybe_reset(policy(td))
+    policy(td)
+    assert planner.asked == [[0, 2, 4], [0]]
+    assert td["plan_step"].flatten().tolist() == [5, 5, 1]
+
+
+def test_a_state_that_was_set_in_between_is_planned_for() -> None:
+    env, planner = ChainEnv(9), CountingPlanner(ChainEnv(9))
+    policy = HierarchicalPolicy(planner)
+    _, td = env.step_and_maybe_reset(policy(at(env, [0, 0])))
+    td["state"] = torch.tensor([1, 5])  # the first is where its step led
+    policy(td)
+    assert planner.asked == [[0, 0], [5]]
+
+
+def test_a_count_of_zero_begins_an_episode_in_a_copy_that_shows_no_step() -> None:
+    env, planner = TransformedEnv(ChainEnv(9), StepCounter()), CountingPlanner(ChainEnv(9))
+    policy = HierarchicalPolicy(planner)
+    td = policy(env.reset()).clone()
+    td = policy(td.update(env.reset()))
+    assert planner.asked == [[0], [0]]
+    td = td.clone().set("step_count", torch.tensor([4]))
+    policy(td)
+    assert len(planner.asked) == 2
+
+
+def test_a_policy_that_was_pickled_goes_on_with_the_plan_in_the_tensordict() -> None:
+    env = ChainEnv(9)
+    policy = HierarchicalPolicy(MCTSPlanner(ChainEnv(9)))
+    _, td = env.step_and_maybe_reset(policy(env.reset()))
+    td = copy.deepcopy(policy)(td.clone())
+    assert (td["plan_step"].item(), td["num_plans"].item()) == (2, 1)
 
 
 # ---------------------------------------------------------------------- closed loop

@@ -21,6 +21,7 @@ from torchrl.envs import (
     CatFrames,
     Compose,
     EnvBase,
+    InitTracker,
     NoopResetEnv,
     RandomTruncationTransform,
     TimeMaxPool,
@@ -78,6 +79,18 @@ class CarriedFrames(CatFrames):
         return state_spec
 
 
+class CarriedInit(InitTracker):
+    """InitTracker of as many states as there are, whatever the batch of the env."""
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for init_key in self.init_keys:
+            if next_tensordict.get(init_key, None) is None:
+                path = () if isinstance(init_key, str) else init_key[:-1]
+                done = next_tensordict.get(unravel_key((*path, "done")))
+                next_tensordict.set(init_key, torch.zeros_like(done))
+        return next_tensordict
+
+
 def carried(transform: Transform) -> Transform:
     """Return a copy of a transform for another env; of CatFrames, one that keeps no buffer."""
     if isinstance(transform, CatFrames):
@@ -90,6 +103,8 @@ def carried(transform: Transform) -> Transform:
             padding_value=transform.padding_value,
             reset_key=transform.__dict__.get("_reset_key"),
         )
+    if isinstance(transform, InitTracker):
+        return CarriedInit(transform.init_key)
     copy = transform.clone()
     copy.reset_parent()
     if _is_foreign(transform):  # what it keeps stays in one place, for both envs
@@ -99,7 +114,7 @@ def carried(transform: Transform) -> Transform:
 
 
 def apart(env: EnvBase, *, recorders: bool = True) -> EnvBase:
-    """Return an env whose CatFrames keep no buffer; an env without CatFrames as it is.
+    """Return an env whose CatFrames and InitTracker are of any states; without them, as it is.
 
     With ``recorders=False`` TorchRL's recorders are left out.
     """
@@ -107,9 +122,14 @@ def apart(env: EnvBase, *, recorders: bool = True) -> EnvBase:
         return env
     base, transforms = apart(env.base_env, recorders=recorders), flat_transforms(env)
     kept = [t for t in transforms if recorders or not isinstance(t, _RECORDERS)]
-    frames = any(isinstance(t, CatFrames) for t in kept)
-    if base is env.base_env and len(kept) == len(transforms) and not frames:
+    replaced = any(_is_replaced(t, env) for t in kept)
+    if base is env.base_env and len(kept) == len(transforms) and not replaced:
         return env
+    if type(env) is not TransformedEnv:
+        raise ValueError(
+            f"A planner makes a copy of the transforms of an env with CatFrames, InitTracker or a "
+            f"recorder, and cannot make one of {_name(env)}. Use a plain TransformedEnv."
+        )
     return TransformedEnv(base, Compose(*map(carried, kept)), auto_unwrap=False)
 
 
@@ -121,11 +141,6 @@ def planning_env(env: EnvBase) -> EnvBase:
     """
     _refuse_states(env, inside=None)
     plan = apart(env, recorders=False)  # simulated steps are not to be filmed
-    if plan is not env and type(env) is not TransformedEnv:
-        raise ValueError(
-            f"MCTSPlanner plans in a copy of the transforms of an env with CatFrames or a "
-            f"recorder, and cannot make one of {type(env).__name__}. Use a plain TransformedEnv."
-        )
     shown = set(map(unravel_key, plan.full_observation_spec.keys(True, True)))
     for layer in _transformed(plan):
         transforms = flat_transforms(layer)
@@ -177,6 +192,13 @@ def _transformed(env: EnvBase) -> list[TransformedEnv]:
         found.append(env)
         env = env.base_env
     return found
+
+
+def _is_replaced(transform: Transform, env: EnvBase) -> bool:
+    if isinstance(transform, (CarriedFrames, CarriedInit)):
+        return False
+    tracks = isinstance(transform, InitTracker) and not env.batch_locked
+    return tracks or isinstance(transform, CatFrames)
 
 
 class ForeignStates:

@@ -15,6 +15,7 @@ from torchrl.data import Categorical, OneHot
 from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_hmcts.carried_state import ForeignStates
 from torchrl_hmcts.planners.simulator import Simulator
 from torchrl_hmcts.testing.claims import (
     ContractError,
@@ -98,7 +99,8 @@ def check_macro_env(
     All of :func:`check_env`, and: the action is one discrete option; a step takes at least one base
     step; some option may be taken wherever an episode goes on; set to the states of a rollout and
     stepped with its options the env gives what the unbroken rollout gave, for all of them at once
-    if it is stateless; a step leaves its input as it was. With ``step_async``, ``step_wait`` and
+    if it is stateless; a step leaves its input as it was; transforms of your own keep no tensor to
+    themselves that changes from step to step. With ``step_async``, ``step_wait`` and
     ``step_abandon``: steps that are under way at the same time do not touch each other.
 
     Args:
@@ -126,6 +128,15 @@ def check_macro_env(
     name = _name(env)
     with during(name, "as the simulator of a planner"):
         simulator = Simulator(env, duration_key=duration_key, mask_key=mask_key)
+    foreign = ForeignStates(env)
+    before = foreign.read()
+    _rollout(env, num_steps, seed, _Random(env, mask_key))
+    changed = foreign.changed(before)
+    require(
+        changed is None,
+        f"{name}: {changed} changes as the env is stepped. A planner cannot set it: keep that "
+        "state in the tensordict, and declare it in the state and observation specs.",
+    )
     check_env(
         env,
         num_steps=num_steps,
@@ -420,7 +431,7 @@ def _check_set_state(
     tolerance: float,
 ) -> None:
     """Set to the states of a rollout and stepped, the env gives the rollout."""
-    name = _name(env)
+    name, env = _name(env), simulator.env  # in which transforms keep nothing to themselves
     option_key = simulator.option_key
     roots = data.select(*simulator.root_keys)
     options = data.get(option_key)

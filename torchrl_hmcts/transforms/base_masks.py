@@ -5,9 +5,7 @@ from __future__ import annotations
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torchrl.data import Composite
-from torchrl.envs import ActionMask, EnvBase
-
-from torchrl_hmcts.nesting import flat_transforms
+from torchrl.envs import EnvBase
 
 _CONVENTION = "action_mask"  # TorchRL's name
 
@@ -24,14 +22,12 @@ class BaseMasks:
 
     def __init__(self, env: EnvBase) -> None:
         shown = list(map(unravel_key, env.full_observation_spec.keys(True, True)))
-        masks = {key for key in shown if _parts(key)[-1] == _CONVENTION}
-        for transform in flat_transforms(env):
-            if isinstance(transform, ActionMask):
-                masks |= {unravel_key(transform.in_keys[1])} & set(shown)
         self.renamed: dict[NestedKey, NestedKey] = {}
-        for key in (key for key in shown if key in masks):
+        for key in shown:
             *path, last = _parts(key)
-            while (new := unravel_key((*path, f"base_{last}"))) in shown or new in masks:
+            if last != _CONVENTION:
+                continue
+            while (new := unravel_key((*path, f"base_{last}"))) in shown:
                 last = f"base_{last}"
             self.renamed[key] = new
 

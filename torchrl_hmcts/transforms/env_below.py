@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -22,6 +23,13 @@ from torchrl.envs.gym_like import GymLikeEnv
 
 from torchrl_hmcts.carried_state import CarriedFrames, apart
 from torchrl_hmcts.nesting import flat_transforms
+
+_SPECS = (
+    *("action_spec", "full_action_spec", "action_keys", "action_key", "input_spec"),
+    *("reward_spec", "full_reward_spec", "reward_keys", "reward_key", "output_spec"),
+    *("observation_spec", "full_observation_spec", "state_spec", "full_state_spec"),
+    *("done_spec", "full_done_spec", "done_keys", "batch_size", "device", "_is_batched"),
+)
 
 if TYPE_CHECKING:
     from torchrl_hmcts.transforms.option import OptionTransform
@@ -79,6 +87,15 @@ def _flat(transform: Transform) -> list[Transform]:
     if not isinstance(transform, Compose):
         return [transform]
     return [part for inner in transform.transforms for part in _flat(inner)]
+
+
+def with_constant_specs(env: EnvBase) -> EnvBase:
+    """Return a shallow copy of an env whose specs are attributes of its class."""
+    kind = type(env)
+    folded = {name: getattr(env, name) for name in _SPECS if hasattr(kind, name)}
+    view = copy(env)
+    view.__class__ = type(kind.__name__, (kind,), folded)
+    return view
 
 
 def check_holds_elements(env: EnvBase) -> None:

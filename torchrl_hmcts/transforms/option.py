@@ -278,6 +278,7 @@ class OptionTransform(Transform):
         fit = self._fitted()
         if not fit.alone or self.trajectory is not None:
             return None
+        fit = fit.for_planning()
         with torch.no_grad():
             root = fit.set_state(state)
             root.set(self.skill_key, option)
@@ -298,7 +299,7 @@ class OptionTransform(Transform):
             reward = reward + discount * after.get(fit.reward_key)
             taken += 1
         duration = torch.full((1,), taken, dtype=torch.int64, device=reward.device)
-        return self._finish(fit, after.copy(), reward, duration, None)
+        return self._finish(fit, after, reward, duration, None)
 
     def _has_ended(
         self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, taken: int

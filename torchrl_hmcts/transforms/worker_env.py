@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING
 
 import torch
@@ -9,7 +10,7 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded
-from torchrl.envs import CatFrames, EnvBase, Transform
+from torchrl.envs import CatFrames, EnvBase, GymLikeEnv, Transform
 
 from torchrl_hmcts.carried_state import CarriedFrames
 from torchrl_hmcts.direct_calls import is_plain
@@ -22,6 +23,7 @@ from torchrl_hmcts.transforms.env_below import (
     env_below,
     group_shape,
     transforms_before,
+    with_constant_specs,
 )
 
 _AS_IT_IS = {"validated": True, "inplace": False, "non_blocking": False}
@@ -87,6 +89,7 @@ class WorkerEnv:
         # its next step, and options inside an option, take the way of all others.
         alone = self.batch_locked and not parent.batch_size
         self.alone = alone and not self.memory and self.duration_key is None
+        self._planning: WorkerEnv | None = None
         self._frames = [  # with buffers of their own
             t
             for t in transforms_before(transform)
@@ -112,6 +115,19 @@ class WorkerEnv:
             if kept is not None:  # a primer has written the memory of before
                 after.update(kept.select(*self.memory))
         return after
+
+    def for_planning(self) -> WorkerEnv:
+        """The same, of an env that looks its specs up once: most of the cost of a GymEnv's step.
+
+        It is to be set to a state before it is stepped: what an env keeps in its attributes is in
+        another object than that which is acted in.
+        """
+        if self._planning is None:
+            self._planning = self
+            if isinstance(self._env, GymLikeEnv):
+                self._planning = copy(self)
+                self._planning._env = with_constant_specs(self._env)
+        return self._planning
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
         """Set the env to a state, and return all that it shows there."""
