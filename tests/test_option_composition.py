@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import (
+    AutoResetTransform,
     CatFrames,
     Compose,
     EnvBase,
@@ -461,6 +462,11 @@ class TestAutoReset:
         with pytest.raises(ValueError, match=r"GymEnv steps.*all its 3 at once.*SerialEnv\(3"):
             base.append_transform(level("o", "action", 4))
         base.close()
+
+    def test_a_batch_that_resets_itself_is_refused(self) -> None:
+        resetting = TransformedEnv(SerialEnv(2, cart_pole), AutoResetTransform())
+        with pytest.raises(ValueError, match=r"steps, and at their end resets, all its 2 at once"):
+            resetting.append_transform(level("o", "action", 4))
 
     def test_options_of_one_step_run_in_them(self) -> None:
         env = vector_env().append_transform(level("o", "action", 1))

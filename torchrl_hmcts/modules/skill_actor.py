@@ -22,7 +22,7 @@ from torchrl.data import (
 )
 from torchrl.modules import OneHotCategorical, ProbabilisticActor, ReparamGradientStrategy
 
-from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
+from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, entries, key_list
 
 
 class _Categorical(torch.distributions.Categorical):
@@ -222,7 +222,7 @@ class SkillPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of each row's skill."""
-        outputs = self.network.forward(*[tensordict.get(key) for key in self.in_keys])
+        outputs = self.network.forward(*entries(self, tensordict, self.in_keys))
         deterministic = not is_to_sample(self.deterministic)
         action = self._choose(outputs, deterministic, self.generator)
         return tensordict.set(self.action_key, action)

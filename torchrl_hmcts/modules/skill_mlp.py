@@ -87,6 +87,7 @@ class SkillMLP(nn.Module):
         They are in the order of ``parameters()``; of N copies, stacked.
         """
         *features, skill = inputs
+        check_skill(skill, features[0])
         y = self._all_skills(weights, features)  # [*B, Z, O], of stacked weights [N, *B, Z, O]
         index = skill.unsqueeze(-1).unsqueeze(-1).expand(*y.shape[:-2], 1, self.out_features)
         return y.gather(-2, index).squeeze(-2)
@@ -178,6 +179,7 @@ class ConcatSkillMLP(nn.Module):
         They are in the order of ``parameters()``; of N copies, stacked.
         """
         *features, skill = inputs
+        check_skill(skill, features[0])
         x = torch.cat((*features, self._one_hot(skill, features[0])), -1)
         return run_layers(self.trunk._modules.values(), weights, x)
 
@@ -284,6 +286,16 @@ def check_features(x: Tensor, weight: Tensor) -> None:
         )
 
 
+def check_skill(skill: Tensor, features: Tensor) -> None:
+    """Raises ValueError unless skills are int64 ``[*B]`` for features ``[*B, f]``."""
+    if skill.dtype not in (torch.int64, torch.int32) or skill.shape != features.shape[:-1]:
+        raise ValueError(
+            f"Skills must be indices, int64 {list(features.shape[:-1])} for features "
+            f"{list(features.shape)}; got {skill.dtype} {list(skill.shape)}. One-hot skills become "
+            f"indices by skill.long().argmax(-1)."
+        )
+
+
 def own_weights(hidden: nn.Sequential, last: nn.Linear) -> list[Tensor]:
     """Returns the weights and biases that :func:`run_layers` takes."""
     layers = [layer for layer in hidden._modules.values() if type(layer) is nn.Linear]
@@ -342,7 +354,7 @@ class SkillNetwork(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the network's output under ``out_key``, of the shape the network gives."""
-        inputs = [tensordict.get(key) for key in self.in_keys]
+        inputs = entries(self, tensordict, self.in_keys)
         return tensordict.set(self.out_key, self.network(*inputs))
 
 
@@ -364,6 +376,19 @@ def shared_layers(
     for fan_in, fan_out in zip((in_features, *hidden), hidden, strict=False):
         layers += [linear(fan_in, fan_out), activation()]
     return nn.Sequential(*layers)
+
+
+def entries(owner: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:
+    """Returns entries of a tensordict, for a module or loss; KeyError names one that is missing."""
+    found = [tensordict.get(key, None) for key in keys]
+    if any(entry is None for entry in found):
+        missing = [key for key, entry in zip(keys, found, strict=True) if entry is None]
+        raise KeyError(
+            f"{type(owner).__name__} reads {missing[0]!r}, which is missing; there are "
+            f"{sorted(map(str, tensordict.keys(True, True)))}. Give it other keys, or let the env "
+            f"write the entry; a SkillTransform or OptionTransform writes the skill."
+        )
+    return found
 
 
 def check_positive(owner: str, **sizes: int) -> None:

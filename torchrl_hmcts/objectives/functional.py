@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 
-from torchrl_hmcts.modules.skill_mlp import SkillNetwork
+from torchrl_hmcts.modules.skill_mlp import SkillNetwork, entries
 
 
 def without_terminal_entries(
@@ -57,7 +57,7 @@ def takes_weights(module: TensorDictModuleBase) -> bool:
 def run_network(module: SkillNetwork, params: TensorDictBase, tensordict: TensorDictBase) -> Tensor:
     """Returns the output of a module's network; of N stacked copies, with N first."""
     network: Any = module.network
-    inputs = [tensordict.get(key) for key in module.in_keys]
+    inputs = entries(module, tensordict, module.in_keys)
     return network.run(weights_of(params), *inputs)
 
 

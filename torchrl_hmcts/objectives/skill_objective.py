@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
 from torchrl_hmcts.objectives.priority import PriorityWeights
 
@@ -134,6 +135,10 @@ class SkillObjective(PriorityWeights, LossModule):
         """Returns the intrinsic reward ``[*B, 1]`` of transitions ``[*B]``, detached."""
         raise NotImplementedError
 
+    def skill(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the skill of each transition, int64 ``[*B]``."""
+        return entries(self, tensordict, [self.tensor_keys.skill])[0]
+
     def without_empty_states(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns transitions in which terminal states that are not finite are zeros, and marked.
 
@@ -145,7 +150,7 @@ class SkillObjective(PriorityWeights, LossModule):
         after = tensordict.get("next").copy()
         empty = torch.zeros(tensordict.batch_size, dtype=torch.bool, device=terminated.device)
         for key in self.next_features:
-            entry = after.get(key)
+            (entry,) = entries(self, after, [key])
             finite = entry.isfinite().reshape(*empty.shape, -1).all(-1)
             empty = empty | (terminated.reshape(empty.shape) & ~finite)
         for key in self.next_features:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
 
@@ -217,4 +218,5 @@ class DIAYNReward(SkillReward):
         return (log_q.gather(-1, index) - log_prior[index]).masked_fill(off[index], 0.0)
 
     def _intrinsic(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
-        return self.reward(tensordict.get(self.skill_key), next_tensordict)
+        (skill,) = entries(self, tensordict, [self.skill_key])
+        return self.reward(skill, next_tensordict)
