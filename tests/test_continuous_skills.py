@@ -391,3 +391,16 @@ def test_torchrls_sac_trainer_runs_with_another_objective_by_changing_one_object
     after = loss.named_parameters()
     still = [k for (k, p), old in zip(after, before, strict=True) if torch.equal(p, old)]
     assert still in ([], ["objective.encoder_params.network.4.bias"])  # phi(s') - phi(s) has none
+
+
+def test_skipping_done_states_leaves_truncated_ones_their_value() -> None:
+    td = make_data()
+    td["next", "done"][:3] = True  # the first is terminated, the next two are truncated
+    td["next", "velocity"][0] = torch.nan
+    losses = []
+    for skip, data in ((True, td), (False, make_data())):
+        loss = make_loss(skip_done_states=skip)
+        torch.manual_seed(0)
+        losses.append(loss(data.clone())["loss_qvalue"])
+    assert losses[0].isfinite()
+    torch.testing.assert_close(losses[0], losses[1])

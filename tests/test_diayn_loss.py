@@ -13,6 +13,7 @@ from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 
 from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillCritic, SkillDiscriminator
 from torchrl_hmcts.objectives import DIAYNLoss, SkillDiscriminatorLoss
+from torchrl_hmcts.transforms import SkillReward
 
 GROUPS = {
     "loss_actor": "actor_network_params",
@@ -142,11 +143,38 @@ def test_an_actor_of_another_kind_is_asked_for_its_distribution(one_hot: bool) -
     torch.testing.assert_close(loss(td).to_dict(), expected.to_dict())
 
 
-def test_done_states_are_skipped_on_request() -> None:
-    # The one done state is terminated: it has no value, whether it is skipped or not.
-    expected = make_loss()(make_data())
-    out = make_loss(skip_done_states=True)(make_data())
-    torch.testing.assert_close(out.to_dict(), expected.to_dict())
+@pytest.mark.parametrize("skip_done_states", [False, True])
+def test_a_truncated_state_has_a_value_and_a_terminal_one_none(skip_done_states: bool) -> None:
+    td = make_data()
+    td["next", "done"][:3] = True  # the first is terminated, the next two are truncated
+    loss = make_loss(skip_done_states=skip_done_states)
+    target = loss._compute_target(td)
+    undisturbed = make_loss()._compute_target(make_data())
+    torch.testing.assert_close(target, undisturbed)
+    assert target[0] == td["next", "reward"][0]
+    assert (target[1:] != td["next", "reward"][1:].squeeze(-1)).all()
+
+
+def test_what_is_learned_from_a_terminal_state_that_is_not_finite() -> None:
+    """Nothing of the skill, the reward for the critic, and no reward from the objective."""
+    td = make_data()
+    td["next", "velocity"][0] = torch.nan
+    td["next", "displacement"][0] = torch.inf
+    loss = make_loss(reduction="none")
+    out = loss(td.clone())
+    assert out["loss_discriminator"][0] == 0
+    assert out["loss_discriminator"][1:].all()
+    expected = make_loss(reduction="none")(make_data())
+    torch.testing.assert_close(out["loss_qvalue"], expected["loss_qvalue"])
+    rewards = SkillReward(loss.objective)(td)["next", "reward"]
+    assert rewards[0] == 0
+    torch.testing.assert_close(rewards[1:], SkillReward(loss.objective)(td[1:])["next", "reward"])
+
+
+def test_a_state_in_the_midst_of_an_episode_that_is_not_finite_is_not_hidden() -> None:
+    td = make_data()
+    td["next", "displacement"][1] = torch.nan
+    assert make_loss()(td)["loss_discriminator"].isnan()
 
 
 def test_without_target_critics_the_critics_themselves_bootstrap() -> None:

@@ -136,6 +136,9 @@ class TestCodeOfThePages:
             assert BLOCK.search(PAGES[page])
             assert page.rsplit("/", 1)[-1] in (Path(__file__).parent / test).read_text()
 
+    @pytest.mark.filterwarnings("ignore:PPOTrainer is an experimental:UserWarning")
+    @pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
+    @pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
     @pytest.mark.parametrize("page", RUN_HERE)
     def test_every_python_block_of_a_page_runs(
         self, page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

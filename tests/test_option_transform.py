@@ -620,7 +620,7 @@ class TestOtherTransforms:
 
     @pytest.mark.parametrize("batch", BATCHES)
     def test_a_macro_env_under_another_option_transform(self, batch):
-        """Manager of managers: two options of two base steps each, discounted per option."""
+        """Manager of managers: two options of two base steps each, discounted per base step."""
         inner, td = chain(batch=batch)
         upper = OptionTransform(
             TensorDictModule(lambda goal: goal, ["goal"], ["option"]),
@@ -629,14 +629,14 @@ class TestOtherTransforms:
             0.5,
             option_key="goal_option",
             skill_key="goal",
-            duration_key="options_taken",
+            duration_key="base_steps",
         )
         env = TransformedEnv(inner, Compose(OptionTransform(skill_is_action(), 2, 2, GAMMA), upper))
         check_env_specs(env)
         after = env.step(td.set("goal_option", torch.full(batch, RIGHT)))["next"]
         assert (after["state"] == 4).all()
-        assert (after["options_taken"] == 2).all()
-        expected = torch.full((*batch, 1), -0.25 * 1.9 * 1.5)
+        assert (after["base_steps"] == 4).all()
+        expected = torch.full((*batch, 1), -0.25 * 1.9 * (1 + 0.5**2))
         torch.testing.assert_close(after["reward"], expected)
 
 

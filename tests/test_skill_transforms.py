@@ -4,17 +4,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Categorical, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.data import (
+    Bounded,
+    Categorical,
+    Composite,
+    LazyMemmapStorage,
+    LazyStackStorage,
+    LazyTensorStorage,
+    ListStorage,
+    ReplayBuffer,
+    Storage,
+    Unbounded,
+)
 from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior, SkillDiscriminator
-from torchrl_hmcts.transforms import DIAYNReward, DisplacementTransform, SkillTransform
+from torchrl_hmcts.objectives import SkillDiscriminatorLoss
+from torchrl_hmcts.testing import ContractError, check_transform
+from torchrl_hmcts.transforms import (
+    DIAYNReward,
+    DisplacementTransform,
+    SkillReward,
+    SkillTransform,
+)
 
 
 class Line(EnvBase):
@@ -279,3 +298,55 @@ def test_stepping_without_a_skill_says_where_it_comes_from() -> None:
     env = make_env()
     with pytest.raises(KeyError, match=r"env\.reset"):
         env.step(env.reset().exclude("skill").set("action", torch.tensor(0)))
+
+
+def a_reward(kind: type, **kwargs: Any) -> SkillReward:
+    torch.manual_seed(0)
+    if kind is DIAYNReward:
+        return DIAYNReward(SkillDiscriminator(2, num_skills=4), num_skills=4, **kwargs)
+    return SkillReward(SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=4)), **kwargs)
+
+
+def storages(folder: Path) -> dict[str, Storage]:
+    return {
+        "tensor": LazyTensorStorage(8),
+        "stack": LazyStackStorage(8),
+        "list": ListStorage(8),
+        "memmap": LazyMemmapStorage(8, scratch_dir=folder),
+    }
+
+
+@pytest.mark.parametrize("kind", [SkillReward, DIAYNReward])
+@pytest.mark.parametrize("name", ["tensor", "stack", "list", "memmap"])
+def test_looking_at_a_buffer_leaves_the_stored_reward_as_it_is(
+    kind: type, name: str, tmp_path: Path
+) -> None:
+    transform = a_reward(kind, extrinsic_coeff=1.0)
+    buffer = ReplayBuffer(storage=storages(tmp_path)[name], transform=transform, batch_size=8)
+    after = TensorDict(displacement=torch.ones(8, 2), reward=torch.full((8, 1), 10.0))
+    data = TensorDict(skill=torch.zeros(8, dtype=torch.int64), next=after).auto_batch_size_(1)
+    buffer.extend(data.clone())
+    right = 10 + a_reward(kind)(data.clone())["next", "reward"][0].item()
+    looks = [buffer[:], buffer[0], buffer.sample(), buffer[:], buffer[0]]
+    for look in looks:
+        assert look["next", "reward"].flatten().tolist() == pytest.approx([right] * look.numel())
+
+
+def test_a_transform_that_writes_into_what_is_stored_fails_the_check() -> None:
+    class InPlace(SkillReward):
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            self._score(tensordict, tensordict.get("next"))
+            return tensordict
+
+    objective = SkillDiscriminatorLoss(SkillDiscriminator(1, num_skills=2, in_keys=["position"]))
+    data = TransformedEnv(Line(), SkillTransform(2)).rollout(3)
+    with pytest.raises(
+        ContractError, match="InPlace changed what is stored in a LazyTensorStorage"
+    ):
+        check_transform(
+            lambda: InPlace(objective, extrinsic_coeff=1.0),
+            lambda: TransformedEnv(Line(), SkillTransform(2)),
+            data=data,
+            data_writes=[("next", "reward")],
+            checks=["replay_buffer"],
+        )

@@ -13,9 +13,18 @@ from torch import nn
 from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ProbabilisticActor, QValueActor, ValueOperator
-from torchrl.objectives import A2CLoss, DQNLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives import (
+    A2CLoss,
+    ClipPPOLoss,
+    DiscreteSACLoss,
+    DQNLoss,
+    SoftUpdate,
+    ValueEstimators,
+)
 from torchrl.objectives.value import GAE, TD0Estimator, TDLambdaEstimator
+from torchrl.trainers.algorithms.ppo import PPOTrainer
 
+from torchrl_hmcts.objectives import use_durations as durations
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -247,3 +256,116 @@ class TestA2CLoss:
         smdp = loss(rollout.clone())
         for key in ("loss_objective", "loss_critic"):
             assert (plain[key] - smdp[key]).abs() > 1e-3
+
+
+class TestAChainOfKnownValue:
+    """The values of going to the right are known; where durations count, they are a fixed point.
+
+    From state s the end of five states is 4 - s base steps away and worth 1: V(s) = 0.9^(3 - s).
+    Two options of two base steps lead from 0 to 2 and from 2 to the end.
+    """
+
+    VALUES = torch.tensor([[GAMMA**3], [GAMMA**2], [GAMMA], [1.0], [0.0]])
+
+    @pytest.fixture
+    def known(self):
+        worker = TensorDictModule(lambda skill: skill.clone(), ["skill"], ["action"])
+        options = OptionTransform(worker, OPTIONS, 2, GAMMA, option_key="action")
+        env = TransformedEnv(ChainEnv(5), options)
+        data = env.rollout(5, lambda td: td.set("action", torch.tensor(1)))
+        assert data["next", "duration"].flatten().tolist() == [2, 2]
+        data.set("action_log_prob", torch.zeros(2))
+        return data
+
+    def table(self, *columns):
+        table = Table(*columns)
+        table.entries.data = (
+            self.VALUES
+            if columns == (1,)
+            else torch.cat((torch.full_like(self.VALUES, -9.0), self.VALUES), -1)
+        )
+        return table
+
+    def actor(self):
+        logits = Table(OPTIONS)
+        logits.entries.data = torch.tensor([[-30.0, 30.0]]).repeat(5, 1)
+        return ProbabilisticActor(
+            TensorDictModule(logits, ["state"], ["logits"]),
+            in_keys=["logits"],
+            distribution_class=torch.distributions.Categorical,
+            return_log_prob=True,
+        )
+
+    def errors(self, name, data, told):
+        """What is left of the errors of the known values, with durations told or not."""
+
+        def make(loss):
+            if told:
+                return durations(loss, gamma=GAMMA)
+            loss.make_value_estimator(gamma=GAMMA)
+            return loss
+
+        critic = ValueOperator(self.table(1), in_keys=["state"])
+        if name == "DQN":
+            q = QValueActor(self.table(OPTIONS), in_keys=["state"], action_space="categorical")
+            loss = make(DQNLoss(q, action_space="categorical", delay_value=False))
+            return loss(data)["loss"]
+        if name == "A2C":
+            return make(A2CLoss(self.actor(), critic))(data)["loss_critic"]
+        if name == "PPO":
+            return make(ClipPPOLoss(self.actor(), critic))(data)["loss_critic"]
+        if name == "PPO's GAE":
+            gae = GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic)
+            return (durations(gae) if told else gae)(data)["advantage"].abs().sum()
+        q = TensorDictModule(self.table(OPTIONS), ["state"], ["action_value"])
+        loss = DiscreteSACLoss(
+            self.actor(),
+            q,
+            action_space="categorical",
+            num_actions=OPTIONS,
+            alpha_init=1e-9,
+            fixed_alpha=True,
+            loss_function="l2",
+            target_entropy=0.0,
+            delay_qvalue=False,
+        )
+        for entry in loss.qvalue_network_params.values(True, True):
+            entry.data.copy_(self.table(OPTIONS).entries.expand_as(entry))
+        return make(loss)(data)["loss_qvalue"]
+
+    @pytest.mark.parametrize("name", ["DQN", "A2C", "PPO", "PPO's GAE", "discrete SAC"])
+    def test_only_with_durations_the_known_values_are_right(self, known, name):
+        assert self.errors(name, known.clone(), told=True).item() == pytest.approx(0, abs=1e-6)
+        assert self.errors(name, known.clone(), told=False).item() > 1e-3
+
+    @pytest.mark.filterwarnings("ignore:PPOTrainer is an experimental:UserWarning")
+    def test_a_ppo_trainer_discounts_by_durations_where_it_is_given_the_gae(self, known):
+        critic = ValueOperator(self.table(1), in_keys=["state"])
+        for gae, right in (
+            (None, False),
+            (durations(GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic)), True),
+        ):
+            loss = ClipPPOLoss(self.actor(), critic)
+            trainer = PPOTrainer(
+                collector=[],
+                total_frames=1,
+                frame_skip=1,
+                optim_steps_per_batch=1,
+                loss_module=durations(loss, gamma=GAMMA),
+                gamma=GAMMA,
+                lmbda=LMBDA,
+                gae=gae,
+                progress_bar=False,
+            )
+            advantage = trainer._pre_epoch_hook(known.clone())["advantage"]
+            assert (advantage.abs().max() < 1e-6) == right
+
+    def test_what_does_not_discount_is_refused(self):
+        with pytest.raises(TypeError, match="sets a TorchRL loss or value estimator; got Linear"):
+            durations(nn.Linear(1, 1))
+        critic = ValueOperator(self.table(1), in_keys=["state"])
+        gae = GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic)
+        with pytest.raises(ValueError, match="gamma=0.9 for a GAE, which has its own"):
+            durations(gae, gamma=0.9)
+        with pytest.raises(ValueError, match=r"in \(0, 1\] per base step; got 1.5"):
+            durations(ClipPPOLoss(self.actor(), critic), gamma=1.5)

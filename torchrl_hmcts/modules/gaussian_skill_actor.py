@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_hmcts.modules.skill_mlp import SkillMLP, key_list
+from torchrl_hmcts.modules.skill_mlp import SkillMLP, entries, key_list
 
 
 class GaussianSkillActor(ProbabilisticActor):
@@ -127,7 +127,7 @@ class _GaussianNetwork(TensorDictModuleBase):
         self.extractor = NormalParamExtractor()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        outputs = self.network(*[tensordict.get(key) for key in self.in_keys])
+        outputs = self.network(*entries(self, tensordict, self.in_keys))
         for key, value in zip(self.out_keys, self.extractor(outputs), strict=True):
             tensordict.set(key, value)
         return tensordict

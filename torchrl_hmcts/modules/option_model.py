@@ -256,7 +256,9 @@ class OptionModel(TensorDictModuleBase):
         it always was is then what an untrained network predicts. Call it before training; the
         meaning of the networks' outputs changes with it.
         """
-        values = self.targets(tensordict, normalized=False).flatten(0, -2)[:, :-1]
+        values = self.targets(tensordict, normalized=False).flatten(0, -2)
+        empty = (values[:, -1] > 0.5) & ~values.isfinite().all(-1)  # a terminal state may be
+        values = values[~empty, :-1]
         if len(values) < 2:
             raise ValueError(
                 f"fit_normalization needs at least 2 transitions; got {len(values)}. Record some "

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import InteractionType, TensorDictModuleBase
+from tensordict.nn.probabilistic import interaction_type
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.data import (
@@ -21,11 +22,27 @@ from torchrl.data import (
 )
 from torchrl.modules import OneHotCategorical, ProbabilisticActor, ReparamGradientStrategy
 
-from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
+from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, entries, key_list
+
+
+class _Categorical(torch.distributions.Categorical):
+    """PyTorch's, whose mean is not a number: for ``ExplorationType.MEAN`` it is the mode here."""
+
+    @property
+    def mean(self) -> Tensor:
+        return self.mode
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        return self.mode
 
 
 class _OneHotCategorical(OneHotCategorical):
     """TorchRL's, which takes the logits ``[B, 1]`` of a single action for those of B actions."""
+
+    @property
+    def mean(self) -> Tensor:
+        return self.mode
 
     def __init__(
         self,
@@ -40,6 +57,11 @@ class _OneHotCategorical(OneHotCategorical):
             return
         torch.distributions.Categorical.__init__(self, probs, logits, **kwargs)
         self.grad_method, self.num_samples = grad_method, 1
+
+
+def is_to_sample(deterministic: bool) -> bool:
+    """Return whether to sample: where nobody says otherwise, the caller or the exploration type."""
+    return not deterministic and interaction_type() in (None, InteractionType.RANDOM)
 
 
 class SkillActor(ProbabilisticActor):
@@ -105,7 +127,7 @@ class SkillActor(ProbabilisticActor):
             in_keys={"logits": logits_key},
             out_keys=[action_key],
             spec=Composite({action_key: spec}),
-            distribution_class=_OneHotCategorical if one_hot else torch.distributions.Categorical,
+            distribution_class=_OneHotCategorical if one_hot else _Categorical,
             return_log_prob=False,
         )
         self.num_skills = num_skills
@@ -145,7 +167,9 @@ class SkillPolicy(TensorDictModuleBase):
         actor (SkillActor or GaussianSkillActor): the actor whose parameters are used; later updates
             are seen.
         deterministic (bool): take the most probable action (of a Gaussian: its mean, squashed)
-            instead of sampling. Default ``False``.
+            instead of sampling, whatever the exploration type. Default ``False``: sample, unless
+            TorchRL's ``set_exploration_type`` asks for ``DETERMINISTIC``, ``MODE`` or ``MEAN``,
+            which mean the same here.
         generator (torch.Generator, optional): source of the samples. Default ``None``: torch's
             global one.
 
@@ -198,8 +222,9 @@ class SkillPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of each row's skill."""
-        outputs = self.network.forward(*[tensordict.get(key) for key in self.in_keys])
-        action = self._choose(outputs, self.deterministic, self.generator)
+        outputs = self.network.forward(*entries(self, tensordict, self.in_keys))
+        deterministic = not is_to_sample(self.deterministic)
+        action = self._choose(outputs, deterministic, self.generator)
         return tensordict.set(self.action_key, action)
 
 

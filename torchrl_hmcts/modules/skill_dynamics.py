@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
-from torchrl_hmcts.modules.skill_mlp import SkillMLP, check_positive, key_list
+from torchrl_hmcts.modules.skill_mlp import SkillMLP, check_positive, entries, key_list
 
 
 class SkillDynamics(TensorDictModuleBase):
@@ -102,7 +102,7 @@ class SkillDynamics(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes mean and standard deviation of the change under every skill, ``[*B, Z, D]``."""
-        loc = self.network.all_skills(*[tensordict.get(key) for key in self.in_keys])
+        loc = self.network.all_skills(*entries(self, tensordict, self.in_keys))
         scale = (self.min_std + self.log_std.exp()).expand_as(loc)
         tensordict.set(self.out_keys[0], loc)
         return tensordict.set(self.out_keys[1], scale)

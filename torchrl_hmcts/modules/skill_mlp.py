@@ -87,6 +87,7 @@ class SkillMLP(nn.Module):
         They are in the order of ``parameters()``; of N copies, stacked.
         """
         *features, skill = inputs
+        check_skill(skill, features[0])
         y = self._all_skills(weights, features)  # [*B, Z, O], of stacked weights [N, *B, Z, O]
         index = skill.unsqueeze(-1).unsqueeze(-1).expand(*y.shape[:-2], 1, self.out_features)
         return y.gather(-2, index).squeeze(-2)
@@ -178,6 +179,7 @@ class ConcatSkillMLP(nn.Module):
         They are in the order of ``parameters()``; of N copies, stacked.
         """
         *features, skill = inputs
+        check_skill(skill, features[0])
         x = torch.cat((*features, self._one_hot(skill, features[0])), -1)
         return run_layers(self.trunk._modules.values(), weights, x)
 
@@ -232,7 +234,9 @@ class FeatureMLP(nn.Sequential):
         super().__init__(*hidden, linear(sizes[-2], sizes[-1]))
 
     def forward(self, *features: Tensor) -> Tensor:
-        return super().forward(_concatenate(features))
+        x = _concatenate(features)
+        check_features(x, next(self.parameters()))
+        return super().forward(x)
 
     def run(self, weights: Sequence[Tensor], *features: Tensor) -> Tensor:
         """Does what ``forward`` does, with weights in place of its own, as :meth:`SkillMLP.run`."""
@@ -254,6 +258,7 @@ def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor
     Layers are applied here, not called as modules: their weights may be stacked, and calling a
     small module costs as much as what it computes.
     """
+    check_features(x, weights[0])
     num_nets = weights[-1].shape[:-1]  # () or, stacked, (N,)
     batch = x.shape[:-1]
     if num_nets:
@@ -267,6 +272,28 @@ def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor
             x = x.relu() if type(layer) is nn.ReLU else layer(x)
     y = _linear(weights[i], weights[i + 1], x)
     return y.view(*num_nets, *batch, y.shape[-1]) if num_nets else y
+
+
+def check_features(x: Tensor, weight: Tensor) -> None:
+    """Raises ValueError unless features ``[*B, F]`` fit the weights of a first layer ``[O, F]``."""
+    if x.shape[-1] != weight.shape[-1] or x.dtype != weight.dtype:
+        fix = f"Build it with in_features={x.shape[-1]}, or give it other in_keys."
+        if x.shape[-1] == weight.shape[-1]:
+            fix = "Append DoubleToFloat() to the env, or change the network by network.to(dtype)."
+        raise ValueError(
+            f"A network for {weight.shape[-1]} features of {weight.dtype} was given "
+            f"{x.shape[-1]} of {x.dtype}, the entries of its in_keys side by side. {fix}"
+        )
+
+
+def check_skill(skill: Tensor, features: Tensor) -> None:
+    """Raises ValueError unless skills are int64 ``[*B]`` for features ``[*B, f]``."""
+    if skill.dtype not in (torch.int64, torch.int32) or skill.shape != features.shape[:-1]:
+        raise ValueError(
+            f"Skills must be indices, int64 {list(features.shape[:-1])} for features "
+            f"{list(features.shape)}; got {skill.dtype} {list(skill.shape)}. One-hot skills become "
+            f"indices by skill.long().argmax(-1)."
+        )
 
 
 def own_weights(hidden: nn.Sequential, last: nn.Linear) -> list[Tensor]:
@@ -327,7 +354,7 @@ class SkillNetwork(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the network's output under ``out_key``, of the shape the network gives."""
-        inputs = [tensordict.get(key) for key in self.in_keys]
+        inputs = entries(self, tensordict, self.in_keys)
         return tensordict.set(self.out_key, self.network(*inputs))
 
 
@@ -349,6 +376,19 @@ def shared_layers(
     for fan_in, fan_out in zip((in_features, *hidden), hidden, strict=False):
         layers += [linear(fan_in, fan_out), activation()]
     return nn.Sequential(*layers)
+
+
+def entries(owner: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:
+    """Returns entries of a tensordict, for a module or loss; KeyError names one that is missing."""
+    found = [tensordict.get(key, None) for key in keys]
+    if any(entry is None for entry in found):
+        missing = [key for key, entry in zip(keys, found, strict=True) if entry is None]
+        raise KeyError(
+            f"{type(owner).__name__} reads {missing[0]!r}, which is missing; there are "
+            f"{sorted(map(str, tensordict.keys(True, True)))}. Give it other keys, or let the env "
+            f"write the entry; a SkillTransform or OptionTransform writes the skill."
+        )
+    return found
 
 
 def check_positive(owner: str, **sizes: int) -> None:

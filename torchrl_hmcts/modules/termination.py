@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
+from torchrl_hmcts.modules.skill_actor import is_to_sample
 from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
 
 Condition = Callable[[TensorDictBase], Tensor]
@@ -203,7 +204,8 @@ class LearnedTermination:
         network (TensorDictModuleBase): writes logits ``[*B, 1]``, e.g. a
             :class:`TerminationNetwork`, or a ``TensorDictSequential`` of what computes its
             features and one.
-        deterministic (bool): do not sample. Default ``True``.
+        deterministic (bool): do not sample. Default ``True``. With ``False`` it samples, unless
+            TorchRL's ``set_exploration_type`` asks for anything but ``RANDOM``.
         generator (torch.Generator, optional): source of the samples. Default: torch's global one.
         every (int): base steps between two questions, so that an option may end after that many,
             twice that many and so on; asking costs a call of the network. Default 1.
@@ -274,7 +276,7 @@ class LearnedTermination:
             if not asked.any():
                 return asked
         probability = self.probability(td)
-        if self.deterministic:
+        if not is_to_sample(self.deterministic):
             ends = probability >= 0.5
         else:
             draw = torch.empty_like(probability).uniform_(generator=self.generator)

@@ -6,6 +6,7 @@ from torchrl_hmcts.objectives.dads import SkillDynamicsLoss
 from torchrl_hmcts.objectives.diayn import ContinuousDIAYNLoss, DIAYNLoss
 from torchrl_hmcts.objectives.discrete_skill_sac import DiscreteSkillSACLoss
 from torchrl_hmcts.objectives.discriminator import SkillDiscriminatorLoss
+from torchrl_hmcts.objectives.durations import use_durations
 from torchrl_hmcts.objectives.lsd import LSDEncoderLoss
 from torchrl_hmcts.objectives.metra import METRAEncoderLoss
 from torchrl_hmcts.objectives.option_critic import IntraOptionQLoss, OptionTerminationLoss
@@ -33,6 +34,7 @@ __all__ = [
     "SkillPriorLoss",
     "SkillSACLoss",
     "n_step_returns",
+    "use_durations",
 ]
 
 name_all_arguments(globals(), __all__)

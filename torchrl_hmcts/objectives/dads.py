@@ -126,7 +126,7 @@ class SkillDynamicsLoss(SkillObjective):
 
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         density = self.log_densities(tensordict)
-        skill = tensordict.get(self.tensor_keys.skill)
+        skill = self.skill(tensordict)
         loss = -density.gather(-1, skill.unsqueeze(-1)).squeeze(-1)
         off = self.inactive()
         if off is not None:
@@ -140,7 +140,7 @@ class SkillDynamicsLoss(SkillObjective):
     @torch.no_grad()
     def reward(self, tensordict: TensorDictBase) -> Tensor:
         density = self.log_densities(tensordict)
-        skill = tensordict.get(self.tensor_keys.skill).unsqueeze(-1)
+        skill = self.skill(tensordict).unsqueeze(-1)
         evidence = (density + self.log_prior(density)).logsumexp(-1, keepdim=True)
         reward = density.gather(-1, skill) - evidence
         off = self.inactive()

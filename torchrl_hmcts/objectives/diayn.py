@@ -90,7 +90,9 @@ class DIAYNLoss(_WithDiscriminator, DiscreteSkillSACLoss):
         delay_qvalue (bool): bootstrap from target critics, to be moved by ``SoftUpdate``. Default
             ``True``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
-        skip_done_states (bool): see ``DiscreteSACLoss``. Default ``False``.
+        skip_done_states (bool): ``DiscreteSACLoss`` has it; without effect here: what follows
+            a transition is never read where it terminates, and always where it is truncated.
+            Default ``False``.
         deactivate_vmap (bool): run the critics one after the other. Default ``False``.
 
     Returns:

@@ -72,7 +72,9 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
             ``True``.
         reduction (str, optional): ``"mean"``, ``"sum"`` or ``"none"``. Default: that of the
             objective, which must be the same.
-        skip_done_states (bool): see ``DiscreteSACLoss``. Default ``False``.
+        skip_done_states (bool): ``DiscreteSACLoss`` has it; without effect here: what follows
+            a transition is never read where it terminates, and always where it is truncated.
+            Default ``False``.
         deactivate_vmap (bool): run critics that cannot be stacked one after the other. Default
             ``False``.
 
@@ -215,10 +217,8 @@ class DiscreteSkillSACLoss(TrainsObjective, DiscreteSACLoss):
 
     def _compute_target(self, tensordict: TensorDictBase) -> Tensor:
         """Returns r + gamma (1 - d) V(s', z), ``[*B]``, without gradients."""
-        if self.skip_done_states:
-            return super()._compute_target(tensordict)
         with torch.no_grad():
-            after = tensordict.get("next").copy()
+            after = self._what_follows(tensordict)
             log_prob = self._log_probs(after)
             value = self._action_values(after, self.target_qvalue_network_params).amin(0)
             relative = self._relative(log_prob, after)

@@ -109,7 +109,7 @@ class SkillDiscriminatorLoss(SkillObjective):
     def discriminator_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the reduced cross-entropy and ``{"discriminator_accuracy": ...}``."""
         logits = self.skill_logits(tensordict)
-        skill = tensordict.get(self.tensor_keys.skill)
+        skill = self.skill(tensordict)
         loss = F.cross_entropy(logits.flatten(0, -2), skill.flatten(), reduction="none")
         loss = loss.view(skill.shape)
         off = self.inactive()
@@ -126,7 +126,7 @@ class SkillDiscriminatorLoss(SkillObjective):
     @torch.no_grad()
     def reward(self, tensordict: TensorDictBase) -> Tensor:
         log_q = self.skill_logits(tensordict).log_softmax(-1)
-        skill = tensordict.get(self.tensor_keys.skill).unsqueeze(-1)
+        skill = self.skill(tensordict).unsqueeze(-1)
         reward = log_q.gather(-1, skill) - self.log_prior(log_q)[skill]
         off = self.inactive()
         return reward if off is None else reward.masked_fill(off[skill], 0.0)

@@ -102,7 +102,7 @@ class EncoderObjective(SkillObjective):
 
         It is 0 for skills that are switched off.
         """
-        skill = tensordict.get(self.tensor_keys.skill)
+        skill = self.skill(tensordict)
         travel = (step * self.skill_vectors().to(step)[skill]).sum(-1)
         off = self.inactive()
         return travel if off is None else travel.masked_fill(off[skill], 0.0)

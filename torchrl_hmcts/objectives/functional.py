@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 
-from torchrl_hmcts.modules.skill_mlp import SkillNetwork
+from torchrl_hmcts.modules.skill_mlp import SkillNetwork, entries
+
+
+def without_terminal_entries(
+    next_tensordict: TensorDictBase, terminated: Tensor, keys: Iterable[NestedKey]
+) -> TensorDictBase:
+    """Returns a copy of what follows transitions, with zeros for the entries of terminal states.
+
+    Nothing follows a terminal state, so its entries may be anything, NaN included; a product with
+    zero would be NaN all the same, and its gradients too.
+    """
+    out = next_tensordict.copy()
+    terminated = terminated.reshape(out.batch_size)
+    for key in keys:
+        entry = out.get(key, None)
+        if entry is not None and entry.is_floating_point():
+            out.set(key, entry.masked_fill(expand_as_right(terminated, entry), 0.0))
+    return out
 
 
 def run_module(
@@ -39,7 +57,7 @@ def takes_weights(module: TensorDictModuleBase) -> bool:
 def run_network(module: SkillNetwork, params: TensorDictBase, tensordict: TensorDictBase) -> Tensor:
     """Returns the output of a module's network; of N stacked copies, with N first."""
     network: Any = module.network
-    inputs = [tensordict.get(key) for key in module.in_keys]
+    inputs = entries(module, tensordict, module.in_keys)
     return network.run(weights_of(params), *inputs)
 
 

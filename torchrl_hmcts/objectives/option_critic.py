@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_hmcts.objectives.functional import without_terminal_entries
 from torchrl_hmcts.objectives.priority import PriorityWeights
 from torchrl_hmcts.objectives.skill_objective import check_reduction
 
@@ -154,7 +155,7 @@ class OptionTerminationLoss(PriorityWeights, LossModule):
     @torch.no_grad()
     def advantage(self, tensordict: TensorDictBase) -> Tensor:
         """Returns A(s', o) of transitions ``[*B]``: how much worse than V(s') going on is."""
-        next_td = _next_with_option(tensordict, self.tensor_keys.skill)
+        next_td = _next_with_option(tensordict, self.tensor_keys)
         if self.qvalue_network is not None:
             self.qvalue_network(next_td)
         values = next_td.get(self.tensor_keys.action_value)  # [*B, A]
@@ -168,7 +169,7 @@ class OptionTerminationLoss(PriorityWeights, LossModule):
 
     def termination_probability(self, tensordict: TensorDictBase) -> Tensor:
         """Returns beta(s', o) of transitions ``[*B]``, with gradients."""
-        next_td = _next_with_option(tensordict, self.tensor_keys.skill)
+        next_td = _next_with_option(tensordict, self.tensor_keys)
         network = self.termination_network
         with self.termination_network_params.to_module(network, preserve_module_state=False):
             logits = network(next_td).get(self.tensor_keys.termination_logits)
@@ -327,7 +328,7 @@ class IntraOptionQLoss(PriorityWeights, LossModule):
         """Returns what Q(s, o) should be, ``[*B]``."""
         keys = self.tensor_keys
         option = tensordict.get(keys.skill)
-        next_td = _next_with_option(tensordict, keys.skill)
+        next_td = _next_with_option(tensordict, keys)
         params = self.target_qvalue_network_params if self.delay_value else None
         params = self.qvalue_network_params.detach() if params is None else params
         with params.to_module(self.qvalue_network, preserve_module_state=False):
@@ -365,9 +366,13 @@ class IntraOptionQLoss(PriorityWeights, LossModule):
         return out
 
 
-def _next_with_option(tensordict: TensorDictBase, skill_key: NestedKey) -> TensorDictBase:
-    """The entries after the step, with the option that led there; a copy."""
-    return tensordict.get("next").copy().set(skill_key, tensordict.get(skill_key))
+def _next_with_option(tensordict: TensorDictBase, keys: Any) -> TensorDictBase:
+    """The entries after the step, with the option that led there; zeros where it terminated."""
+    after = tensordict.get("next")
+    reward = unravel_key(getattr(keys, "reward", ""))
+    read = [key for key in after.keys(True, True) if key != reward]
+    after = without_terminal_entries(after, after.get(keys.terminated), read)
+    return after.set(keys.skill, tensordict.get(keys.skill))
 
 
 def _pair(keys: Any) -> tuple[NestedKey, NestedKey]:

@@ -181,6 +181,9 @@ class OptionModelLoss(PriorityWeights, LossModule):
             duration_key=keys.duration,
             terminated_key=keys.terminated,
         ).expand_as(outputs)
+        # Nothing is asked of a terminal state, so it may hold anything: nothing is learned of it.
+        empty = (target[..., -1:] > 0.5) & ~target.isfinite()
+        target = torch.where(empty, outputs.detach(), target)
         mask = tensordict.get(keys.bootstrap_mask, None)
         share = None if mask is None else mask.movedim(-1, 0).to(outputs.dtype)  # [K, *B]
 

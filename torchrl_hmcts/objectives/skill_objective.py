@@ -10,12 +10,15 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
 from torchrl_hmcts.objectives.priority import PriorityWeights
+
+_EMPTY = "_empty_state"  # bool [*B]
 
 
 class SkillObjective(PriorityWeights, LossModule):
@@ -45,8 +48,12 @@ class SkillObjective(PriorityWeights, LossModule):
     Raises:
         ValueError: if the reduction is unknown or the prior is not over ``num_skills`` skills.
 
-    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``priority_weight``
-    (default ``"priority_weight"``).
+    A terminal state may hold anything; where the entries that are read of one are not finite, its
+    transition teaches nothing and is worth 0.
+
+    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``terminated`` (read under
+    ``"next"`` if it is there, default ``"terminated"``), ``priority_weight`` (default
+    ``"priority_weight"``).
 
     Reference:
         This project's: the common form of DIAYN, DADS, METRA and LSD.
@@ -75,6 +82,7 @@ class SkillObjective(PriorityWeights, LossModule):
     @dataclass
     class _AcceptedKeys:
         skill: NestedKey = "skill"
+        terminated: NestedKey = "terminated"
         priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
@@ -127,7 +135,40 @@ class SkillObjective(PriorityWeights, LossModule):
         """Returns the intrinsic reward ``[*B, 1]`` of transitions ``[*B]``, detached."""
         raise NotImplementedError
 
+    def skill(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the skill of each transition, int64 ``[*B]``."""
+        return entries(self, tensordict, [self.tensor_keys.skill])[0]
+
+    def without_empty_states(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns transitions in which terminal states that are not finite are zeros, and marked.
+
+        :meth:`losses` and :meth:`reward` are asked about these.
+        """
+        terminated = tensordict.get(unravel_key(("next", self.tensor_keys.terminated)), None)
+        if terminated is None:
+            return tensordict
+        after = tensordict.get("next").copy()
+        empty = torch.zeros(tensordict.batch_size, dtype=torch.bool, device=terminated.device)
+        for key in self.next_features:
+            (entry,) = entries(self, after, [key])
+            finite = entry.isfinite().reshape(*empty.shape, -1).all(-1)
+            empty = empty | (terminated.reshape(empty.shape) & ~finite)
+        for key in self.next_features:
+            entry = after.get(key)
+            after.set(key, entry.masked_fill(expand_as_right(empty, entry), 0))
+        return tensordict.copy().set("next", after).set(_EMPTY, empty)
+
+    def finite_reward(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns what :meth:`reward` does, and 0 for a terminal state that is not finite."""
+        tensordict = self.without_empty_states(tensordict)
+        reward = self.reward(tensordict)
+        empty = tensordict.get(_EMPTY, None)
+        return reward if empty is None else reward.masked_fill(empty.unsqueeze(-1), 0.0)
+
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        empty = tensordict.get(_EMPTY, None)
+        if empty is not None:
+            loss = loss.masked_fill(empty, 0.0)
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
 
@@ -154,7 +195,8 @@ class SkillObjective(PriorityWeights, LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch_size = tensordict.batch_size if self.reduction == "none" else torch.Size([])
-        out = TensorDict(self.losses(tensordict), batch_size=batch_size)
+        losses = self.losses(self.without_empty_states(tensordict))
+        out = TensorDict(losses, batch_size=batch_size)
         own = [key for key in self._modules if key.endswith("_params")]
         self._clear_weakrefs(tensordict, out, *own)
         return out

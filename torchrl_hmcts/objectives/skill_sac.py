@@ -55,7 +55,9 @@ class SkillSACLoss(TrainsObjective, SACLoss):
             ``True``.
         reduction (str, optional): ``"mean"``, ``"sum"`` or ``"none"``. Default: that of the
             objective, which must be the same.
-        skip_done_states (bool): see ``SACLoss``. Default ``False``.
+        skip_done_states (bool): an argument of ``SACLoss`` without effect here: what follows
+            a transition is never read where it terminates, and always where it is truncated.
+            Default ``False``.
         deactivate_vmap (bool): run critics that cannot be stacked one after the other. Default
             ``False``.
 
@@ -137,7 +139,8 @@ class SkillSACLoss(TrainsObjective, SACLoss):
             target_entropy=target_entropy,
             delay_qvalue=delay_qvalue,
             reduction=reduction,
-            skip_done_states=skip_done_states,
+            # Not TorchRL's own, which takes a time limit for the end and still meets the NaN.
+            skip_done_states=False,
             deactivate_vmap=deactivate_vmap,
             scalar_output_mode="exclude" if reduction == "none" else None,
         )
@@ -146,7 +149,8 @@ class SkillSACLoss(TrainsObjective, SACLoss):
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Returns the critics' summed loss, ``td_error`` and each critic's own loss."""
-        target = self._compute_target_v2(tensordict)  # [*B]
+        following = tensordict.copy().set("next", self._what_follows(tensordict))
+        target = self._compute_target_v2(following)  # [*B]
         value = self._vmap_qnetworkN0(
             tensordict.select(*self.qvalue_network.in_keys, strict=False),
             self.qvalue_network_params,

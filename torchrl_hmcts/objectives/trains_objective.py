@@ -11,7 +11,11 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
-from torchrl_hmcts.objectives.functional import run_network, takes_weights
+from torchrl_hmcts.objectives.functional import (
+    run_network,
+    takes_weights,
+    without_terminal_entries,
+)
 from torchrl_hmcts.objectives.priority import PriorityWeights
 from torchrl_hmcts.objectives.skill_objective import SkillObjective, check_reduction
 
@@ -104,6 +108,15 @@ class TrainsObjective(PriorityWeights):
         value = run_network(self.qvalue_network, params, tensordict)
         return TensorDict({self.qvalue_network.out_key: value}, batch_size=value.shape[:-1])
 
+    def _what_follows(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns the entries after transitions, in a copy, without those of terminal states."""
+        after = tensordict.get("next")
+        terminated = after.get(self.tensor_keys.terminated, None)
+        if terminated is None:
+            terminated = after.get(self.tensor_keys.done)
+        keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        return without_terminal_entries(after, terminated, keys)
+
     def _critic_losses(
         self, chosen: Tensor, target: Tensor, tensordict: TensorDictBase
     ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -127,7 +140,7 @@ class TrainsObjective(PriorityWeights):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         loss_qvalue, critics, loss_actor, policy = self._sac_losses(tensordict)
-        skills = self.objective.losses(tensordict)
+        skills = self.objective.losses(self.objective.without_empty_states(tensordict))
         weights = self._maybe_get_priority_weight(tensordict)
         log_prob = policy["log_prob"]
         loss_alpha = self._reduce_loss(

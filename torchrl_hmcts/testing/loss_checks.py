@@ -27,6 +27,7 @@ LOSS_CHECKS = (
     "set_keys",
     "nested_keys",
     "value_estimators",
+    "terminal_states",
     "state_dict",
     "compile",
 )
@@ -68,6 +69,7 @@ def check_loss(
     set_keys         with every key renamed it gives the same; unknown names are refused
     nested_keys      with every key nested it gives the same
     value_estimators each of those named can be made and gives finite losses
+    terminal_states  what follows a terminal state may be NaN: losses and gradients are finite
     state_dict       loaded into another loss it gives the same; using a loss adds nothing to it
     compile          ``torch.compile(fullgraph=True)`` gives the same losses and gradients
     ================ ============================================================================
@@ -136,6 +138,8 @@ def check_loss(
             it.renamed(check, _nested, keys)
         elif check == "value_estimators":
             it.value_estimators(value_estimators)
+        elif check == "terminal_states":
+            it.terminal_states()
         elif check == "state_dict":
             it.state_dict()
         else:
@@ -424,6 +428,31 @@ class _Loss:
                 f"{self.name} with make_value_estimator({kind}) gives {out.select(*self.losses)}.",
             )
 
+    def terminal_states(self) -> None:
+        loss = self.make()
+        keys = [unravel_key(("next", k)) for k in _ends(loss)]
+        if not any(self.data.get(key, None) is not None for key in keys):
+            return
+        data = self.data.clone()
+        first = (0,) * data.ndim
+        for key in keys:
+            if data.get(key, None) is not None:
+                data.get(key)[first] = True
+        kept = unravel_key(("next", getattr(loss.tensor_keys, "reward", "reward")))
+        for key in leaves(data):
+            value = data.get(key)
+            if key[0] == "next" and key != kept and value.is_floating_point():
+                value[first] = torch.nan
+        out = self.run(loss, data).select(*self.losses)
+        out.sum(reduce=True).backward()
+        gradients = {n: p.grad for n, p in loss.named_parameters() if p.grad is not None}
+        for name, value in (*out.items(), *gradients.items()):
+            require(
+                bool(torch.isfinite(value).all()),
+                f"{self.name}: with NaN in the entries after a terminal state {name!r} is not "
+                "finite. Replace them before a network reads them: a product with 0 is NaN too.",
+            )
+
     def state_dict(self) -> None:
         loss, other = self.make(), self.make(seed=self.seed + 1)
         at_first = set(loss.state_dict())
@@ -461,6 +490,12 @@ class _Loss:
                 f"{self.name} under torch.compile(fullgraph=True): the gradient of {name!r} is "
                 "another.",
             )
+
+
+def _ends(loss: LossModule) -> list[NestedKey]:
+    """The names of what says that an episode is at its end."""
+    keys = loss.tensor_keys
+    return [getattr(keys, name) for name in ("terminated", "done") if hasattr(keys, name)]
 
 
 def _flat(key: NestedKey) -> NestedKey:

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import LazyStackStorage, LazyTensorStorage, ReplayBuffer, Storage
 from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -71,7 +71,8 @@ def check_transform(
     compose        the same in a ``Compose``
     env            rollouts: what it writes is there, all else is as without it; :func:`check_env`
     model          in front of a network, or it refuses data
-    replay_buffer  on a replay buffer: samples hold what it writes, or it refuses data
+    replay_buffer  on a replay buffer: samples hold what it writes and what is stored stays as it
+                   is, or it refuses data
     inverse        ``inv`` writes the inner action, or leaves a tensordict as it is
     state_dict     goes into another transform of its kind, key by key, and its rollouts go on alike
     copy           a deep copy and a pickle of the env step as the env does
@@ -265,12 +266,31 @@ def _on_data(
             f"{it.name} wrote no {key!r} {where}. Define forward, or name in data_writes what it "
             "writes.",
         )
-    if check != "replay_buffer":
+    if check == "replay_buffer":
+        _leaves_stored(it, where, data)
+    else:
         changed = different(data, out, leaves(data) - set(map(unravel_key, keys)))
         require(
             changed is None,
             f"{it.name} changed {changed and changed[0]!r} {where}, which it is not said to write. "
             "Name it in data_writes, or leave it.",
+        )
+
+
+def _leaves_stored(it: _Transform, where: str, given: TensorDictBase) -> None:
+    """Look at stored data through the transform, and require that they are as they were."""
+    storages: list[Storage] = [LazyTensorStorage(len(given)), LazyStackStorage(len(given))]
+    for storage in storages:
+        buffer = ReplayBuffer(storage=storage, transform=it.make(), batch_size=1)
+        buffer.extend(given.clone())
+        before = storage[:].clone()
+        for look in (slice(None), 0):
+            _ = buffer[look]
+        held = storage[:]
+        require(
+            leaves(held) == leaves(before) and different(before, held, leaves(before)) is None,
+            f"{it.name} changed what is stored in a {type(storage).__name__} {where} when it was "
+            "only looked at. Write to a shallow copy: tensordict.copy().",
         )
 
 

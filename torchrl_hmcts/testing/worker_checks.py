@@ -12,9 +12,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import step_mdp
 
 from torchrl_hmcts.testing.claims import ContractError, different, during, leaves, require, seeded
 from torchrl_hmcts.transforms.option import OptionTransform
+from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
 
 def check_worker(
@@ -57,7 +59,8 @@ def check_worker(
     """
     name = type(worker).__name__
     with during(name, "as the worker of an OptionTransform"):
-        TransformedEnv(env, OptionTransform(worker, num_options, 1, skill_key=skill_key))
+        options = OptionTransform(worker, num_options, 1, skill_key=skill_key)
+        TransformedEnv(env, options, auto_unwrap=False)
     states = _states(env, num_options)
     options = torch.arange(states.batch_size.numel()).reshape(states.batch_size) % num_options
     given = states.clone().set(skill_key, options.to(states.device or "cpu"))
@@ -92,12 +95,60 @@ def check_worker(
             f"{name} changed its own {key!r} while acting. Call eval() first, or keep running "
             "statistics out of it.",
         )
+    _check_option(name, worker, env, num_options, skill_key)
     if deterministic and not env.batch_locked:
         together = _act(name, worker, given)
         for b in range(given.batch_size.numel()):
             alone = _act(name, worker, given[b])
             told = f"of an element alone and among others (option {int(options[b])})"
             _same(name, env, together[b], alone, tolerance, told)
+
+
+def _check_option(
+    name: str,
+    worker: Callable[[TensorDictBase], TensorDictBase],
+    env: EnvBase,
+    num_options: int,
+    skill_key: NestedKey,
+    num_steps: int = 5,
+) -> None:
+    """Compare the actions of an option with those of a plain rollout."""
+    keys = [unravel_key(key) for key in env.action_keys]
+    options = OptionTransform(
+        worker,
+        num_options,
+        num_steps,
+        option_key="_checked_option",
+        skill_key=skill_key,
+        trajectory_keys=keys,
+    )
+    macro = TransformedEnv(env, options, auto_unwrap=False)
+    with during(name, "carrying an option out"), torch.no_grad():
+        with seeded(0):
+            env.set_seed(0)
+            td = macro.reset()
+            option = torch.full(td.batch_size, num_options - 1, device=td.device)
+            block = macro.step(td.set("_checked_option", option))["next", OptionTrajectory.KEY]
+        with seeded(0):
+            env.set_seed(0)
+            td = env.reset()
+            for i in range(num_steps):
+                worker(td.set(skill_key, option))
+                td = env.step(td)
+                step = block[..., i]
+                ran = step.get(OptionTrajectory.MASK_KEY)
+                for key in keys:
+                    one, two = td.get(key)[ran], step.get(key)[ran]
+                    close = one.shape == two.shape and torch.allclose(one.double(), two.double())
+                    require(
+                        close,
+                        f"{name} writes {key!r} = {two!s:.100} in base step {i} of an option and "
+                        f"{one!s:.100} in a plain rollout: its memory is lost. Let it write under "
+                        f"'next' what it reads in the next step, and keep nothing in itself.",
+                    )
+                if not block.get(OptionTrajectory.MASK_KEY)[..., i + 1 :].any():
+                    return
+                td = step_mdp(td)
 
 
 def _states(env: EnvBase, num_options: int) -> TensorDictBase:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
 
@@ -98,7 +99,7 @@ class SkillReward(Transform):
     def _intrinsic(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
         if tensordict.get("next", None) is not next_tensordict:
             tensordict = tensordict.copy().set("next", next_tensordict)
-        return self.objective.reward(tensordict)
+        return self.objective.finite_reward(tensordict)
 
     def _score(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = self._intrinsic(tensordict, next_tensordict)
@@ -116,6 +117,7 @@ class SkillReward(Transform):
         return next_tensordict.set(self.reward_key, reward)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = tensordict.copy()  # a storage may have handed out what it holds
         self._score(tensordict, tensordict.get("next"))
         return tensordict
 
@@ -216,4 +218,5 @@ class DIAYNReward(SkillReward):
         return (log_q.gather(-1, index) - log_prior[index]).masked_fill(off[index], 0.0)
 
     def _intrinsic(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
-        return self.reward(tensordict.get(self.skill_key), next_tensordict)
+        (skill,) = entries(self, tensordict, [self.skill_key])
+        return self.reward(skill, next_tensordict)

@@ -6,6 +6,7 @@ Letters: *B batch of the tensordict, n its elements that still run, T ``max_step
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,10 +17,12 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
+from torchrl_hmcts.transforms.env_below import discounted, power, rows_of
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 from torchrl_hmcts.transforms.worker_env import WorkerEnv
 
 Termination = Callable[[TensorDictBase], Tensor]
+_ROOT = "_option_root_"
 
 
 class OptionTransform(Transform):
@@ -42,33 +45,55 @@ class OptionTransform(Transform):
     ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
     ``make_value_estimator``, any TorchRL loss is correct for the SMDP.
 
-    Append it last of the transforms that must see base steps; what is appended after it sees
-    macro-steps. The worker is not registered as a sub-module: its owner moves, trains and saves it.
+    Where the env below counts base steps itself, as one with an OptionTransform does, k is their
+    sum and the rewards are discounted by it: options of options have any number of levels.
+
+    Append it last of the transforms that must see base steps, each of which they see once; what is
+    appended after it sees macro-steps. The worker is not registered as a sub-module: its owner
+    moves, trains and saves it. What a recurrent worker writes under ``"next"`` is its memory; it is
+    carried from base step to base step.
+
+    With a group of agents and ``option_key=("agents", "option")`` each agent has an option. Their
+    options begin and end together: at the termination, after ``max_steps`` or as soon as any
+    ``done`` below is true, an agent's own included. Each agent's rewards are discounted and summed
+    by themselves.
 
     Args:
         worker (TensorDictModuleBase): reads observation or state entries and ``skill_key``, writes
             the env's action.
         num_options (int): number of options.
-        max_steps (int): base steps after which an option ends at the latest.
+        max_steps (int): steps of the env below after which an option ends at the latest; of an env
+            with options these are options.
         gamma (float): discount per base step, in ``(0, 1]``.
         termination (callable, optional): ``termination(td) -> bool`` tensor ``[*B]`` or
             ``[*B, 1]``, True where the option ends. ``td`` holds the entries after a base step,
             ``skill_key`` and the base steps taken so far under ``duration_key``. Default: none.
         option_key (NestedKey): the macro action, int64 ``[*B]`` (one-hot bool ``[*B, num_options]``
-            with ``one_hot=True``). Default ``"option"``.
+            with ``one_hot=True``); ``[*B, n]`` in a group of n agents. With ``"action"`` every
+            TorchRL actor, loss and trainer fits without ``set_keys``. Default ``"option"``.
         skill_key (NestedKey): the entry by which the worker is told the option, int64 ``[*B]``.
             Default ``"skill"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
         one_hot (bool): options are one-hot instead of categorical. Default ``False``.
         trajectory_keys (sequence of NestedKey, optional): base transitions to hand out, e.g. to
-            train the worker: entries as ``"position"``, ``"action"`` or ``("next", "reward")``, as
+            train the worker: entries of the env or of the worker, as ``"position"``, ``"skill"``,
+            ``"action_log_prob"`` or ``("next", "reward")``, are handed out as
             ``("next", "trajectory", ...)`` of shape ``[*B, T]``, zero after the option's end, with
             ``("next", "trajectory", "mask")``. Default: none.
+        base_duration_key (NestedKey, optional): the entry, int64 ``[*B, 1]``, in which the env
+            below counts the base steps of each of its steps. Default: that of its
+            ``OptionTransform``, else ``duration_key`` or ``"duration"``, if the env has it; without
+            one each step is a base step.
+        worker_memory (str): ``"reset"`` (default), so that a recurrent worker begins each option
+            with zeros and the state of the macro env is that of the env alone, or ``"keep"``, so
+            that it begins where the option before ended; the env must then hand its memory on, by
+            a ``TensorDictPrimer`` before this transform.
 
     Raises:
         ValueError: if a number is out of range; when attached to an env: if the worker reads an
-            entry the env does not have or writes an action that does not fit the env's action spec;
-            when stepping: if an option index is out of range.
+            entry the env does not have or writes an action that does not fit the env's action spec,
+            or if the env steps or resets elements whose option has ended; when stepping: if an
+            option index is out of range, or the termination returns anything but one bool each.
 
     Reference:
         Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999; dissertation, sections 2.2
@@ -102,6 +127,8 @@ class OptionTransform(Transform):
         duration_key: NestedKey = "duration",
         one_hot: bool = False,
         trajectory_keys: Sequence[NestedKey] | None = None,
+        base_duration_key: NestedKey | None = None,
+        worker_memory: Literal["reset", "keep"] = "reset",
     ) -> None:
         if not callable(worker):
             raise ValueError(
@@ -114,6 +141,11 @@ class OptionTransform(Transform):
             raise ValueError(
                 f"OptionTransform needs a discount gamma in (0, 1] per base step; got {gamma}."
             )
+        if worker_memory not in ("reset", "keep"):
+            raise ValueError(
+                f"OptionTransform needs worker_memory to be 'reset', so that a recurrent worker "
+                f"begins each option with zeros, or 'keep'; got {worker_memory!r}."
+            )
         self.option_key = unravel_key(option_key)
         self.skill_key = unravel_key(skill_key)
         self.duration_key = unravel_key(duration_key)
@@ -125,6 +157,10 @@ class OptionTransform(Transform):
         self.max_steps = max_steps
         self.gamma = float(gamma)
         self.one_hot = one_hot
+        self.worker_memory = worker_memory
+        self.base_duration_key = (
+            None if base_duration_key is None else unravel_key(base_duration_key)
+        )
         self.trajectory = (
             None if trajectory_keys is None else OptionTrajectory(trajectory_keys, max_steps)
         )
@@ -141,13 +177,21 @@ class OptionTransform(Transform):
                 f"OptionTransform found no option under {self.option_key!r}. Write it with a "
                 f"planner or policy, or with env.rand_action(td)."
             )
-        inner = fit.masks.show(tensordict).copy()
-        inner.set(self.skill_key, self._skill(option, tensordict.batch_size))
+        private = [key for key in tensordict.keys() if str(key).startswith(_ROOT)]
+        inner = fit.masks.show(tensordict).exclude("_step", "next", *private)
+        inner.set(self.skill_key, self._skill(option, fit.option_shape, tensordict.batch_size))
+        if self.worker_memory == "reset":
+            fit.begin_memory(inner)
         with torch.no_grad():
             fit.act(inner)
-        for key in (self.skill_key, *fit.action_keys):
+        for key in (self.skill_key, *fit.worker_writes):
             tensordict.set(key, inner.get(key))
-        return tensordict
+        # For _step: all that the worker wrote, as it wrote it.
+        return tensordict.set(self._root_key, inner)
+
+    @property
+    def _root_key(self) -> str:
+        return f"{_ROOT}{id(self)}"  # its own: another OptionTransform may stand below
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         fit = self._fitted()
@@ -155,64 +199,69 @@ class OptionTransform(Transform):
         skipped = tensordict.get("_step", None)
         if skipped is not None:
             skipped = ~skipped.reshape(batch_size)
-        root = tensordict.exclude("_step", "next", self.option_key)
+        root = tensordict.get(self._root_key).exclude(self.option_key)
         if "next" in tensordict.keys():  # of an earlier step from this root: TorchRL copies it over
             next_tensordict = next_tensordict.select(*fit.written)
-        flatten = not fit.batch_locked and len(batch_size) != 1
-        if flatten:  # one batch dimension is all the loop has to know
+        kept = root.get("next", None)
+        if kept is not None:  # what a recurrent worker goes on with
+            next_tensordict.update(kept.select(*fit.memory))
+        # One batch dimension is all the loop has to know; without any there are no rows to drop.
+        flatten = not fit.batch_locked and len(batch_size) > 1
+        if flatten:
             root, next_tensordict = root.reshape(-1), next_tensordict.reshape(-1)
         with torch.no_grad():
             if fit.alone and self.trajectory is None:
                 out = self._run_alone(fit, root, next_tensordict)
-            elif fit.batch_locked:
+            elif fit.batch_locked or not batch_size:
                 out = self._run_locked(fit, root, next_tensordict, skipped)
             else:
                 out = self._run(fit, root, next_tensordict)
         return fit.leave(out.reshape(batch_size) if flatten else out)
 
     def _run(self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
-        """Go on in a stateless env, with fewer rows whenever some have ended."""
+        """Continue in a stateless env, with fewer rows whenever some have ended."""
         n = after.batch_size[0]
-        reward = after.get(fit.reward_key).clone()  # [n, 1], of all rows
-        duration: Tensor | None = None  # [n, 1], of the rows that have ended
+        reward = after.get(fit.reward_key).clone()  # [n, ...], of all rows
+        duration = torch.empty((n, 1), dtype=torch.int64, device=reward.device)
         trajectory = self._begin_trajectory(fit, root, after)
         carried = fit.carried(root, after)
         out: TensorDictBase | None = None
         rows: Tensor | None = None  # the rows that still run; None: all of them
-        discount = 1.0
-        taken = 1
-        while taken < self.max_steps:
-            ended = self._ended(fit, root, after, taken)
+        passed = last = fit.durations(after)  # base steps: an int, or [m, 1] of the running rows
+        discount: float | Tensor = 1.0
+        for taken in range(1, self.max_steps):
+            ended = self._ended(fit, root, after, passed)
             if ended.any():
-                if out is None or duration is None or rows is None:
+                if out is None or rows is None:
                     out = after.clone()
-                    duration = torch.full((n, 1), taken, device=reward.device)
                     rows = torch.arange(n, device=reward.device)
                 else:
                     out[rows[ended]] = after[ended]
-                    duration[rows[ended]] = taken
+                duration[rows[ended]] = rows_of(passed, ended)
                 running = ~ended
                 rows = rows[running]
                 if not rows.numel():
                     break
                 root, after = root[running], after[running]
-            discount *= self.gamma
+                passed, last, discount = (rows_of(x, running) for x in (passed, last, discount))
+            discount = discount * power(self.gamma, last)
             root = self._advance(fit, root, after, carried)
             after = fit.step(root)
-            gained = after.get(fit.reward_key) * discount
+            gained = discounted(after.get(fit.reward_key), discount)
             if rows is None:
                 reward += gained
             else:
                 reward.index_add_(0, rows, gained)
             if trajectory is not None:
                 trajectory.write(taken, rows, root, after)
-            taken += 1
-        if out is None or duration is None or rows is None:
+            last = fit.durations(after)
+            passed = passed + last
+        if out is None or rows is None:
             out = after
-            duration = torch.full((n, 1), taken, device=reward.device)
+            duration[:] = passed
         elif rows.numel():
             out[rows] = after
-            duration[rows] = taken
+            duration[rows] = passed
         return self._finish(fit, out, reward, duration, trajectory)
 
     def run_from(self, state: TensorDictBase, option: Tensor) -> TensorDictBase | None:
@@ -240,7 +289,7 @@ class OptionTransform(Transform):
     def _run_alone(
         self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase
     ) -> TensorDictBase:
-        """Go on in an env of one state, whose rows need no masks."""
+        """Continue in an env of one state, whose rows need no masks."""
         first = after.get(fit.reward_key)
         # Sums of one number: numpy takes a twentieth of torch's time, and rounds as it does.
         number = np.float64 if first.dtype == torch.float64 else np.float32
@@ -272,31 +321,33 @@ class OptionTransform(Transform):
         after: TensorDictBase,
         skipped: Tensor | None,
     ) -> TensorDictBase:
-        """Go on in an env of fixed batch size, which is told by ``_step`` whom to leave alone."""
+        """Continue in an env of fixed batch size; ``_step`` tells it whom to leave alone."""
         batch_size = after.batch_size
         out = after.clone()
         reward = out.get(fit.reward_key).clone()
-        duration = torch.ones((*batch_size, 1), dtype=torch.int64, device=reward.device)
         running = torch.ones(batch_size, dtype=torch.bool, device=reward.device)
         if skipped is not None:
             running &= ~skipped
-            duration[skipped] = 0
         trajectory = self._begin_trajectory(fit, root, after, running)
         carried = fit.carried(root, after)
-        discount = 1.0
+        last = fit.durations(after)
+        duration = running.unsqueeze(-1) * last  # [*B, 1]
+        discount: float | Tensor = 1.0
         for taken in range(1, self.max_steps):
-            running = running & ~self._ended(fit, root, out, taken)
+            passed = taken if isinstance(last, int) else duration
+            running = running & ~self._ended(fit, root, out, passed)
             if not running.any():
                 break
-            discount *= self.gamma
+            discount = discount * power(self.gamma, last)
             root = self._advance(fit, root, out, carried)
             if batch_size and not running.all():
                 root.set("_step", running)
             after = fit.step(root)
             root = root.exclude("_step")
-            gained = discount * after.get(fit.reward_key)
+            gained = discounted(after.get(fit.reward_key), discount)
             reward = torch.where(expand_as_right(running, reward), reward + gained, reward)
-            duration = duration + running.unsqueeze(-1)
+            last = fit.durations(after)
+            duration = duration + running.unsqueeze(-1) * last
             out = after.clone() if running.all() else _where(running, after, out)
             if trajectory is not None:
                 trajectory.write(taken, running, root, after)
@@ -311,18 +362,31 @@ class OptionTransform(Transform):
         return root
 
     def _ended(
-        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, taken: int
+        self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, passed: int | Tensor
     ) -> Tensor:
         shape = after.batch_size
-        ended = after.get(fit.done_keys[0]).reshape(shape)
+        ended = after.get(fit.done_keys[0]).reshape(*shape, -1).any(-1)
         for key in fit.done_keys[1:]:
-            ended = ended | after.get(key).reshape(shape)
+            ended = ended | after.get(key).reshape(*shape, -1).any(-1)
         if self.termination is not None:
             seen = after.copy()
             seen.set(self.skill_key, root.get(self.skill_key))
-            seen.set(self.duration_key, torch.full((*shape, 1), taken, device=ended.device))
-            ended = ended | self.termination(seen).reshape(shape)
+            if isinstance(passed, int):
+                passed = torch.full((*shape, 1), passed, device=ended.device)
+            seen.set(self.duration_key, passed)
+            ended = ended | self._asked(self.termination(seen), shape)
         return ended
+
+    def _asked(self, ends: Tensor, shape: torch.Size) -> Tensor:
+        good = isinstance(ends, Tensor) and ends.dtype == torch.bool
+        if not good or ends.shape not in (shape, (*shape, 1)):
+            got = f"{ends.dtype} {list(ends.shape)}" if isinstance(ends, Tensor) else repr(ends)
+            raise ValueError(
+                f"The termination {getattr(self.termination, '__name__', self.termination)!s} must "
+                f"return bool {list(shape)} or {[*shape, 1]}, True where the option ends; it "
+                f"returned {got}."
+            )
+        return ends.reshape(shape)
 
     def _begin_trajectory(
         self,
@@ -345,6 +409,8 @@ class OptionTransform(Transform):
         duration: Tensor,
         trajectory: OptionTrajectory | None,
     ) -> TensorDictBase:
+        if fit.unannounced:
+            out = out.exclude(*fit.unannounced)
         fit.masks.hide(out)
         out.set(fit.reward_key, reward)
         out.set(self.duration_key, duration)
@@ -367,9 +433,11 @@ class OptionTransform(Transform):
             tensordict_reset.set(OptionTrajectory.KEY, empty.data)
         return tensordict_reset
 
-    def _skill(self, option: Tensor, batch_size: torch.Size) -> Tensor:
-        shape = (*batch_size, self.num_options) if self.one_hot else batch_size
-        if option.shape != torch.Size(shape) or not (self.one_hot or option.dtype == torch.int64):
+    def _skill(self, option: Tensor, shape: torch.Size, batch_size: torch.Size) -> Tensor:
+        shape = batch_size + shape[len(self.parent.batch_size) :]
+        if self.one_hot:
+            shape = torch.Size((*shape, self.num_options))
+        if option.shape != shape or not (self.one_hot or option.dtype == torch.int64):
             raise ValueError(
                 f"The option under {self.option_key!r} must be "
                 f"{'one-hot' if self.one_hot else 'int64'} {list(shape)}; got {option.dtype} "
@@ -399,13 +467,15 @@ class OptionTransform(Transform):
         self._fitted()
         input_spec = input_spec.clone()
         old = input_spec["full_action_spec"]
-        shape, device = old.shape, old.device
+        shape, device = self._fitted().option_shape, old.device
         option: TensorSpec
         if self.one_hot:
             option = OneHot(self.num_options, shape=(*shape, self.num_options), device=device)
         else:
             option = Categorical(self.num_options, shape=shape, device=device)
-        spec = Composite(shape=shape, device=device)
+        spec = Composite(shape=old.shape, device=device)
+        for group in _groups(self.option_key):  # a group of agents keeps its shape
+            spec[group] = Composite(shape=shape, device=device)
         spec[self.option_key] = option
         input_spec["full_action_spec"] = spec
         masks = self._fitted().masks
@@ -433,7 +503,11 @@ class OptionTransform(Transform):
         observation_spec = self._fitted().masks.hide_specs(observation_spec.clone())
         shape, device = observation_spec.shape, observation_spec.device
         observation_spec[self.duration_key] = Bounded(
-            0, self.max_steps, shape=(*shape, 1), dtype=torch.int64, device=device
+            0,
+            self._fitted().most_base_steps(self.max_steps),
+            shape=(*shape, 1),
+            dtype=torch.int64,
+            device=device,
         )
         if self.trajectory is not None:
             spec = self._fitted().trajectory_spec
@@ -469,7 +543,7 @@ class OptionTransform(Transform):
                     "TransformedEnv(env, OptionTransform(...)); it has no meaning in a replay "
                     "buffer."
                 )
-            self._fit = WorkerEnv(parent, self)
+            self._fit = WorkerEnv(self)
         return self._fit
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -484,6 +558,10 @@ class OptionTransform(Transform):
             f"{type(self).__name__}(num_options={self.num_options}, max_steps={self.max_steps}, "
             f"gamma={self.gamma})"
         )
+
+
+def _groups(key: NestedKey) -> list[NestedKey]:
+    return [] if isinstance(key, str) else [unravel_key(key[:-1])]
 
 
 def _where(mask: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:

@@ -5,7 +5,7 @@ Letters: *B batch of the tensordict, T base steps an option can take at most.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -19,8 +19,8 @@ class OptionTrajectory:
     """Collects chosen entries of an option's base transitions into a tensordict ``[*B, T]``.
 
     Args:
-        keys: entries of a base transition, e.g. ``"position"``, ``"action"`` or
-            ``("next", "reward")``.
+        keys: entries of a base transition, the env's or the worker's, e.g. ``"position"``,
+            ``"action"``, ``"action_log_prob"`` or ``("next", "reward")``.
         max_steps: T.
     """
 
@@ -36,33 +36,42 @@ class OptionTrajectory:
                 'e.g. ["observation", "action", ("next", "reward")], or pass None.'
             )
 
-    def make_spec(self, env: EnvBase) -> Composite:
-        """Return the spec of the block, ``[*B, T]``."""
-        root = env.full_observation_spec.clone()
-        root.update(env.full_state_spec)
-        root.update(env.full_action_spec)
+    def make_spec(
+        self,
+        env: EnvBase,
+        root: TensorDictBase,
+        memory: Mapping[NestedKey, tuple[torch.Size, torch.dtype]],
+    ) -> Composite:
+        """Return the spec of the block, ``[*B, T]``.
+
+        Args:
+            env: the env that takes the base steps.
+            root: what a base step begins with, after the worker has acted.
+            memory: what the worker itself writes under ``"next"``: shapes and types.
+        """
         after = env.full_observation_spec.clone()
         after.update(env.full_reward_spec)
         after.update(env.full_done_spec)
         shape = (*env.batch_size, self.max_steps)
         ndim = len(env.batch_size)
+        events = {unravel_key(k): (v.shape[ndim:], v.dtype) for k, v in root.items(True, True)}
+        nexts = {unravel_key(k): (v.shape[ndim:], v.dtype) for k, v in after.items(True, True)}
+        nexts.update(memory)
         spec = Composite(shape=shape, device=env.device)
         for key in self.keys:
             is_next = isinstance(key, tuple) and key[0] == "next"
-            source, name = (after, key[1:] if len(key) > 2 else key[1]) if is_next else (root, key)
-            leaf = source[name] if name in source.keys(True, True) else None
-            if leaf is None:
+            source, name = (nexts, unravel_key(key[1:])) if is_next else (events, key)
+            if name not in source:
+                before = sorted(str(k) for k in events if k[0] != "next")
                 raise ValueError(
                     f"trajectory_keys names {key!r}, which is no entry of a base transition of "
-                    f"{type(env.base_env).__name__}. Entries: "
-                    f"{sorted(map(str, root.keys(True, True)))}, and under 'next' "
-                    f"{sorted(map(str, after.keys(True, True)))}."
+                    f"{type(env.base_env).__name__}. Entries: {before}, and under 'next' "
+                    f"{sorted(map(str, nexts))}."
                 )
+            event, dtype = source[name]
             # Not the entry's own bounds: the zeros after an option's end need not lie in them.
-            kind = Binary if leaf.dtype == torch.bool else Unbounded
-            spec[key] = kind(
-                shape=(*shape, *leaf.shape[ndim:]), dtype=leaf.dtype, device=env.device
-            )
+            kind = Binary if dtype == torch.bool else Unbounded
+            spec[key] = kind(shape=(*shape, *event), dtype=dtype, device=env.device)
         spec[self.MASK_KEY] = Binary(shape=shape, dtype=torch.bool, device=env.device)
         return spec
 
