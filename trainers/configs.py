@@ -137,6 +137,7 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
             "atari_ram": "AtariRAMEnv",
             "gridworld": "GridworldMazeEnv",
             "labmaze": "LabMazeEnv",
+            "settable_gym": "SettableGymEnv",
             "stateless": "StatelessSimulator",
             "waterworld": "WaterworldMazeEnv",
         },
