@@ -21,6 +21,7 @@ from torchrl_hmcts.planners.backups import Backup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
 from torchrl_hmcts.planners.chance import ProgressiveWidening
 from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, MostVisited
+from torchrl_hmcts.planners.counts import whole_number
 from torchrl_hmcts.planners.growth import Growth, SearchProgress
 from torchrl_hmcts.planners.node_evaluation import (
     Evaluator,
@@ -32,7 +33,7 @@ from torchrl_hmcts.planners.node_evaluation import (
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.search import RootStates, Search, check_search
+from torchrl_hmcts.planners.search import RootStates, Search, check_search, root_seeds
 from torchrl_hmcts.planners.simulator import Simulator
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import TERMINAL
@@ -214,11 +215,13 @@ class MCTSPlanner(TensorDictModuleBase):
         self.final_choice = final_choice
         self.budget = budget
         self.expand = expand
-        self.leaves_per_wave = leaves_per_wave
-        self.waves_in_flight = waves_in_flight
+        self.leaves_per_wave = int(leaves_per_wave)
+        self.waves_in_flight = int(waves_in_flight)
         self.exhausted = exhausted
         self.progress = progress
-        self._seeds = None if seed is None else np.random.SeedSequence(seed)
+        if seed is not None:
+            whole_number("MCTSPlanner", "seed", seed)
+        self._seeds = None if seed is None else np.random.SeedSequence(int(seed))
         self.option_key = self.simulator.option_key
         self.num_options = self.simulator.num_options
         self.in_keys = list(self.simulator.root_keys)
@@ -363,7 +366,7 @@ class MCTSPlanner(TensorDictModuleBase):
         if not len(rows):
             return torch.zeros(shape, dtype=torch.bool)
         index = torch.from_numpy(rows)
-        root = self.simulator.root(td.reshape(-1)[index])
+        root = self.simulator.root(td.flatten()[index])
         taken = options.reshape(search.num_roots, -1)[index].tolist()
         state, done = self.simulator.state(root), self.simulator.done(root)
         kept = np.zeros(search.num_roots, np.bool_)
@@ -409,7 +412,7 @@ class MCTSPlanner(TensorDictModuleBase):
                     int(torch.empty((), dtype=torch.int64).random_())
                 )
             seed = int(self._seeds.spawn(1)[0].generate_state(1, np.uint32)[0])
-        search.seed((np.arange(search.num_roots) + int(seed)) & np.iinfo(np.int64).max)
+        search.seed(root_seeds("MCTSPlanner", seed, search.num_roots))
 
     def _plant(self, search: Search, root: TensorDictBase, rows: np.ndarray | None) -> None:
         """Plant the roots ``rows`` of a search, all by default, at the states ``root``."""
@@ -424,13 +427,19 @@ class MCTSPlanner(TensorDictModuleBase):
                     f"Root {bad} has no option that may be taken: its action mask is all False. "
                     f"Plan from a state that is not a dead end, or mark it as done."
                 )
+            looked_at = root
+            if self.leaf_evaluator is not None or self.option_prior is not None:
+                looked_at = root.clone()  # the state to plan from stays what it is
             values = leaf_values(
-                self.leaf_evaluator, root, simulator.terminated(root), lambda: search.seeds[where]
+                self.leaf_evaluator,
+                looked_at,
+                simulator.terminated(root),
+                lambda: search.seeds[where],
             )
             known = RootStates(
                 values=values,
                 done=done,
-                priors=option_priors(self.option_prior, root, self.num_options),
+                priors=option_priors(self.option_prior, looked_at, self.num_options),
                 masks=masks,
                 features=node_features(self.novelty, root),
                 codes=node_codes(self.transpositions, root),

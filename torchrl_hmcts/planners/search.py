@@ -13,6 +13,7 @@ import numpy as np
 
 from torchrl_hmcts.planners.backups import Backup, MaxBackup
 from torchrl_hmcts.planners.chance import ProgressiveWidening
+from torchrl_hmcts.planners.counts import NO_LIMIT, whole_number
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.scored_descent import select_by_scores
@@ -20,6 +21,7 @@ from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     FORBIDDEN,
+    LARGEST,
     PENDING,
     PRUNED,
     REWARDED,
@@ -29,7 +31,7 @@ from torchrl_hmcts.planners.tree import (
 )
 from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, TreePolicy
 
-NO_LIMIT = np.iinfo(np.int64).max
+_MOST_HALVED = 2**24  # simulations of Gumbel, whose schedule holds counts in float32
 
 
 class Wave:
@@ -71,6 +73,22 @@ class RootStates(NamedTuple):
     codes: np.ndarray | None = None  # [m, K] uint8
 
 
+def _check_rows(known: Outcomes | RootStates, m: int, num_options: int) -> None:
+    """Refuse arrays without a row for each of ``m`` states: the kernels trust them."""
+    for name, array in zip(known._fields, known, strict=True):
+        if array is None:
+            continue
+        shape = array.shape
+        wide = name in ("priors", "masks")
+        if shape[0] == m and (not wide or shape[1] == num_options):
+            continue
+        if not wide or shape != (0, num_options):
+            expected = [m, num_options] if wide else [m]
+            raise ValueError(
+                f"A search got {name} {list(shape)} for {m} states; it needs {expected}."
+            )
+
+
 def check_search(
     owner: str,
     *,
@@ -93,6 +111,8 @@ def check_search(
     ):
         if value not in names:
             raise ValueError(f"{owner}: {name} is {names[0]!r} or {names[1]!r}; got {value!r}.")
+    leaves_per_wave = whole_number(owner, "leaves_per_wave", leaves_per_wave)
+    waves_in_flight = whole_number(owner, "waves_in_flight", waves_in_flight)
     if not 1 <= leaves_per_wave <= 255:
         raise ValueError(f"{owner} needs leaves_per_wave from 1 to 255; got {leaves_per_wave}.")
     if waves_in_flight < 1 or leaves_per_wave * waves_in_flight > 255:
@@ -115,6 +135,18 @@ def check_search(
             f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
             f"leaves_per_wave=1."
         )
+    if isinstance(tree_policy, Gumbel) and num_simulations > _MOST_HALVED:
+        raise ValueError(
+            f"{owner}: Gumbel plans every simulation ahead, {_MOST_HALVED:,} at most; got "
+            f"{num_simulations:,}."
+        )
+
+
+def root_seeds(owner: str, seed: int, num_roots: int) -> np.ndarray:
+    """Return ``seed + b`` for root b, int64 ``[B]``, modulo 2 ** 63."""
+    whole_number(owner, "seed", seed)
+    first = np.uint64(int(seed) & NO_LIMIT)
+    return ((np.arange(num_roots, dtype=np.uint64) + first) & np.uint64(NO_LIMIT)).astype(np.int64)
 
 
 class Search:
@@ -168,8 +200,9 @@ class Search:
         # Copies: what one search has seen is nothing to the next, nor to one that is resumed later.
         self.novelty = copy.copy(novelty)
         self.transpositions = copy.copy(transpositions)
-        self.num_options = num_options
-        self.num_roots = num_roots
+        self.num_options = whole_number("Search", "num_options", num_options, least=1)
+        self.num_roots = whole_number("Search", "num_roots", num_roots)
+        capacity = whole_number("Search", "capacity", capacity, least=1)
         self.expand_all = expand == "all"
         self.leaves_per_wave = leaves_per_wave
         self.waves_in_flight = waves_in_flight
@@ -299,6 +332,9 @@ class Search:
         first = rows is None
         if rows is None:
             rows = np.arange(self.num_roots)
+        _check_rows(known, len(rows), self.num_options)
+        if len(rows) and not (0 <= rows.min() and rows.max() < self.num_roots):
+            raise ValueError(f"A search of {self.num_roots} roots has no roots {rows}.")
         tree = self.tree
         for test, codes in ((self.novelty, known.features), (self.transpositions, known.codes)):
             if test is not None:
@@ -322,7 +358,7 @@ class Search:
         zeros = np.zeros(len(rows), np.int64)
         self._remember(rows, zeros, known.features, known.codes)
         if self.novelty is not None and known.features is not None:
-            self.novelty.accept(rows, known.features, zeros)
+            self.novelty.accept(rows.copy(), known.features.copy(), zeros.copy())
         if self.transpositions is not None and known.codes is not None:
             self.transpositions.find(rows, known.codes, zeros)
 
@@ -404,7 +440,24 @@ class Search:
         -1; only in a stochastic simulator.
         """
         tree, m = self.tree, len(wave)
+        _check_rows(outcomes, m, self.num_options)
+        bad = self._kernels.first_bad(
+            outcomes.rewards, outcomes.discounts, outcomes.values, outcomes.priors
+        )
+        if bad >= 0:
+            raise ValueError(
+                f"An outcome has the reward {outcomes.rewards[bad]}, the discount "
+                f"{outcomes.discounts[bad]}, the value {outcomes.values[bad]} and the priors "
+                f"{outcomes.priors[bad : bad + 1].tolist()}. All must be finite, rewards and "
+                f"values smaller than {LARGEST:g}, discounts in [0, 1] and priors not negative; "
+                f"scale the rewards, or find the step from which the env wrote them."
+            )
+        if merges is not None and not (
+            len(merges) == m and (merges < tree.num_nodes[wave.records["root"]]).all()
+        ):
+            raise ValueError(f"merges must name {m} nodes of the tree, or -1; got {merges}.")
         self._attach(wave)
+        self.inserting = tree.states is not None  # until the new states are stored, too
         self._reserve_wave()
         novel = np.ones(m, np.bool_)
         nothing = np.empty(0, np.int64)
@@ -424,7 +477,7 @@ class Search:
         if self.novelty is not None:
             assert outcomes.features is not None
             steps = tree.nodes["base_steps"][wave.roots, wave.nodes] + outcomes.durations
-            novel[goes_on] = self.novelty.accept(roots, outcomes.features[goes_on], steps[goes_on])
+            novel[goes_on] = self._accept(roots, outcomes.features[goes_on], steps[goes_on])
         self._kernels.insert(
             tree.nodes, tree.edges, tree.roots, self.settings, wave.records, outcomes.rewards,
             outcomes.discounts, outcomes.durations, outcomes.done, novel, twins,
@@ -434,6 +487,17 @@ class Search:
         new_nodes = np.ascontiguousarray(wave.records["new_node"])
         self._remember(wave.roots, new_nodes, outcomes.features, outcomes.codes)
         return new_nodes
+
+    def _accept(self, roots: np.ndarray, features: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """The answer of the novelty test, bool ``[m]``."""
+        assert self.novelty is not None
+        novel = np.asarray(self.novelty.accept(roots, features, steps))
+        if novel.shape != (len(features),) or novel.dtype != np.bool_:
+            raise ValueError(
+                f"The novelty test accepted {novel.dtype} {list(novel.shape)}; it must say of each "
+                f"of the {len(features)} states whether it is new, in bool."
+            )
+        return novel
 
     def seed(self, seeds: np.ndarray) -> None:
         """Give each root the seed of its random numbers, int64 ``[B]``."""
@@ -451,7 +515,7 @@ class Search:
             allowed = edges["closed"][b, 0] != FORBIDDEN
             prior = np.where(allowed, edges["prior"][b, 0], 0.0)
             drawn = np.zeros(self.num_options)
-            if not allowed.any():
+            if not allowed.any() or noise.fraction == 0.0:
                 continue
             drawn[allowed] = self.generator(b, "noise").dirichlet(
                 np.full(int(allowed.sum()), noise.alpha)
@@ -530,7 +594,7 @@ class Search:
         tree = self.tree
         again = np.ones(len(pruned), np.bool_)
         if self.novelty is not None:
-            again = self.novelty.accept(
+            again = self._accept(
                 np.full(len(pruned), root),
                 np.ascontiguousarray(tree.features[root, pruned]),
                 tree.nodes["base_steps"][root, pruned].astype(np.int64),
@@ -560,6 +624,8 @@ class Search:
     def reroot(self, root: int, node: int) -> None:
         """Make a node the new root: its subtree stays, with all values, the rest is dropped."""
         tree = self.tree
+        if not (0 <= root < self.num_roots and 0 <= node < tree.num_nodes[root]):
+            raise ValueError(f"Root {root} of {self.num_roots} has no node {node} to move to.")
         kept = np.empty(tree.num_nodes[root], np.int64)
         count = self._kernels.reroot(tree.nodes, tree.edges, tree.roots, root, node, kept)
         kept = kept[:count]
