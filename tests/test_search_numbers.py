@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -564,3 +565,68 @@ def test_roots_that_have_ended_are_not_searched() -> None:
     out = MCTSPlanner(env)(td)
     assert out["plan_found"].flatten().tolist() == [True, False, True]
     assert out["num_simulations"].flatten().tolist() == [30, 0, 30]
+
+
+# ---------------------------------------------------------------------- parts that are assigned
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "names"),
+    [
+        (UCT(c=1.0), UCT(c=50.0), ["c"]),
+        (PUCT(c=1.0), PUCT(c=9.0, unvisited_value=0.5), ["c", "unvisited_value"]),
+    ],
+)
+def test_a_kept_search_follows_the_tree_policy_of_its_planner(
+    first: Any, then: Any, names: list[str]
+) -> None:
+    env = ChainEnv(length=6)
+    planner = MCTSPlanner(env, tree_policy=first, seed=0)
+    search = planner.plant(env.reset())
+    planner.tree_policy = then
+    planner.resume(search)
+    assert [search.settings[name][0] for name in names] == [getattr(then, name) for name in names]
+    planted = MCTSPlanner(env, tree_policy=then, seed=0).search(env.reset())
+    assert search.tree.edges.tobytes() == planted.tree.edges.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("tree_policy", PUCT()),
+        ("backup", MaxBackup()),
+        ("novelty", RadiusNovelty("state", 0.5)),
+        ("transpositions", Transpositions("state")),
+        ("chance", ProgressiveWidening()),
+        ("expand", "one"),
+        ("exhausted", "revisit"),
+        ("leaves_per_wave", 4),
+        ("waves_in_flight", 2),
+    ],
+)
+def test_a_kept_search_refuses_what_its_tree_does_not_fit(name: str, value: Any) -> None:
+    env = ChainEnv(length=6)
+    planner = MCTSPlanner(env, seed=0)
+    search = planner.plant(env.reset())
+    other = MCTSPlanner(env, seed=0, **{name: value})
+    with pytest.raises(ValueError, match=f"planted with {name}=.*plant a new one"):
+        other.resume(search)
+    setattr(planner, name, value)
+    with pytest.raises(ValueError, match=f"planted with {name}="):
+        planner.resume(search)
+
+
+def test_a_part_that_makes_no_search_is_refused_after_assignment_too() -> None:
+    env = ChainEnv(length=6)
+    planner = MCTSPlanner(env, seed=0)
+    planner.tree_policy = Gumbel()
+    with pytest.raises(ValueError, match="Gumbel halves a known number"):
+        planner.plan(env.reset())
+
+
+def test_a_copy_of_a_search_is_resumed() -> None:
+    env = ChainEnv(length=6)
+    planner = MCTSPlanner(env, novelty=RadiusNovelty("state", 0.5), seed=0)
+    search = planner.plant(env.reset())
+    copied = planner.resume(copy.deepcopy(search))
+    assert copied.tree.edges.tobytes() == planner.resume(search).tree.edges.tobytes()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -285,23 +285,27 @@ class MCTSPlanner(TensorDictModuleBase):
         root = self.simulator.root(td)
         num_roots = root.batch_size[0]
         search = Search(
-            num_roots,
-            self.num_options,
-            tree_policy=self.tree_policy,
-            backup=self.backup,
-            novelty=self.novelty,
-            transpositions=self.transpositions,
-            chance=self.chance,
-            expand=self.expand,
-            leaves_per_wave=self.leaves_per_wave,
-            exhausted=self.exhausted,
-            waves_in_flight=self.waves_in_flight,
-            capacity=self._capacity(num_roots),
+            num_roots, self.num_options, **self._parts(), capacity=self._capacity(num_roots)
         )
         self._seed(search, seed)
         self._plant(search, root, None)
         self.last_search = search
         return search
+
+    def _parts(self) -> dict[str, Any]:
+        """What a search is set to, as it is now, once more checked: it may have been assigned."""
+        check_search(
+            "MCTSPlanner",
+            tree_policy=self.tree_policy,
+            num_simulations=self.budget.simulations,
+            expand=self.expand,
+            leaves_per_wave=self.leaves_per_wave,
+            exhausted=self.exhausted,
+            waves_in_flight=self.waves_in_flight,
+        )
+        names = ("backup", "novelty", "transpositions", "chance", "expand", "leaves_per_wave")
+        names += ("tree_policy", "exhausted", "waves_in_flight")
+        return {name: getattr(self, name) for name in names}
 
     def _capacity(self, num_roots: int) -> int:
         """Nodes to make room for at once: all that the budget allows, if that is not very many."""
@@ -315,8 +319,13 @@ class MCTSPlanner(TensorDictModuleBase):
     def resume(self, search: Search, *, where: Tensor | None = None) -> Search:
         """Go on with a search, with a fresh budget; with ``Gumbel`` to the end of its schedule.
 
-        Only the roots ``where`` (bool ``[*B]``) are searched, all by default.
+        Only the roots ``where`` (bool ``[*B]``) are searched, all by default. The search follows
+        the planner: assign ``planner.tree_policy = UCT(c=5.0)`` for another constant.
+
+        Raises:
+            ValueError: if the search was planted with another backup, novelty test or the like.
         """
+        search.follow(**self._parts())
         return Growth(self, search).run(time.perf_counter(), _rows(search, where))
 
     def advance(

@@ -142,6 +142,25 @@ def check_search(
         )
 
 
+def _is_same(one: Any, other: Any) -> bool:
+    """Whether two parts of a planner do the same; a copy of a search holds copies of them."""
+    if one is other or type(one) is not type(other):
+        return one is other
+    if type(one).__repr__ is object.__repr__:
+        return True
+    return one == other or repr(one) == repr(other)
+
+
+def _goes_on(one: TreePolicy, other: TreePolicy) -> bool:
+    """Whether a search by one tree policy has kept all that the other needs."""
+    if isinstance(one, PUCT) and isinstance(other, PUCT):
+        return one.normalize == other.normalize
+    if isinstance(one, UCT) or isinstance(other, UCT):
+        return type(one) is type(other)
+    compiled = isinstance(one, (PUCT, Gumbel)), isinstance(other, (PUCT, Gumbel))
+    return not any(compiled) or one == other
+
+
 def root_seeds(owner: str, seed: int, num_roots: int) -> np.ndarray:
     """Return ``seed + b`` for root b, int64 ``[B]``, modulo 2 ** 63."""
     whole_number(owner, "seed", seed)
@@ -196,6 +215,16 @@ class Search:
         from torchrl_hmcts.planners import kernels
 
         self._kernels = kernels
+        self._parts = {
+            "backup": backup,
+            "novelty": novelty,
+            "transpositions": transpositions,
+            "chance": chance,
+            "expand": expand,
+            "leaves_per_wave": leaves_per_wave,
+            "exhausted": exhausted,
+            "waves_in_flight": waves_in_flight,
+        }
         self.tree_policy = tree_policy
         # Copies: what one search has seen is nothing to the next, nor to one that is resumed later.
         self.novelty = copy.copy(novelty)
@@ -239,8 +268,35 @@ class Search:
 
         self.__dict__.update(state, _kernels=kernels)
 
+    def follow(self, *, tree_policy: TreePolicy, **parts: Any) -> None:
+        """Take over what the planner is set to now: another constant of the tree policy, no more.
+
+        Args:
+            tree_policy: of the kind that the search was planted with.
+            parts: the other keywords of the constructor, which must be what they were.
+
+        Raises:
+            ValueError: if anything else differs, since what the tree holds would not fit it.
+        """
+        kept = {"tree_policy": self.tree_policy, **self._parts}
+        now = {"tree_policy": tree_policy, **parts}
+        for name in parts:
+            if not _is_same(kept[name], now[name]):
+                break
+        else:
+            name = "tree_policy"
+            if tree_policy is kept[name] or _goes_on(kept[name], tree_policy):
+                self._set_policy(tree_policy)
+                return
+        raise ValueError(
+            f"This search was planted with {name}={kept[name]!r}; the planner now has "
+            f"{name}={now[name]!r}. What the tree holds does not fit it: plant a new one, or "
+            f"resume it with a planner like the first."
+        )
+
     def _set_policy(self, tree_policy: TreePolicy) -> None:
         kernels, settings = self._kernels, self.settings[0]
+        self.tree_policy = tree_policy
         self._scores = None
         if isinstance(tree_policy, UCT):
             settings["score"], settings["c"] = kernels.UCT_SCORE, tree_policy.c
