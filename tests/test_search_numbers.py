@@ -600,8 +600,6 @@ def test_a_kept_search_follows_the_tree_policy_of_its_planner(
         ("chance", ProgressiveWidening()),
         ("expand", "one"),
         ("exhausted", "revisit"),
-        ("leaves_per_wave", 4),
-        ("waves_in_flight", 2),
     ],
 )
 def test_a_kept_search_refuses_what_its_tree_does_not_fit(name: str, value: Any) -> None:
@@ -614,6 +612,22 @@ def test_a_kept_search_refuses_what_its_tree_does_not_fit(name: str, value: Any)
     setattr(planner, name, value)
     with pytest.raises(ValueError, match=f"planted with {name}="):
         planner.resume(search)
+
+
+@pytest.mark.parametrize("tree_policy", [UCT(), least_visited])
+def test_a_kept_search_follows_the_waves_of_its_planner(tree_policy: Any) -> None:
+    env = ChainEnv(length=6)
+    kwargs: dict[str, Any] = {"tree_policy": tree_policy, "expand": "one", "budget": simulations(9)}
+    planner = MCTSPlanner(env, **kwargs)
+    search = planner.plant(env.reset())
+    planner.leaves_per_wave, planner.waves_in_flight = 3, 2
+    planner.resume(search)
+    planted = MCTSPlanner(env, leaves_per_wave=3, waves_in_flight=2, **kwargs).search(env.reset())
+    one, other = (x.tree.edges[:, : x.tree.num_nodes[0]] for x in (search, planted))
+    assert one.tobytes() == other.tobytes()
+    planner.leaves_per_wave, planner.waves_in_flight = 1, 1
+    assert planner.resume(search).num_simulations.tolist() == [9]
+    assert not search.tree.edges["in_flight"].any()
 
 
 def test_a_part_that_makes_no_search_is_refused_after_assignment_too() -> None:

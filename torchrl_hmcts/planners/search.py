@@ -221,9 +221,7 @@ class Search:
             "transpositions": transpositions,
             "chance": chance,
             "expand": expand,
-            "leaves_per_wave": leaves_per_wave,
             "exhausted": exhausted,
-            "waves_in_flight": waves_in_flight,
         }
         self.tree_policy = tree_policy
         # Copies: what one search has seen is nothing to the next, nor to one that is resumed later.
@@ -233,8 +231,6 @@ class Search:
         self.num_roots = whole_number("Search", "num_roots", num_roots)
         capacity = whole_number("Search", "capacity", capacity, least=1)
         self.expand_all = expand == "all"
-        self.leaves_per_wave = leaves_per_wave
-        self.waves_in_flight = waves_in_flight
         self.growing = False  # also after an interruption: some of it may have been in flight
         self.inserting = False  # also after an interruption: nodes may be there without a state
         self.stochastic = chance is not None
@@ -243,8 +239,6 @@ class Search:
         settings = self.settings[0]
         settings["backup"] = kernels.MAX_BACKUP if self.max_backup else kernels.MEAN_BACKUP
         settings["expand_all"] = self.expand_all
-        settings["leaves"] = leaves_per_wave
-        settings["mark"] = leaves_per_wave * waves_in_flight > 1
         # Chance options never close, and halving counts visits: both land on what they know.
         revisit = exhausted == "revisit" or self.stochastic or isinstance(tree_policy, Gumbel)
         settings["revisit"] = revisit
@@ -252,10 +246,8 @@ class Search:
         if chance is not None:
             settings["widening"], settings["widening_exponent"] = chance.k, chance.alpha
         self._set_policy(tree_policy)
+        self._set_waves(leaves_per_wave, waves_in_flight)
         self.tree = SearchTree(num_roots, num_options, capacity=capacity)
-        self._wave = np.zeros(
-            num_roots * leaves_per_wave * (num_options if self.expand_all else 1), WAVE
-        )
         self._gumbel = np.zeros((0, 0), np.float32)
         self.seed(np.arange(num_roots))
         self._room = 1  # nodes of the largest tree, at most
@@ -268,11 +260,29 @@ class Search:
 
         self.__dict__.update(state, _kernels=kernels)
 
-    def follow(self, *, tree_policy: TreePolicy, **parts: Any) -> None:
-        """Take over what the planner is set to now: another constant of the tree policy, no more.
+    def _set_waves(self, leaves_per_wave: int, waves_in_flight: int) -> None:
+        self.leaves_per_wave, self.waves_in_flight = leaves_per_wave, waves_in_flight
+        self.settings["leaves"] = leaves_per_wave
+        # Options on the way down are marked for other descents, and always for those in Python.
+        alone = leaves_per_wave * waves_in_flight == 1 and self._scores is None
+        self.settings["mark"] = not alone
+        per_leaf = self.num_options if self.expand_all else 1
+        self._wave = np.zeros(self.num_roots * leaves_per_wave * per_leaf, WAVE)
+
+    def follow(
+        self,
+        *,
+        tree_policy: TreePolicy,
+        leaves_per_wave: int,
+        waves_in_flight: int,
+        **parts: Any,
+    ) -> None:
+        """Take over what the planner is set to now: constants of the tree policy, and waves.
 
         Args:
             tree_policy: of the kind that the search was planted with.
+            leaves_per_wave: leaves of each root in a wave.
+            waves_in_flight: waves under way at a time.
             parts: the other keywords of the constructor, which must be what they were.
 
         Raises:
@@ -287,6 +297,7 @@ class Search:
             name = "tree_policy"
             if tree_policy is kept[name] or _goes_on(kept[name], tree_policy):
                 self._set_policy(tree_policy)
+                self._set_waves(leaves_per_wave, waves_in_flight)
                 return
         raise ValueError(
             f"This search was planted with {name}={kept[name]!r}; the planner now has "
@@ -313,7 +324,7 @@ class Search:
             settings["score"], settings["c"] = kernels.GUMBEL_SCORE, tree_policy.c_visit
             settings["c_scale"] = tree_policy.c_scale
         else:
-            self._scores, settings["mark"] = tree_policy, 1
+            self._scores = tree_policy
         if isinstance(tree_policy, UCT | PUCT):
             kernels.fill_factors(self.settings)
 
