@@ -303,7 +303,14 @@ class MCTSPlanner(TensorDictModuleBase):
             exhausted=self.exhausted,
             waves_in_flight=self.waves_in_flight,
         )
-        names = ("backup", "novelty", "transpositions", "chance", "expand", "leaves_per_wave")
+        names: tuple[str, ...] = (
+            "backup",
+            "novelty",
+            "transpositions",
+            "chance",
+            "expand",
+            "leaves_per_wave",
+        )
         names += ("tree_policy", "exhausted", "waves_in_flight")
         return {name: getattr(self, name) for name in names}
 

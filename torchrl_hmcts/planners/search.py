@@ -135,7 +135,7 @@ def check_search(
             f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
             f"leaves_per_wave=1."
         )
-    if isinstance(tree_policy, Gumbel) and num_simulations > _MOST_HALVED:
+    if isinstance(tree_policy, Gumbel) and (num_simulations or 0) > _MOST_HALVED:
         raise ValueError(
             f"{owner}: Gumbel plans every simulation ahead, {_MOST_HALVED:,} at most; got "
             f"{num_simulations:,}."
@@ -288,7 +288,7 @@ class Search:
         Raises:
             ValueError: if anything else differs, since what the tree holds would not fit it.
         """
-        kept = {"tree_policy": self.tree_policy, **self._parts}
+        kept: dict[str, Any] = {"tree_policy": self.tree_policy, **self._parts}
         now = {"tree_policy": tree_policy, **parts}
         for name in parts:
             if not _is_same(kept[name], now[name]):
