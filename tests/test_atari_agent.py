@@ -176,6 +176,18 @@ def test_trackers_under_a_small_search_keep_the_ball_in_play() -> None:
     assert player.state["lives"].item() == 5 if "lives" in player.state.keys() else True
 
 
+def test_the_search_that_is_kept_explores_in_units_of_the_greatest_reward() -> None:
+    pool = make_pool(RepeatActions(4), max_steps=5)
+    player = AtariAgent(pool, AtariSearch(ratio=4.0, tree_policy="uct", c=2.0), seed=0)
+    player.play(1)
+    kept = player.planner.last_search
+    assert kept.settings["c"][0] == 2.0
+    player.greatest_reward = 40.0
+    player.play(1)
+    assert player.planner.last_search is kept  # no tree was planted again
+    assert kept.settings["c"][0] == player.planner.tree_policy.c == 80.0
+
+
 # ------------------------------------------------------------------------------------ experiment
 
 

@@ -243,8 +243,8 @@ def test_a_search_over_arrays_grows_the_same_trees(
 @pytest.mark.parametrize(
     ("name", "wrong", "message"),
     [
-        ("reward", np.zeros(7, np.float32), "rows that do not fit the wave"),
-        ("value", np.full(1, np.nan, np.float32), "number that is not finite"),
+        ("reward", np.zeros(7, np.float32), "returned reward as float32 \\[7\\]"),
+        ("value", np.full(1, np.nan, np.float32), "returned the value nan"),
     ],
 )
 def test_a_transition_function_that_goes_wrong_later_is_refused(

@@ -152,9 +152,14 @@ class ReferenceSearch:
         return all(a in node.children and self.closed(node.children[a]) for a in self.options(node))
 
     def prior(self, node: Node, option: int) -> float:
+        """Sums to 1 over the options that may be taken."""
+        options = self.options(node)
+        if option not in options:
+            return 0.0
         if not self.use_priors:
-            return 1.0 / self.smdp.num_options
-        return self.smdp.priors[node.state][option]
+            return 1.0 / len(options)
+        priors = self.smdp.priors[node.state]
+        return priors[option] / sum(priors[a] for a in options)
 
     # What UCT and PUCT maximise.
 
@@ -200,7 +205,7 @@ class ReferenceSearch:
         low, high = min(q), max(q)
         most = max((child.visits for child in tried.values()), default=0)
         return [
-            math.log(self.prior(node, a))
+            (math.log(self.prior(node, a)) if self.prior(node, a) else -math.inf)
             + (50.0 + most) * self.c * (q[a] - low) / max(high - low, 1e-8)
             for a in all_options
         ]

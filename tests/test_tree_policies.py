@@ -329,7 +329,7 @@ def test_a_policy_is_told_visits_values_and_squared_returns() -> None:
     assert [node.option_values[0, 0].item() for node in at_root] == [0.0, 1.0, 1.75]
     assert [node.option_squares[0, 0].item() for node in at_root] == [0.0, 1.0, 1.0 + 2.5**2]
     assert at_root[2].node_values.item() == pytest.approx((0.0 + 1.0 + 2.5) / 3)
-    assert at_root[0].priors[0].tolist() == pytest.approx([1 / 3] * 3)
+    assert at_root[0].priors[0].tolist() == [0.5, 0.0, 0.5]
 
 
 @pytest.mark.parametrize(

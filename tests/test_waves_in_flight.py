@@ -237,7 +237,7 @@ def test_a_search_that_was_interrupted_while_it_inserted_does_not_go_on() -> Non
         planner.resume(search)
 
 
-def test_the_number_of_waves_is_that_with_which_the_search_was_planted() -> None:
+def test_a_search_can_be_resumed_with_more_waves() -> None:
     env = TableEnv(MAZE)
     search = planner_of(env, expand="one").search(env.reset())
     planner_of(env, expand="one", waves_in_flight=3).resume(search)

@@ -5,6 +5,7 @@ Letters: ``B`` roots, ``A`` options, ``m`` outcomes of one wave.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -14,17 +15,34 @@ import torch
 from torch import Tensor
 
 from torchrl_hmcts.planners.backups import Backup, MeanBackup
-from torchrl_hmcts.planners.search import Outcomes, RootStates, Search, check_search
+from torchrl_hmcts.planners.counts import whole_number
+from torchrl_hmcts.planners.search import (
+    Outcomes,
+    RootStates,
+    Search,
+    check_search,
+    root_seeds,
+)
+from torchrl_hmcts.planners.tree import LARGEST, MOST_NODES
 from torchrl_hmcts.planners.tree_policies import PUCT, Gumbel, TreePolicy
 
 Array = np.ndarray | Tensor
+
+_SIZE = f"must be finite and smaller than {LARGEST:g}, so that sums of them are finite"
+_RANGES = {  # lowest, highest, and the rule
+    "reward": (-LARGEST, LARGEST, f"rewards {_SIZE}"),
+    "value": (-LARGEST, LARGEST, f"values {_SIZE}"),
+    "prior": (0.0, LARGEST, "probabilities must be finite and not negative"),
+    "discount": (0.0, 1.0, "discounts, gamma ** duration, must be finite and in [0, 1]"),
+}
 
 
 class Root(NamedTuple):
     """The states to search from.
 
     Attributes:
-        prior (Array): ``[B, A]`` float32, probabilities of options.
+        prior (Array): ``[B, A]`` float32, probabilities of options; those of the options that may
+            be taken are scaled to sum to 1.
         value (Array): ``[B]`` float32.
         embedding (Array): ``[B, ...]`` what the transition function needs of a state, any dtype.
 
@@ -47,7 +65,8 @@ class Transition(NamedTuple):
     Attributes:
         reward (Array): ``[m]`` float32, R.
         discount (Array): ``[m]`` float32, D: gamma ** duration, 0 for a terminal state.
-        prior (Array): ``[m, A]`` float32, probabilities of options in the next state.
+        prior (Array): ``[m, A]`` float32, probabilities of options in the next state, scaled to
+            sum to 1.
         value (Array): ``[m]`` float32, of the next state.
         embedding (Array): ``[m, ...]`` of the next state, shape and dtype of the roots'.
 
@@ -95,7 +114,7 @@ def tree_search(
         root: states to search from. NumPy arrays or CPU tensors; the transition function is called
             with the kind the embedding has.
         transition: ``transition(embedding [m, ...], option [m] int64) -> Transition`` of
-            contiguous float32 arrays. The arrays it is given are reused by the next call.
+            contiguous float32 arrays. The arrays it is given are copies, reused by the next call.
         num_simulations: per root.
         tree_policy: Default ``PUCT()``.
         backup: Default ``MeanBackup()``.
@@ -109,8 +128,9 @@ def tree_search(
         are the visits of the roots' options. States of nodes are not kept in the tree.
 
     Raises:
-        ValueError: if shapes do not fit, a number is out of range or not finite, or ``Gumbel``
-            comes with several leaves per wave.
+        ValueError: if shapes do not fit, a number is out of range or not finite (rewards and
+            values are smaller than 1e30, discounts in [0, 1]), or ``Gumbel`` comes with several
+            leaves per wave.
         TypeError: if the transition function returns another kind of array than it was given.
 
     Reference:
@@ -135,8 +155,12 @@ def tree_search(
     backup = MeanBackup() if backup is None else backup
     prior, value = _check_root(root)
     num_roots, num_options = prior.shape
-    if num_simulations < 1:
-        raise ValueError(f"tree_search needs num_simulations >= 1; got {num_simulations}.")
+    num_simulations = whole_number("tree_search", "num_simulations", num_simulations, least=1)
+    if num_simulations >= MOST_NODES:
+        raise ValueError(
+            f"tree_search makes room for a node per simulation, fewer than {MOST_NODES:,}; got "
+            f"num_simulations={num_simulations}."
+        )
     check_search(
         "tree_search",
         tree_policy=tree_policy,
@@ -166,7 +190,7 @@ def tree_search(
         )
     search.start(RootStates(value, np.zeros(num_roots, np.bool_), prior, masks))
     search.begin(num_simulations)
-    search.seed(np.arange(num_roots) + seed)
+    search.seed(root_seeds("tree_search", seed, num_roots))
     if isinstance(tree_policy, Gumbel):
         search.halve(num_simulations)
     loop = _Loop(search, root.embedding, transition, no_masks)
@@ -188,13 +212,15 @@ class _Loop:
         first = np.ascontiguousarray(_numpy(embedding))
         rows = len(search._wave)
         self.dtype, self.shape = first.dtype, first.shape[1:]
-        self.size = first.nbytes // len(first)
+        self.size = self.dtype.itemsize * math.prod(self.shape)
         self.nothing = first[:0]
         self.stored = np.zeros((search.num_roots, search.tree.capacity, self.size), np.uint8)
-        self.stored[:, 0] = first.reshape(len(first), -1).view(np.uint8)
+        self.stored[:, 0] = _bytes(first).reshape(len(first), self.size)
         self.buffer = np.zeros(rows * self.size, np.uint8)
+        # Copies: the transition function may write into what it is given.
+        self.given = np.zeros(rows, np.int64)
+        self.options: Any = self.given
         self.states: Any = self.buffer.view(self.dtype).reshape(rows, *self.shape)
-        self.options: Any = search._wave["option"]
         if self.is_tensor:
             self.states, self.options = map(torch.from_numpy, (self.states, self.options))
 
@@ -213,6 +239,7 @@ class _Loop:
             self.masks,
             self.stored,
             self.buffer,
+            self.given,
         )
         advance: Any
         if kernels.COMPILED:
@@ -224,29 +251,31 @@ class _Loop:
         none, no_prior = np.zeros(0, np.float32), np.zeros((0, search.num_options), np.float32)
         nothing = _bytes(self.nothing) if as_bytes else self.nothing
         count = advance(0, none, none, none, no_prior, nothing)
-        reward: Any
-        discount: Any
-        prior: Any
-        value: Any
-        embedding: Any
-        if count:
-            answer = transition(states[:count], options[:count])
-            self._check(answer, count)
-            reward, discount, prior, value, embedding = answer
+        dtype, shape, first = self.dtype, self.shape, True
         while count:
-            if self.is_tensor:
-                reward, discount, prior, value, embedding = (
-                    x.detach().numpy() for x in (reward, discount, prior, value, embedding)
-                )
-            if as_bytes:
-                embedding = _bytes(embedding)
-            count = advance(count, reward, discount, value, prior, embedding)
             if count == size:
-                reward, discount, prior, value, embedding = transition(states, options)
-            elif count:
-                reward, discount, prior, value, embedding = transition(
-                    states[:count], options[:count]
-                )
+                answer = transition(states, options)
+            else:
+                answer = transition(states[:count], options[:count])
+            try:
+                if first:
+                    self._check(answer, count)
+                    first = False
+                reward, discount, prior, value, embedding = answer
+                if self.is_tensor:
+                    reward, discount, prior, value, embedding = (
+                        x.detach().numpy() for x in (reward, discount, prior, value, embedding)
+                    )
+                if embedding.dtype is not dtype:  # as bytes it might look right
+                    self._check(answer, count)
+                if as_bytes:
+                    if embedding.shape[1:] != shape:
+                        self._check(answer, count)
+                    embedding = _bytes(embedding)
+                count = advance(count, reward, discount, value, prior, embedding)
+            except Exception:
+                self._check(answer, count)
+                raise
 
     def run_in_python(self) -> None:
         """The same with a tree policy that is not compiled."""
@@ -287,6 +316,11 @@ class _Loop:
             "value": (count,),
             "embedding": (count, *self.shape),
         }
+        if not isinstance(answer, tuple) or len(answer) != len(shapes):
+            raise TypeError(
+                f"The transition function returned {type(answer).__name__}; return a Transition of "
+                f"{', '.join(shapes)}."
+            )
         for (name, shape), array in zip(shapes.items(), answer, strict=True):
             dtype = self.dtype if name == "embedding" else np.dtype(np.float32)
             if not isinstance(array, Tensor if self.is_tensor else np.ndarray):
@@ -301,11 +335,17 @@ class _Loop:
                     f"The transition function returned {name} as {got.dtype} {list(got.shape)}"
                     f"{order}; it must be {dtype} {list(shape)} and contiguous."
                 )
-            if name != "embedding" and not np.isfinite(got).all():
-                raise ValueError(
-                    f"The transition function returned the {name} {got[~np.isfinite(got)][0]}; "
-                    f"rewards, discounts, priors and values must be finite."
-                )
+            if name != "embedding":
+                _check_range(f"The transition function returned the {name} {{number}}", name, got)
+
+
+def _check_range(found: str, name: str, array: np.ndarray) -> None:
+    """Refuse numbers that no search can use; ``found`` says of which array, with its {number}."""
+    low, high, rule = _RANGES[name]
+    exact = array.astype(np.float64)
+    good = (exact >= low) & (exact <= high)
+    if not good.all():
+        raise ValueError(f"{found.format(number=array[~good][0])}; {rule}.")
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:
@@ -320,8 +360,10 @@ def _check_root(root: Root) -> tuple[np.ndarray, np.ndarray]:
     prior, value = (
         np.ascontiguousarray(_numpy(x), dtype=np.float32) for x in (root.prior, root.value)
     )
-    if prior.ndim != 2 or not prior.size:
-        raise ValueError(f"The roots' prior must be [B, A]; got {list(prior.shape)}.")
+    if prior.ndim != 2 or not prior.shape[1]:
+        raise ValueError(
+            f"The roots' prior must be [B, A]; got {list(prior.shape)}. A is 1 or more."
+        )
     for name, array in (("value", value), ("embedding", root.embedding)):
         if array.ndim < 1 or len(array) != len(prior) or (name == "value" and array.ndim > 1):
             raise ValueError(
@@ -329,7 +371,5 @@ def _check_root(root: Root) -> tuple[np.ndarray, np.ndarray]:
                 f"prior; got shape {list(array.shape)}."
             )
     for name, array in (("prior", prior), ("value", value)):
-        if not np.isfinite(array).all() or (name == "prior" and (array < 0.0).any()):
-            bad = array[~np.isfinite(array) | (array < 0.0)][0]
-            raise ValueError(f"The roots' {name} holds {bad}, which is no {name}.")
+        _check_range(f"The roots' {name} holds {{number}}, which is no {name}", name, array)
     return prior, value

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchrl_hmcts.planners.counts import whole_number
+
 _DEFAULT_EXPANSIONS = 1000
 
 
@@ -14,6 +16,7 @@ class SearchBudget:
     Simulations are exact with ``expand="one"``; with ``"all"`` the last leaf still simulates all of
     its options. The others are looked at after every wave, with a ``TreeRollout`` after its
     rollouts, so a search may exceed them by what one wave simulates, or all that are in flight.
+    A tree of 2,130,706,431 visits is not searched further.
 
     Args:
         expansions: nodes whose options are simulated (with ``expand="one"``: options simulated).
@@ -28,6 +31,7 @@ class SearchBudget:
 
     Raises:
         ValueError: if a limit is zero or negative.
+        TypeError: if a count is no integer.
 
     Reference:
         This project's.
@@ -54,9 +58,9 @@ class SearchBudget:
                     f"SearchBudget needs {name} > 0: a search of nothing has no plan; got {value}. "
                     f"Use None for no limit."
                 )
+            if value is not None and name != "seconds":
+                object.__setattr__(self, name, whole_number("SearchBudget", name, value))
         if all(getattr(self, name) is None for name in limits):
             object.__setattr__(self, "expansions", _DEFAULT_EXPANSIONS)
-        if self.improve_expansions < 0:
-            raise ValueError(
-                f"SearchBudget needs improve_expansions >= 0; got {self.improve_expansions}."
-            )
+        more = whole_number("SearchBudget", "improve_expansions", self.improve_expansions)
+        object.__setattr__(self, "improve_expansions", more)

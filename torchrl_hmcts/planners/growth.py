@@ -18,14 +18,15 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_hmcts.planners.counts import NO_LIMIT
 from torchrl_hmcts.planners.node_evaluation import (
     leaf_values,
     node_codes,
     node_features,
     option_priors,
 )
-from torchrl_hmcts.planners.search import NO_LIMIT, Outcomes, Search, Wave
-from torchrl_hmcts.planners.tree import TERMINAL
+from torchrl_hmcts.planners.search import Outcomes, Search, Wave
+from torchrl_hmcts.planners.tree import MOST_BASE_STEPS, TERMINAL
 from torchrl_hmcts.planners.tree_policies import Gumbel
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ class Growth:
         """
         search, budget = self.search, self.planner.budget
         search.begin(budget.simulations)
-        search.growing = True
+        search.growing = search.num_roots > 0
         if isinstance(self.planner.tree_policy, Gumbel):
             assert budget.simulations is not None
             search.halve(budget.simulations)
@@ -130,7 +131,9 @@ class Growth:
     def _grow(self, begin: float, rows: np.ndarray) -> None:
         search, budget, under_way = self.search, self.planner.budget, self._under_way
         # Without a limit of simulations a root may revisit what it knows for ever.
-        endless = budget.simulations is None and bool(search.settings["revisit"][0])
+        endless = bool(search.settings["revisit"][0]) and bool(
+            (search.roots["limit"] == NO_LIMIT).any()
+        )
         since = search.roots["revisits"].copy()  # at the last outcome of each root
         active = self._still_active(rows)
         while len(active) or under_way:
@@ -203,7 +206,9 @@ class Growth:
             wave = search.detach(wave)
         try:
             states = search.tree.get_states(wave.roots, wave.nodes, simulator.state_keys)
-            sent = simulator.send(states, wave.options)
+            sent = simulator.send(states, wave.options.copy())  # the env may write into them
+            if search.waves_in_flight > 1 and not simulator.works_beside:
+                sent = sent.clone()  # an env may write its next states into the same tensors
         except BaseException:
             search.cancel(wave)
             raise
@@ -224,16 +229,20 @@ class Growth:
         if simulator.duration_key is None:
             discounts = np.where(terminated, np.float32(0.0), np.float32(planner.gamma))
         else:
+            _check_durations(search, wave, durations)
             discounts = np.where(terminated, 0.0, planner.gamma**durations).astype(np.float32)
+        looked_at = after
+        if planner.leaf_evaluator is not None or planner.option_prior is not None:
+            looked_at = after.clone()  # what is stored must not depend on what they do with it
         outcomes = Outcomes(
             rewards=simulator.rewards(after),
             discounts=discounts,
             durations=durations,
             done=done,
             values=leaf_values(
-                planner.leaf_evaluator, after, terminated, lambda: _row_seeds(search, wave)
+                planner.leaf_evaluator, looked_at, terminated, lambda: _row_seeds(search, wave)
             ),
-            priors=option_priors(planner.option_prior, after, planner.num_options),
+            priors=option_priors(planner.option_prior, looked_at, planner.num_options),
             masks=simulator.masks(after),
             features=node_features(planner.novelty, after),
             codes=node_codes(planner.transpositions, after),
@@ -241,7 +250,6 @@ class Growth:
         merges = None
         if planner.chance is not None:
             merges = self._find_merges(wave, after, done)
-        search.inserting = True
         nodes = search.insert(wave, outcomes, merges)
         search.tree.set_states(wave.roots, nodes, after)
         search.inserting = False
@@ -262,6 +270,18 @@ class Growth:
                     break
                 node = int(tree.nodes["sibling"][b, node])
         return merges
+
+
+def _check_durations(search: Search, wave: Wave, durations: np.ndarray) -> None:
+    """Refuse times that no option can have taken, and paths whose length would wrap."""
+    above = search.tree.nodes["base_steps"][wave.roots, wave.nodes]
+    good = (durations >= 1) & (durations <= MOST_BASE_STEPS - above.astype(np.int64))
+    if not good.all():
+        raise ValueError(
+            f"The simulator returned a duration of {durations[~good][0]}. An option takes one base "
+            f"step or more, and a path {MOST_BASE_STEPS:,} at most; find the step from which the "
+            f"env wrote it."
+        )
 
 
 def _row_seeds(search: Search, wave: Wave) -> np.ndarray:

@@ -21,6 +21,9 @@ from torchrl_hmcts.planners.tree import (
     EDGE,
     EXPANDED,
     FORBIDDEN,
+    LARGEST,
+    MOST_SAMPLES,
+    MOST_VISITS,
     NODE,
     PENDING,
     PRUNED,
@@ -36,6 +39,10 @@ UCT_SCORE, PUCT_SCORE, GUMBEL_SCORE = 0, 1, 2
 MEAN_BACKUP, MAX_BACKUP = 0, 1
 RAW_VALUES, SIBLINGS, WHOLE_TREE = 0, 1, 2
 
+# Visits of a node up to which its mean value is updated in float32, with an error of about 1e-5.
+# Beyond it the rest of the mean is kept too: changes of one part in 10 million would be lost.
+FEW_VISITS = 2**16
+ROUNDING = 1e-5  # by which the sum of float32 probabilities may differ from 1
 FACTORS = 256  # visits of a node up to which its exploration factor is looked up
 BLOCK = 32  # trees that go down in step: what they touch fits in the first-level cache
 AHEAD = 4  # outcomes; by so many the insertion is ahead in asking for memory
@@ -62,7 +69,8 @@ SETTINGS = np.dtype(
     align=True,
 )
 
-_float32, _bool_, _uint8 = np.dtype(np.float32), np.dtype(np.bool_), np.dtype(np.uint8)
+_float32, _int64 = np.dtype(np.float32), np.dtype(np.int64)
+_bool_, _uint8 = np.dtype(np.bool_), np.dtype(np.uint8)
 
 # What a descent comes to.
 _ALL_OPTIONS, _ONE_OPTION, _KNOWN_LEAF, _COLLISION = 0, 1, 2, 3
@@ -239,7 +247,7 @@ def _outcome(nodes, first):
 @numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _wants_sample(edge, s):
     """Whether progressive widening asks for one more outcome of an option that has some."""
-    if s["widening"] <= 0.0 or edge["in_flight"] > 0 or edge["samples"] >= 65_535:
+    if s["widening"] <= 0.0 or edge["in_flight"] > 0 or edge["samples"] >= MOST_SAMPLES:
         return False
     most = s["widening"] * (edge["visits"] + 1.0) ** s["widening_exponent"]  # with this visit
     return edge["samples"] < math.ceil(most)
@@ -532,6 +540,7 @@ def _write_node(nodes, edges, n, parent, option, value, priors, masks, i):
     node = nodes[n]
     node["visits"] = 1
     node["value"] = value
+    node["rest"] = 0.0
     node["raw_value"] = value
     node["parent"] = parent
     node["option"] = option
@@ -539,21 +548,30 @@ def _write_node(nodes, edges, n, parent, option, value, priors, masks, i):
     node["samples"] = 1
     node["twin"] = -1
     node["flags"] = 0
-    opened = 0
+    # Priors of the options that may be taken sum to 1; what does so already keeps its bits.
+    opened, mass = num_options, 0.0
+    if masks.shape[0]:
+        for a in range(num_options):
+            opened -= not masks[i, a]
+            mass += priors[i, a] if priors.shape[0] and masks[i, a] else 0.0
+    elif priors.shape[0]:
+        for a in range(num_options):
+            mass += priors[i, a]
+    share = 1.0 / opened if opened > 0 and mass == 0.0 else 0.0
+    scale = 1.0 if abs(mass - 1.0) <= ROUNDING or mass == 0.0 else 1.0 / mass
     for a in range(num_options):
         edge = edges[n, a]
         edge["child"] = -1
         edge["visits"] = 0
         edge["value"] = 0.0
-        edge["prior"] = priors[i, a] if priors.shape[0] else 1.0 / num_options
+        edge["prior"] = priors[i, a] * scale + share if priors.shape[0] else share
         edge["squares"] = 0.0
         edge["samples"] = 0
         edge["in_flight"] = 0
         edge["closed"] = 0
         if masks.shape[0] and not masks[i, a]:
             edge["closed"] = FORBIDDEN
-        else:
-            opened += 1
+            edge["prior"] = 0.0
     node["open_options"] = opened
 
 
@@ -631,8 +649,14 @@ def _back_up(nodes, edges, root, s, n):
         edge["value"] = _option_value(nodes, edge["child"])
         node = nodes[parent]
         node["visits"] += 1
-        if s["backup"] == MEAN_BACKUP:
+        if s["backup"] == MEAN_BACKUP and node["visits"] <= FEW_VISITS:
             node["value"] += (gain - node["value"]) / node["visits"]
+        elif s["backup"] == MEAN_BACKUP:
+            # np.float64, since numba's float() of a float32 is one.
+            mean = np.float64(node["value"]) + node["rest"]
+            mean += (gain - mean) / node["visits"]
+            node["value"] = mean
+            node["rest"] = mean - np.float64(node["value"])
         else:
             best = -np.inf
             for other in range(num_options):
@@ -794,15 +818,34 @@ def insert(
 
 
 @njit(error_model="numpy", _nrt=False)
+def first_bad(rewards, discounts, values, priors):
+    """The first outcome with a number that no search can use, or -1.
+
+    Those are rewards and values from LARGEST on, discounts outside [0, 1], priors below 0, and what
+    is not finite. ``values`` and ``priors`` may be empty.
+    """
+    for i in range(rewards.shape[0]):
+        good = (abs(rewards[i]) < LARGEST) & (0.0 <= discounts[i]) & (discounts[i] <= 1.0)
+        if values.shape[0]:
+            good &= abs(values[i]) < LARGEST
+        if priors.shape[0]:
+            for a in range(priors.shape[1]):
+                good &= (0.0 <= priors[i, a]) & (priors[i, a] < LARGEST)
+        if not good:
+            return i
+    return -1
+
+
+@njit(error_model="numpy", _nrt=False)
 def advance(
-    nodes, edges, roots, settings, gumbel, wave, masks, stored, states, count,
+    nodes, edges, roots, settings, gumbel, wave, masks, stored, states, options, count,
     rewards, discounts, values, priors, new_states,
 ):  # fmt: skip
     """Insert the outcomes of ``wave[:count]`` and select the next wave; return its size.
 
     One call per simulation for searches over plain arrays: a discount of 0 is a terminal state, an
     option takes one base step, and states (bytes, flat) are copied to and from the tree's
-    ``stored`` ones.
+    ``stored`` ones. What is written to ``states`` and ``options`` is never read again.
     """
     s = settings[0]
     size = stored.shape[2]
@@ -816,12 +859,8 @@ def advance(
         or new_states.shape[0] != count * size
     ):
         raise ValueError("the transition function returned rows that do not fit the wave")
-    for i in range(count):
-        total = rewards[i] + discounts[i] + values[i]
-        for a in range(num_options):
-            total += priors[i, a]
-        if not math.isfinite(total):
-            raise ValueError("the transition function returned a number that is not finite")
+    if first_bad(rewards, discounts, values, priors) >= 0:
+        raise ValueError("the transition function returned a number that is out of range")
     if count:
         _arrived(nodes, edges, roots, s, wave, count)
     for i in range(count):
@@ -848,6 +887,7 @@ def advance(
     count = select(nodes, edges, roots, settings, gumbel, wave)
     for i in range(count):
         b, n = wave[i]["root"], wave[i]["node"]
+        options[i] = wave[i]["option"]
         for k in range(size):
             states[i * size + k] = stored[b, n, k]
     return count
@@ -866,9 +906,9 @@ def _pointer(typing_context, address, dtype):
     return target(types.intp, dtype), codegen
 
 
-def handle(nodes, edges, roots, settings, gumbel, wave, masks, stored, states):
+def handle(nodes, edges, roots, settings, gumbel, wave, masks, stored, states, options):
     """Where the arrays of a search are: addresses, then sizes. They must outlive it."""
-    arrays = (nodes, edges, roots, settings, gumbel, wave, masks, stored, states)
+    arrays = (nodes, edges, roots, settings, gumbel, wave, masks, stored, states, options)
     sizes = (*edges.shape, gumbel.shape[0], gumbel.shape[1], len(wave), len(masks))
     sizes += (stored.shape[2], len(states))
     addresses = (array.__array_interface__["data"][0] for array in arrays)
@@ -878,7 +918,7 @@ def handle(nodes, edges, roots, settings, gumbel, wave, masks, stored, states):
 @njit(error_model="numpy")
 def advance_at(at, count, rewards, discounts, values, priors, embedding):
     """:func:`advance` with its lasting arrays behind one handle: a third of the call's cost."""
-    num_roots, capacity, num_options = at[9], at[10], at[11]
+    num_roots, capacity, num_options = at[10], at[11], at[12]
     if not embedding.flags.c_contiguous:
         raise ValueError("the transition function returned an embedding that is not contiguous")
     return advance(
@@ -886,11 +926,12 @@ def advance_at(at, count, rewards, discounts, values, priors, embedding):
         numba.carray(_pointer(at[1], EDGE), (num_roots, capacity, num_options)),
         numba.carray(_pointer(at[2], ROOT), num_roots),
         numba.carray(_pointer(at[3], SETTINGS), 1),
-        numba.carray(_pointer(at[4], _float32), (at[12], at[13])),
-        numba.carray(_pointer(at[5], WAVE), at[14]),
-        numba.carray(_pointer(at[6], _bool_), (at[15], num_options)),
-        numba.carray(_pointer(at[7], _uint8), (num_roots, capacity, at[16])),
-        numba.carray(_pointer(at[8], _uint8), at[17]),
+        numba.carray(_pointer(at[4], _float32), (at[13], at[14])),
+        numba.carray(_pointer(at[5], WAVE), at[15]),
+        numba.carray(_pointer(at[6], _bool_), (at[16], num_options)),
+        numba.carray(_pointer(at[7], _uint8), (num_roots, capacity, at[17])),
+        numba.carray(_pointer(at[8], _uint8), at[18]),
+        numba.carray(_pointer(at[9], _int64), at[15]),
         count,
         rewards,
         discounts,
@@ -1020,8 +1061,9 @@ def still_active(
         over = root["simulations"] >= root["limit"]
         over = over or root["expansions"] >= expansions or root["base_steps"] >= base_steps
         over = over or root["num_nodes"] >= num_nodes
+        over = over or nodes[active[i], 0]["visits"] >= MOST_VISITS
         if until_plan and root["expansions_to_plan"] >= 0:
-            over = over or root["expansions"] >= root["expansions_to_plan"] + improve
+            over = over or root["expansions"] - root["expansions_to_plan"] >= improve
         if over:
             continue
         if nodes[active[i], 0]["flags"] & CLOSED:

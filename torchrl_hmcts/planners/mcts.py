@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from torchrl_hmcts.planners.backups import Backup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
 from torchrl_hmcts.planners.chance import ProgressiveWidening
 from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, MostVisited
+from torchrl_hmcts.planners.counts import whole_number
 from torchrl_hmcts.planners.growth import Growth, SearchProgress
 from torchrl_hmcts.planners.node_evaluation import (
     Evaluator,
@@ -33,7 +34,7 @@ from torchrl_hmcts.planners.node_evaluation import (
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.search import RootStates, Search, check_search
+from torchrl_hmcts.planners.search import RootStates, Search, check_search, root_seeds
 from torchrl_hmcts.planners.simulator import Simulator
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import TERMINAL
@@ -219,11 +220,13 @@ class MCTSPlanner(TensorDictModuleBase):
         self.final_choice = final_choice
         self.budget = budget
         self.expand = expand
-        self.leaves_per_wave = leaves_per_wave
-        self.waves_in_flight = waves_in_flight
+        self.leaves_per_wave = int(leaves_per_wave)
+        self.waves_in_flight = int(waves_in_flight)
         self.exhausted = exhausted
         self.progress = progress
-        self._seeds = None if seed is None else np.random.SeedSequence(seed)
+        if seed is not None:
+            whole_number("MCTSPlanner", "seed", seed)
+        self._seeds = None if seed is None else np.random.SeedSequence(int(seed))
         self.option_key = self.simulator.option_key
         self.num_options = self.simulator.num_options
         self.in_keys = list(self.simulator.root_keys)
@@ -290,23 +293,34 @@ class MCTSPlanner(TensorDictModuleBase):
         root = self.simulator.root(td)
         num_roots = root.batch_size[0]
         search = Search(
-            num_roots,
-            self.num_options,
-            tree_policy=self.tree_policy,
-            backup=self.backup,
-            novelty=self.novelty,
-            transpositions=self.transpositions,
-            chance=self.chance,
-            expand=self.expand,
-            leaves_per_wave=self.leaves_per_wave,
-            exhausted=self.exhausted,
-            waves_in_flight=self.waves_in_flight,
-            capacity=self._capacity(num_roots),
+            num_roots, self.num_options, **self._parts(), capacity=self._capacity(num_roots)
         )
         self._seed(search, seed)
         self._plant(search, root, None)
         self.last_search = search
         return search
+
+    def _parts(self) -> dict[str, Any]:
+        """What a search is set to, as it is now, once more checked: it may have been assigned."""
+        check_search(
+            "MCTSPlanner",
+            tree_policy=self.tree_policy,
+            num_simulations=self.budget.simulations,
+            expand=self.expand,
+            leaves_per_wave=self.leaves_per_wave,
+            exhausted=self.exhausted,
+            waves_in_flight=self.waves_in_flight,
+        )
+        names: tuple[str, ...] = (
+            "backup",
+            "novelty",
+            "transpositions",
+            "chance",
+            "expand",
+            "leaves_per_wave",
+        )
+        names += ("tree_policy", "exhausted", "waves_in_flight")
+        return {name: getattr(self, name) for name in names}
 
     def _capacity(self, num_roots: int) -> int:
         """Nodes to make room for at once: all that the budget allows, if that is not very many."""
@@ -318,10 +332,15 @@ class MCTSPlanner(TensorDictModuleBase):
         return min(limits) + per_wave + 1
 
     def resume(self, search: Search, *, where: Tensor | None = None) -> Search:
-        """Go on with a search, with a fresh budget; with ``Gumbel`` to the end of its schedule.
+        """Continue a search, with a fresh budget; with ``Gumbel`` to the end of its schedule.
 
-        Only the roots ``where`` (bool ``[*B]``) are searched, all by default.
+        Only the roots ``where`` (bool ``[*B]``) are searched, all by default. The search follows
+        the planner: assign ``planner.tree_policy = UCT(c=5.0)`` for another constant.
+
+        Raises:
+            ValueError: if the search was planted with another backup, novelty test or the like.
         """
+        search.follow(**self._parts())
         return self._grow(search, time.perf_counter(), _rows(search, where))
 
     def _grow(self, search: Search, begin: float, rows: np.ndarray) -> Search:
@@ -375,7 +394,7 @@ class MCTSPlanner(TensorDictModuleBase):
         if not len(rows):
             return torch.zeros(shape, dtype=torch.bool)
         index = torch.from_numpy(rows)
-        root = self.simulator.root(td.reshape(-1)[index])
+        root = self.simulator.root(td.flatten()[index])
         taken = options.reshape(search.num_roots, -1)[index].tolist()
         state, done = self.simulator.state(root), self.simulator.done(root)
         kept = np.zeros(search.num_roots, np.bool_)
@@ -421,7 +440,7 @@ class MCTSPlanner(TensorDictModuleBase):
                     int(torch.empty((), dtype=torch.int64).random_())
                 )
             seed = int(self._seeds.spawn(1)[0].generate_state(1, np.uint32)[0])
-        search.seed((np.arange(search.num_roots) + int(seed)) & np.iinfo(np.int64).max)
+        search.seed(root_seeds("MCTSPlanner", seed, search.num_roots))
 
     def _plant(self, search: Search, root: TensorDictBase, rows: np.ndarray | None) -> None:
         """Plant the roots ``rows`` of a search, all by default, at the states ``root``."""
@@ -436,13 +455,19 @@ class MCTSPlanner(TensorDictModuleBase):
                     f"Root {bad} has no option that may be taken: its action mask is all False. "
                     f"Plan from a state that is not a dead end, or mark it as done."
                 )
+            looked_at = root
+            if self.leaf_evaluator is not None or self.option_prior is not None:
+                looked_at = root.clone()  # the state to plan from stays what it is
             values = leaf_values(
-                self.leaf_evaluator, root, simulator.terminated(root), lambda: search.seeds[where]
+                self.leaf_evaluator,
+                looked_at,
+                simulator.terminated(root),
+                lambda: search.seeds[where],
             )
             known = RootStates(
                 values=values,
                 done=done,
-                priors=option_priors(self.option_prior, root, self.num_options),
+                priors=option_priors(self.option_prior, looked_at, self.num_options),
                 masks=masks,
                 features=node_features(self.novelty, root),
                 codes=node_codes(self.transpositions, root),

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.transpositions import Transpositions
+from torchrl_hmcts.planners.tree import LARGEST
 
 Evaluator = Callable[[TensorDictBase], Tensor]
 
@@ -51,16 +52,19 @@ def leaf_values(
             f"per state, [{num_states}] or [{num_states}, 1]."
         )
     values_np: np.ndarray = values.reshape(-1).to(torch.float32).cpu().numpy()
-    if not np.isfinite(values_np).all():
+    good = np.abs(values_np) < LARGEST
+    if not good.all():
         raise ValueError(
-            f"The leaf evaluator returned {values_np[~np.isfinite(values_np)][0]}. Values must "
-            f"be finite; check the network's input and weights."
+            f"The leaf evaluator returned {values_np[~good][0]}. Values must be finite and smaller "
+            f"than {LARGEST:g}; check the network's input and weights."
         )
     return np.where(terminated, np.float32(0.0), values_np)
 
 
 def option_priors(evaluator: Evaluator | None, td: TensorDictBase, num_options: int) -> np.ndarray:
     """Return the priors of nodes' options, float32 ``[m, A]``, or ``[0, A]`` if all are equal.
+
+    The search scales those of the options that may be taken to sum to 1.
 
     Args:
         evaluator: ``evaluator(td) -> probabilities [m, A]``.
@@ -80,13 +84,15 @@ def option_priors(evaluator: Evaluator | None, td: TensorDictBase, num_options: 
             f"The option prior returned shape {list(priors.shape)}; it must give one "
             f"probability per node and option, {list(shape)}."
         )
-    if not (torch.isfinite(priors) & (priors >= 0)).all():
-        bad = priors[~(torch.isfinite(priors) & (priors >= 0))][0].item()
+    priors = priors.to(torch.float32)
+    good = (priors >= 0) & (priors < LARGEST)
+    if not good.all():
+        bad = priors[~good][0].item()
         raise ValueError(
             f"The option prior returned {bad}. Probabilities must be finite and not negative; "
             f"apply a softmax to logits."
         )
-    return priors.to(torch.float32).cpu().contiguous().numpy()
+    return priors.cpu().contiguous().numpy()
 
 
 def node_features(novelty: NoveltyTest | None, td: TensorDictBase) -> np.ndarray | None:

@@ -192,7 +192,7 @@ class RadiusNovelty:
         parts = []
         for key, scale in zip(self.in_keys, self.scale, strict=True):
             part = tensordict.get(key).to(torch.float32)
-            part = part.reshape(len(part), -1)
+            part = part.reshape(len(part), part.shape[1:].numel())
             parts.append(part if scale == 1.0 else part * scale)
         joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
         return joined.cpu().contiguous().numpy()
@@ -314,7 +314,7 @@ class WidthNovelty:
                     f"RadiusNovelty({key!r}, radius=...), or discretise the entry."
                 )
             part = part.to(torch.uint8) if part.dtype == torch.bool else part
-            parts.append(part.reshape(len(part), -1))
+            parts.append(part.reshape(len(part), part.shape[1:].numel()))
         joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
         return joined.cpu().contiguous().numpy()
 

@@ -116,7 +116,7 @@ def _best(
         option_values=tensor(np.where(edge["visits"] > 0, edge["value"], 0.0)),
         option_squares=tensor(edge["squares"]),
         priors=tensor(edge["prior"]),
-        allowed=torch.from_numpy(allowed),
+        allowed=torch.from_numpy(allowed.copy()),  # the policy may write into it
         batch_size=[len(node)],
     )
     result = scores(statistics)

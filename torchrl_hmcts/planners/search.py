@@ -13,6 +13,7 @@ import numpy as np
 
 from torchrl_hmcts.planners.backups import Backup, MaxBackup
 from torchrl_hmcts.planners.chance import ProgressiveWidening
+from torchrl_hmcts.planners.counts import NO_LIMIT, whole_number
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.scored_descent import select_by_scores
@@ -20,6 +21,7 @@ from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     FORBIDDEN,
+    LARGEST,
     PENDING,
     PRUNED,
     REWARDED,
@@ -29,7 +31,7 @@ from torchrl_hmcts.planners.tree import (
 )
 from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, TreePolicy
 
-NO_LIMIT = np.iinfo(np.int64).max
+_MOST_HALVED = 2**24  # simulations of Gumbel, whose schedule holds counts in float32
 
 
 class Wave:
@@ -71,6 +73,22 @@ class RootStates(NamedTuple):
     codes: np.ndarray | None = None  # [m, K] uint8
 
 
+def _check_rows(known: Outcomes | RootStates, m: int, num_options: int) -> None:
+    """Refuse arrays without a row for each of ``m`` states: the kernels trust them."""
+    for name, array in zip(known._fields, known, strict=True):
+        if array is None:
+            continue
+        shape = array.shape
+        wide = name in ("priors", "masks")
+        if shape[0] == m and (not wide or shape[1] == num_options):
+            continue
+        if not wide or shape != (0, num_options):
+            expected = [m, num_options] if wide else [m]
+            raise ValueError(
+                f"A search got {name} {list(shape)} for {m} states; it needs {expected}."
+            )
+
+
 def check_search(
     owner: str,
     *,
@@ -93,6 +111,8 @@ def check_search(
     ):
         if value not in names:
             raise ValueError(f"{owner}: {name} is {names[0]!r} or {names[1]!r}; got {value!r}.")
+    leaves_per_wave = whole_number(owner, "leaves_per_wave", leaves_per_wave)
+    waves_in_flight = whole_number(owner, "waves_in_flight", waves_in_flight)
     if not 1 <= leaves_per_wave <= 255:
         raise ValueError(f"{owner} needs leaves_per_wave from 1 to 255; got {leaves_per_wave}.")
     if waves_in_flight < 1 or leaves_per_wave * waves_in_flight > 255:
@@ -115,6 +135,37 @@ def check_search(
             f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
             f"leaves_per_wave=1."
         )
+    if isinstance(tree_policy, Gumbel) and (num_simulations or 0) > _MOST_HALVED:
+        raise ValueError(
+            f"{owner}: Gumbel plans every simulation ahead, {_MOST_HALVED:,} at most; got "
+            f"{num_simulations:,}."
+        )
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Whether two parts of a planner do the same; a copy of a search holds copies of them."""
+    if one is other or type(one) is not type(other):
+        return one is other
+    if type(one).__repr__ is object.__repr__:
+        return True
+    return one == other or repr(one) == repr(other)
+
+
+def _goes_on(one: TreePolicy, other: TreePolicy) -> bool:
+    """Whether a search by one tree policy has kept all that the other needs."""
+    if isinstance(one, PUCT) and isinstance(other, PUCT):
+        return one.normalize == other.normalize
+    if isinstance(one, UCT) or isinstance(other, UCT):
+        return type(one) is type(other)
+    compiled = isinstance(one, (PUCT, Gumbel)), isinstance(other, (PUCT, Gumbel))
+    return not any(compiled) or one == other
+
+
+def root_seeds(owner: str, seed: int, num_roots: int) -> np.ndarray:
+    """Return ``seed + b`` for root b, int64 ``[B]``, modulo 2 ** 63."""
+    whole_number(owner, "seed", seed)
+    first = np.uint64(int(seed) & NO_LIMIT)
+    return ((np.arange(num_roots, dtype=np.uint64) + first) & np.uint64(NO_LIMIT)).astype(np.int64)
 
 
 class Search:
@@ -164,15 +215,22 @@ class Search:
         from torchrl_hmcts.planners import kernels
 
         self._kernels = kernels
+        self._parts = {
+            "backup": backup,
+            "novelty": novelty,
+            "transpositions": transpositions,
+            "chance": chance,
+            "expand": expand,
+            "exhausted": exhausted,
+        }
         self.tree_policy = tree_policy
         # Copies: what one search has seen is nothing to the next, nor to one that is resumed later.
         self.novelty = copy.copy(novelty)
         self.transpositions = copy.copy(transpositions)
-        self.num_options = num_options
-        self.num_roots = num_roots
+        self.num_options = whole_number("Search", "num_options", num_options, least=1)
+        self.num_roots = whole_number("Search", "num_roots", num_roots)
+        capacity = whole_number("Search", "capacity", capacity, least=1)
         self.expand_all = expand == "all"
-        self.leaves_per_wave = leaves_per_wave
-        self.waves_in_flight = waves_in_flight
         self.growing = False  # also after an interruption: some of it may have been in flight
         self.inserting = False  # also after an interruption: nodes may be there without a state
         self.stochastic = chance is not None
@@ -181,8 +239,6 @@ class Search:
         settings = self.settings[0]
         settings["backup"] = kernels.MAX_BACKUP if self.max_backup else kernels.MEAN_BACKUP
         settings["expand_all"] = self.expand_all
-        settings["leaves"] = leaves_per_wave
-        settings["mark"] = leaves_per_wave * waves_in_flight > 1
         # Chance options never close, and halving counts visits: both land on what they know.
         revisit = exhausted == "revisit" or self.stochastic or isinstance(tree_policy, Gumbel)
         settings["revisit"] = revisit
@@ -190,10 +246,8 @@ class Search:
         if chance is not None:
             settings["widening"], settings["widening_exponent"] = chance.k, chance.alpha
         self._set_policy(tree_policy)
+        self._set_waves(leaves_per_wave, waves_in_flight)
         self.tree = SearchTree(num_roots, num_options, capacity=capacity)
-        self._wave = np.zeros(
-            num_roots * leaves_per_wave * (num_options if self.expand_all else 1), WAVE
-        )
         self._gumbel = np.zeros((0, 0), np.float32)
         self.seed(np.arange(num_roots))
         self._room = 1  # nodes of the largest tree, at most
@@ -206,8 +260,54 @@ class Search:
 
         self.__dict__.update(state, _kernels=kernels)
 
+    def _set_waves(self, leaves_per_wave: int, waves_in_flight: int) -> None:
+        self.leaves_per_wave, self.waves_in_flight = leaves_per_wave, waves_in_flight
+        self.settings["leaves"] = leaves_per_wave
+        # Options on the way down are marked for other descents, and always for those in Python.
+        alone = leaves_per_wave * waves_in_flight == 1 and self._scores is None
+        self.settings["mark"] = not alone
+        per_leaf = self.num_options if self.expand_all else 1
+        self._wave = np.zeros(self.num_roots * leaves_per_wave * per_leaf, WAVE)
+
+    def follow(
+        self,
+        *,
+        tree_policy: TreePolicy,
+        leaves_per_wave: int,
+        waves_in_flight: int,
+        **parts: Any,
+    ) -> None:
+        """Take over what the planner is set to now: constants of the tree policy, and waves.
+
+        Args:
+            tree_policy: of the kind that the search was planted with.
+            leaves_per_wave: leaves of each root in a wave.
+            waves_in_flight: waves under way at a time.
+            parts: the other keywords of the constructor, which must be what they were.
+
+        Raises:
+            ValueError: if anything else differs, since what the tree holds would not fit it.
+        """
+        kept: dict[str, Any] = {"tree_policy": self.tree_policy, **self._parts}
+        now = {"tree_policy": tree_policy, **parts}
+        for name in parts:
+            if not _is_same(kept[name], now[name]):
+                break
+        else:
+            name = "tree_policy"
+            if tree_policy is kept[name] or _goes_on(kept[name], tree_policy):
+                self._set_policy(tree_policy)
+                self._set_waves(leaves_per_wave, waves_in_flight)
+                return
+        raise ValueError(
+            f"This search was planted with {name}={kept[name]!r}; the planner now has "
+            f"{name}={now[name]!r}. What the tree holds does not fit it: plant a new one, or "
+            f"resume it with a planner like the first."
+        )
+
     def _set_policy(self, tree_policy: TreePolicy) -> None:
         kernels, settings = self._kernels, self.settings[0]
+        self.tree_policy = tree_policy
         self._scores = None
         if isinstance(tree_policy, UCT):
             settings["score"], settings["c"] = kernels.UCT_SCORE, tree_policy.c
@@ -224,7 +324,7 @@ class Search:
             settings["score"], settings["c"] = kernels.GUMBEL_SCORE, tree_policy.c_visit
             settings["c_scale"] = tree_policy.c_scale
         else:
-            self._scores, settings["mark"] = tree_policy, 1
+            self._scores = tree_policy
         if isinstance(tree_policy, UCT | PUCT):
             kernels.fill_factors(self.settings)
 
@@ -299,6 +399,9 @@ class Search:
         first = rows is None
         if rows is None:
             rows = np.arange(self.num_roots)
+        _check_rows(known, len(rows), self.num_options)
+        if len(rows) and not (0 <= rows.min() and rows.max() < self.num_roots):
+            raise ValueError(f"A search of {self.num_roots} roots has no roots {rows}.")
         tree = self.tree
         for test, codes in ((self.novelty, known.features), (self.transpositions, known.codes)):
             if test is not None:
@@ -322,7 +425,7 @@ class Search:
         zeros = np.zeros(len(rows), np.int64)
         self._remember(rows, zeros, known.features, known.codes)
         if self.novelty is not None and known.features is not None:
-            self.novelty.accept(rows, known.features, zeros)
+            self.novelty.accept(rows.copy(), known.features.copy(), zeros.copy())
         if self.transpositions is not None and known.codes is not None:
             self.transpositions.find(rows, known.codes, zeros)
 
@@ -404,7 +507,24 @@ class Search:
         -1; only in a stochastic simulator.
         """
         tree, m = self.tree, len(wave)
+        _check_rows(outcomes, m, self.num_options)
+        bad = self._kernels.first_bad(
+            outcomes.rewards, outcomes.discounts, outcomes.values, outcomes.priors
+        )
+        if bad >= 0:
+            raise ValueError(
+                f"An outcome has the reward {outcomes.rewards[bad]}, the discount "
+                f"{outcomes.discounts[bad]}, the value {outcomes.values[bad]} and the priors "
+                f"{outcomes.priors[bad : bad + 1].tolist()}. All must be finite, rewards and "
+                f"values smaller than {LARGEST:g}, discounts in [0, 1] and priors not negative; "
+                f"scale the rewards, or find the step from which the env wrote them."
+            )
+        if merges is not None and not (
+            len(merges) == m and (merges < tree.num_nodes[wave.records["root"]]).all()
+        ):
+            raise ValueError(f"merges must name {m} nodes of the tree, or -1; got {merges}.")
         self._attach(wave)
+        self.inserting = tree.states is not None  # until the new states are stored, too
         self._reserve_wave()
         novel = np.ones(m, np.bool_)
         nothing = np.empty(0, np.int64)
@@ -424,7 +544,7 @@ class Search:
         if self.novelty is not None:
             assert outcomes.features is not None
             steps = tree.nodes["base_steps"][wave.roots, wave.nodes] + outcomes.durations
-            novel[goes_on] = self.novelty.accept(roots, outcomes.features[goes_on], steps[goes_on])
+            novel[goes_on] = self._accept(roots, outcomes.features[goes_on], steps[goes_on])
         self._kernels.insert(
             tree.nodes, tree.edges, tree.roots, self.settings, wave.records, outcomes.rewards,
             outcomes.discounts, outcomes.durations, outcomes.done, novel, twins,
@@ -434,6 +554,17 @@ class Search:
         new_nodes = np.ascontiguousarray(wave.records["new_node"])
         self._remember(wave.roots, new_nodes, outcomes.features, outcomes.codes)
         return new_nodes
+
+    def _accept(self, roots: np.ndarray, features: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """The answer of the novelty test, bool ``[m]``."""
+        assert self.novelty is not None
+        novel = np.asarray(self.novelty.accept(roots, features, steps))
+        if novel.shape != (len(features),) or novel.dtype != np.bool_:
+            raise ValueError(
+                f"The novelty test accepted {novel.dtype} {list(novel.shape)}; it must say of each "
+                f"of the {len(features)} states whether it is new, in bool."
+            )
+        return novel
 
     def seed(self, seeds: np.ndarray) -> None:
         """Give each root the seed of its random numbers, int64 ``[B]``."""
@@ -451,7 +582,7 @@ class Search:
             allowed = edges["closed"][b, 0] != FORBIDDEN
             prior = np.where(allowed, edges["prior"][b, 0], 0.0)
             drawn = np.zeros(self.num_options)
-            if not allowed.any():
+            if not allowed.any() or noise.fraction == 0.0:
                 continue
             drawn[allowed] = self.generator(b, "noise").dirichlet(
                 np.full(int(allowed.sum()), noise.alpha)
@@ -530,7 +661,7 @@ class Search:
         tree = self.tree
         again = np.ones(len(pruned), np.bool_)
         if self.novelty is not None:
-            again = self.novelty.accept(
+            again = self._accept(
                 np.full(len(pruned), root),
                 np.ascontiguousarray(tree.features[root, pruned]),
                 tree.nodes["base_steps"][root, pruned].astype(np.int64),
@@ -560,6 +691,8 @@ class Search:
     def reroot(self, root: int, node: int) -> None:
         """Make a node the new root: its subtree stays, with all values, the rest is dropped."""
         tree = self.tree
+        if not (0 <= root < self.num_roots and 0 <= node < tree.num_nodes[root]):
+            raise ValueError(f"Root {root} of {self.num_roots} has no node {node} to move to.")
         kept = np.empty(tree.num_nodes[root], np.int64)
         count = self._kernels.reroot(tree.nodes, tree.edges, tree.roots, root, node, kept)
         kept = kept[:count]

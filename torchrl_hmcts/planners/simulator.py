@@ -186,7 +186,7 @@ class Simulator:
                     f'The state to plan from has "{key}" = {bad}. A state that is not finite '
                     f"cannot be simulated; find the step that wrote it."
                 )
-        flat: TensorDictBase = td.reshape(-1) if len(td.batch_size) != 1 else td
+        flat: TensorDictBase = td.flatten() if len(td.batch_size) != 1 else td
         return flat
 
     def state(self, td: TensorDictBase) -> TensorDictBase:

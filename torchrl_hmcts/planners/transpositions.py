@@ -86,7 +86,7 @@ class Transpositions:
         parts = []
         for key in self.in_keys:
             part = tensordict.get(key)
-            part = part.reshape(len(part), -1).contiguous().view(torch.uint8)
+            part = part.reshape(len(part), part.shape[1:].numel()).contiguous().view(torch.uint8)
             parts.append(part.cpu().numpy())
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1)
 

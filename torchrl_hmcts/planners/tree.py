@@ -30,20 +30,21 @@ NODE = np.dtype(
     [
         ("visits", np.int32),
         ("value", np.float32),
+        ("rest", np.float32),  # what float32 cannot hold of a mean over very many visits
         ("raw_value", np.float32),
         ("reward", np.float32),
         ("discount", np.float32),
         ("parent", np.int32),
         ("option", np.int32),
         ("sibling", np.int32),
-        ("samples", np.int32),
+        ("samples", np.int16),
+        ("flags", np.int16),
         ("twin", np.int32),
         ("depth", np.int32),
         ("open_options", np.int32),
         ("base_steps", np.int32),
         ("path_return", np.float32),
         ("path_discount", np.float32),
-        ("flags", np.int32),
     ],
     align=True,
 )  # 64 bytes, a cache line
@@ -95,6 +96,14 @@ PRUNED = 8  # the novelty test refused it
 CLOSED = 16  # no simulation below it can add anything
 REWARDED = 32  # the option that led here earned a positive reward
 
+# Nodes, base steps of a path and visits of one root are int32. A planner's search ends at
+# MOST_VISITS: what one wave adds to them does not wrap.
+MOST_NODES = MOST_BASE_STEPS = np.iinfo(np.int32).max
+MOST_VISITS = MOST_NODES - 2**24
+MOST_SAMPLES = np.iinfo(np.int16).max  # outcomes drawn of one option
+# Rewards and values are smaller than this: no sum of them along a path overflows in float32.
+LARGEST = 1e30
+
 # An edge's ``closed``: 0, or one of these.
 SOLVED = 1  # nothing is left to simulate behind it
 FORBIDDEN = 2  # the mask does not allow the option
@@ -126,7 +135,7 @@ class TreeView(TensorClass, metaclass=KeepsDocstring):
         children (Tensor): ``[B, N, A]`` first outcome of an option, -1 if not simulated.
         children_visits (Tensor): ``[B, N, A]`` backups through an option.
         children_values (Tensor): ``[B, N, A]`` value Q = R + D V of an option.
-        children_priors (Tensor): ``[B, N, A]`` prior probability of an option.
+        children_priors (Tensor): ``[B, N, A]`` prior probability of an option, 0 if forbidden.
         children_closed (Tensor): ``[B, N, A]`` 0 open, SOLVED or FORBIDDEN.
         states (TensorDictBase): ``[B, N]`` what the simulator needs to go on from a node.
 
@@ -208,9 +217,14 @@ class SearchTree:
         """Make room for ``num_nodes`` nodes per root; nothing that is stored changes."""
         if num_nodes <= self.capacity:
             return
+        if num_nodes > MOST_NODES:
+            raise ValueError(
+                f"A tree has at most {MOST_NODES:,} nodes; this search asks for {num_nodes:,}. "
+                f"Limit it, e.g. by SearchBudget(nodes=...)."
+            )
         capacity = self.capacity
         while capacity < num_nodes:
-            capacity *= 2
+            capacity = min(2 * capacity, MOST_NODES)
         extra = capacity - self.capacity
 
         def grow(array: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from typing import Literal
 from tensordict import TensorClass
 from torch import Tensor
 
+from torchrl_hmcts.planners.counts import whole_number
 from torchrl_hmcts.planners.docstrings import KeepsDocstring
 
 
@@ -34,7 +35,8 @@ class NodeStatistics(TensorClass, metaclass=KeepsDocstring):
         option_values (Tensor): ``[d, A]`` float32, Q_j = R_j + D_j V_j.
         option_squares (Tensor): ``[d, A]`` float32, sum of the squared returns that Q_j is the mean
             of.
-        priors (Tensor): ``[d, A]`` float32, P(s, a).
+        priors (Tensor): ``[d, A]`` float32, P(s, a): sums to 1 over the options that no mask
+            forbids, 0 for the others.
         allowed (Tensor): ``[d, A]`` bool.
 
     Example:
@@ -96,6 +98,9 @@ class PUCT:
     r"""Predictor upper confidence bounds: exploration in proportion to a prior.
 
     .. math:: \arg\max_a\; Q(s,a) + c\, P(s,a)\, \frac{\sqrt{\sum_b N(s,b)}}{1 + N(s,a)}
+
+    P sums to 1 over the options that the mask allows. Options behind which nothing is left to
+    find keep their share.
 
     Args:
         c: exploration constant, in units of :math:`Q`. Default ``1.25``.
@@ -190,8 +195,7 @@ class Gumbel:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.max_considered < 1:
-            raise ValueError(f"Gumbel needs max_considered >= 1; got {self.max_considered}.")
+        whole_number("Gumbel", "max_considered", self.max_considered, least=1)
         for name in ("c_visit", "c_scale", "scale"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):

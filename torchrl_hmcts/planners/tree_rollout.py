@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchrl_hmcts.planners.counts import whole_number
+
 
 @dataclass(frozen=True)
 class TreeRollout:
@@ -41,5 +43,4 @@ class TreeRollout:
     max_options: int = 10
 
     def __post_init__(self) -> None:
-        if self.max_options < 1:
-            raise ValueError(f"TreeRollout needs max_options >= 1; got {self.max_options}.")
+        whole_number("TreeRollout", "max_options", self.max_options, least=1)
