@@ -338,14 +338,26 @@ def write_json(path: str | Path, content: Any) -> None:
         >>> from torchrl_hmcts.trainers.checkpoints import write_json
         >>> write_json("metrics.json", {"solved": 0, "frames": float("nan")})
     """
-    write_text(path, json.dumps(_finite(content), indent=2) + "\n")
+    write_text(path, json.dumps(finite(content), indent=2) + "\n")
 
 
-def _finite(content: Any) -> Any:
+def finite(content: Any) -> Any:
+    """Return content with None in place of whatever number is not finite: JSON has no other.
+
+    Args:
+        content: dicts, lists, texts and numbers, NumPy's as well.
+
+    Examples:
+        >>> from torchrl_hmcts.trainers.checkpoints import finite
+        >>> finite({"frames": [float("inf"), 2]})
+        {'frames': [None, 2]}
+    """
     if isinstance(content, Mapping):
-        return {key: _finite(value) for key, value in content.items()}
+        return {key: finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_finite(value) for value in content]
+        return [finite(value) for value in content]
+    if hasattr(content, "tolist"):  # of NumPy and torch
+        return finite(content.tolist())
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 

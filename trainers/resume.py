@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import math
 import random
+import time
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,11 @@ from torchrl_hmcts.trainers.checkpoints import (
     find_damage,
     plain_checkpoint,
 )
+from torchrl_hmcts.trainers.locking import folder_locked
+from torchrl_hmcts.trainers.stopping import patient, raise_if_asked, stop_asked, unbroken
+
+FIRST_SAVE_SECONDS = 5.0  # of training, after which there is a checkpoint whatever the interval
+SAVE_SECONDS = 60.0  # between two checkpoints, at most
 
 Generator = torch.Generator | np.random.Generator | random.Random
 
@@ -203,10 +210,14 @@ class ResumableTrainer(Trainer):
     bit, if the env's whole state is in its tensordict. Checkpoints are written so that a crash
     cannot damage one (:class:`DurableRotation`) and are read without pickle.
 
+    Ctrl-C and SIGTERM stop a training after the batch under way, which is saved; then
+    ``KeyboardInterrupt`` is raised. A second Ctrl-C, a second later or more, stops it at once. One
+    trainer at a time writes to a ``save_dir``.
+
     Args:
-        save_dir (path, optional): folder of the checkpoints; one is written whenever
-            ``save_trainer_interval`` base steps have passed, and at the end. Default ``None``: no
-            checkpoints.
+        save_dir (path, optional): folder of the checkpoints; one is written after 5 seconds of
+            training, whenever ``save_trainer_interval`` base steps or a minute have passed, and at
+            the end. Default ``None``: no checkpoints.
         keep_last (int): checkpoints kept. Default ``2``.
         **trainer_kwargs: passed to ``torchrl.trainers.Trainer``.
 
@@ -218,6 +229,7 @@ class ResumableTrainer(Trainer):
         ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
             ``save_trainer_file``.
         OSError: if ``save_dir`` cannot be written to.
+        FolderInUse: on training, if another run writes to ``save_dir``.
 
     Example:
         >>> import torch
@@ -265,6 +277,7 @@ class ResumableTrainer(Trainer):
             # A buffer's own dump() writes a pickle beside the tensors; its state dict needs none.
             checkpoint.register("replay_buffer", buffer, adapter=PlainStateAdapter())
         super().__init__(**trainer_kwargs)
+        self._save_at = math.inf  # time at which a checkpoint is due
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
         self._last_log: dict[str, Any] = {}
         if self.checkpoint is not None and "rng" not in self.checkpoint:
@@ -301,6 +314,39 @@ class ResumableTrainer(Trainer):
         check_settings(found, self.run_settings)
         self.load_from_file(found)
         return self
+
+    def train(self) -> None:
+        """Trains until ``total_frames`` are collected.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
+            FolderInUse: if another run writes to ``save_dir``.
+        """
+        self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
+        folder = getattr(self.checkpoint_rotation, "directory", None)
+        with folder_locked(folder) if folder else nullcontext(), patient():
+            try:
+                super().train()
+            except KeyboardInterrupt:
+                with unbroken():
+                    self._shutdown_hook()
+                    self.collector.shutdown()
+                raise
+
+    def save_trainer(self, force_save: bool = False) -> None:
+        """Writes a checkpoint if one is due; stops here if a signal has asked for it.
+
+        Args:
+            force_save: write one in any case.
+        """
+        due = stop_asked() or time.monotonic() >= self._save_at
+        super().save_trainer(force_save or due)
+        raise_if_asked()
+
+    def _save_trainer(self) -> None:
+        with unbroken():
+            super()._save_trainer()
+        self._save_at = time.monotonic() + SAVE_SECONDS
 
     def compute_loss(self, sub_batch: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch.
