@@ -168,7 +168,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, capsys, monkeypatch) -> None:
 
     monkeypatch.setattr(Experiment, "function", property(lambda self: interrupted))
     assert sweep(tmp_path, "x=[1,2,3]", "trials=4") == 130
-    assert "go on with: hmcts sweep experiment=parabola" in capsys.readouterr().err
+    assert "Continue with: hmcts sweep experiment=parabola" in capsys.readouterr().err
     monkeypatch.setattr(Experiment, "function", property(lambda self: run_parabola))
     assert sweep(tmp_path, "x=[1,2,3]", "trials=4") == 0
     states = [t["state"] for t in told(tmp_path)["trials"]]

@@ -94,7 +94,8 @@ class A3CTrainer:
     A learner's exception, its death by a signal or a gradient that is not finite ends the run: the
     others stop, a checkpoint is written, and :class:`LearnerError` names the learner and carries
     its traceback. Ctrl-C or SIGTERM stops all, writes a checkpoint, says how to go on, and raises
-    ``KeyboardInterrupt``; a second one does not interrupt that. If this process is killed, the learners notice and end.
+    ``KeyboardInterrupt``; a second one does not interrupt that. If this process is killed, the
+    learners notice and end.
 
     A run goes on from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
     T, the learning rate's schedule and the curves are as they were. Not exact, and not meant to be:

@@ -92,7 +92,8 @@ Search for good values of an experiment's keys with Optuna.
 
 needs   the extra `scale`; each trial takes what a run takes
 writes  trial_0000/ ... (folders of runs), sweep.json, importances.png and index.html to the
-        folder; the same command again goes on"""
+        folder; the same command continues it, a trial that was stopped first, also where the folder
+        was moved"""
 
 _LIST = "List the experiments; the keys of one with their defaults and meaning; or the figures."
 

@@ -17,13 +17,14 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
+from torchrl_hmcts.trainers.experiments.run import Run, open_run
+from torchrl_hmcts.trainers.experiments.worker_file import save_worker
 from torchrl_hmcts.trainers.figures.animation import write_episode_gif
 from torchrl_hmcts.trainers.figures.plots import plot_losses, plot_search, plot_skill_fan
-from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
 
@@ -39,18 +40,26 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 4 (tree search over DIAYN skills), on the mazes of chapter 3.
     """
+    with open_run(config) as run:
+        return _run_demo(run.config, run)
+
+
+def _run_demo(config: DemoConfig, run: Run) -> dict[str, Any]:
+    """Carry the demo out in a folder that is open."""
     if config.toy:
         config = dataclasses.replace(config, train_base_steps=1_920, mazes=min(3, config.mazes))
     test_mazes = maze_pool("test")
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
-    out = Path(config.out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = run.path
     begin = time.perf_counter()
 
     print(f"Learning {config.num_skills} skills in {config.train_base_steps:,} base steps ...")
     logger = make_logger(config)
-    trainer, loss = train_worker(config, save_dir=out / "checkpoints", logger=logger)
+    trainer, loss = train_worker(
+        config, save_dir=run.checkpoints, logger=logger, resume=run.resumes
+    )
     logger.close()
+    save_worker(out, loss, trainer.collected_frames)
     train_seconds = time.perf_counter() - begin
     policy = SkillPolicy(loss.actor_network, deterministic=True)
 
@@ -99,15 +108,17 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     plot_search(planner.last_search, real.base_env, out / "search.png")
     write_episode_gif(real.base_env, starts[shown], episodes[shown], out / "episode.gif")
     metrics["seconds"] = round(time.perf_counter() - begin, 2)
-    write_json(out / "metrics.json", metrics)
-    write_page(
-        out / "index.html",
-        title="Solving random mazes by planning over learned skills",
-        metrics=metrics,
-        pictures=_PICTURES,
+    pictures = dict(_PICTURES)
+    if not episodes[shown].solved:
+        pictures["episode.gif"] = (
+            "A test maze that was NOT solved: the plan, if one was found (colours are skills), and "
+            "how far the worker came."
+        )
+    page = run.finish(
+        metrics, title="Solving random mazes by planning over learned skills", pictures=pictures
     )
     print(format_table(metrics))
-    print(f"Pictures and figures: {out / 'index.html'}")
+    print(f"Pictures and figures: {page}")
     return metrics
 
 
@@ -149,14 +160,19 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
 
 
 def train_worker(
-    config: DemoConfig, *, save_dir: Path | None = None, logger: Logger | None = None
+    config: DemoConfig,
+    *,
+    save_dir: Path | None = None,
+    logger: Logger | None = None,
+    resume: bool = False,
 ) -> tuple[DIAYNTrainer, Any]:
     """Train the demo's worker; return the trainer with its history, and the loss with its networks.
 
     Args:
         config: see :class:`~torchrl_hmcts.trainers.config.DemoConfig`.
-        save_dir: folder of the checkpoint that is written at the end. Default: none.
+        save_dir: folder of the checkpoints. Default: none are written.
         logger: of TorchRL; gets the training's values. Default: none.
+        resume: continue from the newest checkpoint in ``save_dir``.
     """
     env = make_training_env(num_skills=config.num_skills, skill_steps=config.skill_steps)
     loss = DIAYNTrainer.make_loss(env, config.num_skills, seed=config.seed)
@@ -170,6 +186,8 @@ def train_worker(
         save_dir=save_dir,
         logger=logger,
     )
+    if resume and save_dir is not None:
+        trainer.load(save_dir)
     trainer.train()
     return trainer, loss
 

@@ -50,8 +50,8 @@ def evaluate(words: Sequence[str]) -> int:
         return refuse("evaluate", error)
     if is_locked(run.path):
         print(f"{run.path} is still running: its newest checkpoint is tested.", file=sys.stderr)
-    from torchrl_hmcts.trainers.figures.report import machine, versions, write_run_page
     from torchrl_hmcts.trainers.checkpoints import finite
+    from torchrl_hmcts.trainers.figures.report import machine, versions, write_run_page
 
     try:
         with said(own.get("log_level", "info")):

@@ -44,9 +44,8 @@ def run_experiment(
                 resume = run.resume_command
                 if run.config.out != config.out:
                     print(f"{config.out} holds a run already; this one goes to {run.config.out}.")
-                if run.config is not config or not getattr(config, "resume", False):
-                    config = run.config
-                elif not run.resumes:
+                config = run.config
+                if getattr(config, "resume", False) and not run.resumes:
                     print("The run was stopped before its first checkpoint: it begins again.")
                 experiment(config)
     except ModuleNotFoundError as error:

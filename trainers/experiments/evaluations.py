@@ -23,33 +23,35 @@ from torchrl_hmcts.trainers.experiments.waterworld_config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
+from torchrl_hmcts.trainers.experiments.worker_file import find_worker
 from torchrl_hmcts.trainers.lab.evaluation import (
     solve_mazes,
     solve_with_wrong_model,
     wrong_models,
 )
 from torchrl_hmcts.trainers.lab.worker import make_worker_loss
-from torchrl_hmcts.trainers.resume import newest_checkpoint
 from torchrl_hmcts.trainers.waterworld.agents import play_mazes
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
 
 def load_networks(loss_module: LossModule, run: str | Path) -> Path:
-    """Give a loss's networks the weights of a run's newest checkpoint, and nothing else of it.
+    """Give a loss's networks the weights of a run's worker, and nothing else of it.
+
+    That is the worker whose figures its page shows, or of a run that has not finished, its newest
+    checkpoint.
 
     Args:
         loss_module: built as in the run; changed in place.
         run: the run's folder.
 
     Returns:
-        The checkpoint.
+        The file they are from.
 
     Raises:
         FileNotFoundError: if the run has written none yet.
         ValueError: if the networks are other ones.
     """
-    folder = Path(run) / "checkpoints"
-    path = newest_checkpoint(folder)
+    path = find_worker(run)
     try:
         Checkpoint(loss_module=loss_module).load(path)
     except RuntimeError as error:

@@ -17,9 +17,10 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import draw_first_person
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
-from torchrl_hmcts.trainers.checkpoints import write_json
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
+from torchrl_hmcts.trainers.experiments.run import Run, open_run
+from torchrl_hmcts.trainers.experiments.worker_file import save_worker
 from torchrl_hmcts.trainers.figures.lab_figures import (
     frames_curve,
     plot_frames_curves,
@@ -29,7 +30,7 @@ from torchrl_hmcts.trainers.figures.lab_figures import (
     write_episode_gif,
 )
 from torchrl_hmcts.trainers.figures.plots import plot_losses
-from torchrl_hmcts.trainers.figures.report import versions, write_page
+from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.lab.evaluation import (
     make_maze_env,
     make_planner,
@@ -81,21 +82,27 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 4.
     """
+    with open_run(config) as run:
+        return _run_labmaze(run.config, run)
+
+
+def _run_labmaze(config: LabMazeConfig, run: Run) -> dict[str, Any]:
+    """Carry the experiment out in a folder that is open."""
     if config.toy:
         config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
-    out = Path(config.out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = run.path
     begin = time.perf_counter()
     print(f"Learning {config.num_skills} skills in {config.train_frames:,} frames ...", flush=True)
     logger = make_logger(config)
     trained = train_worker(
         config,
-        save_dir=out / "checkpoints",
+        save_dir=run.checkpoints,
         logger=logger,
         progress=lambda total: tqdm(total=total if total < 2**31 - 1000 else None, disable=None),
     )
     logger.close()
+    save_worker(out, trained.loss, trained.worker_step)
     curve = frames_curve(trained.tests, config.frames_per_step, config.max_frames)
     _write_curves(trained, curve, config, out / "curves.csv")
     worker = trained.policy
@@ -114,6 +121,7 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
         "training_frames": trained.steps * config.frames_per_step,
         "training_base_steps": trained.steps,
         "training_rounds": trained.rounds,
+        "worker_training_frames": trained.worker_step * config.frames_per_step,
         "training_cpu_seconds": trained.seconds,
         "test": test,
         "wrong_model": robust,
@@ -121,23 +129,35 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
         "versions": versions(),
     }
     print("Drawing ...", flush=True)
-    draw(config, trained, out, unsolved=test["unsolved"])
+    solved = draw(config, trained, out, unsolved=test["unsolved"])
     metrics["seconds"] = round(time.perf_counter() - begin, 1)
-    write_json(out / "metrics.json", metrics)
     title = "DeepMind Lab's random maze, by planning over learned skills"
-    write_page(out / "index.html", title=title, metrics=metrics, pictures=_PICTURES)
+    page = run.finish(metrics, title=title, pictures=_captions(config, trained, solved))
     print(
         f"{test['solved']} of {test['mazes']} mazes solved at the first trial, in "
         f"{test['frames']['mean']:.0f} frames (a script on the shortest path: "
-        f"{test['script_frames']['mean']:.0f}). Pictures and figures: {out / 'index.html'}"
+        f"{test['script_frames']['mean']:.0f}). Pictures and figures: {page}"
     )
     return metrics
 
 
+def _captions(config: LabMazeConfig, trained: TrainedWorker, solved: bool) -> dict[str, str]:
+    """The captions, which say whether the maze was solved, and which worker is shown."""
+    captions = dict(_PICTURES)
+    if not solved:
+        captions["episode.gif"] = (
+            "A test maze that was NOT solved: the plan, if one was found (pale; colours are "
+            "skills), how far the worker came, and what the player sees."
+        )
+    frames = trained.worker_step * config.frames_per_step
+    captions["skills.png"] += f" The worker of all pictures is that after {frames:,} frames."
+    return captions
+
+
 def draw(
     config: LabMazeConfig, trained: TrainedWorker, out: Path, *, unsolved: list[int] | None = None
-) -> None:
-    """Draw all figures of a run into a folder.
+) -> bool:
+    """Draw all figures of a run into a folder; return whether the maze of the GIF was solved.
 
     Args:
         config: of the experiment.
@@ -168,16 +188,17 @@ def draw(
     shown = [i for i in np.argsort(lengths, kind="stable") if i not in (unsolved or ())]
     start = starts[int(shown[int(0.85 * (len(shown) - 1))]) if shown else 0]
     planner = make_planner(config, model)
-    plan, states, options = play_plan(planner, real, start)
+    plan, states, options, solved = play_plan(planner, real, start)
     assert planner.last_search is not None
     plot_search(planner.last_search, env, out / "search.png")
     write_episode_gif(env, states, options, plan, out / "episode.gif")
     iio.imwrite(out / "view.png", draw_first_person(env, states[0], width=640, height=480))
+    return solved
 
 
 def play_plan(
     planner: MCTSPlanner, real: Any, start: TensorDictBase
-) -> tuple[Plan, list[TensorDictBase], list[int]]:
+) -> tuple[Plan, list[TensorDictBase], list[int], bool]:
     """Plan from a start and carry the plan out; return the state after every base step.
 
     Args:
@@ -186,20 +207,22 @@ def play_plan(
         start: state without batch dimensions.
 
     Returns:
-        The plan, the states ``[T + 1]`` and the options ``[T]`` of the base steps.
+        The plan, the states ``[T + 1]`` and the options ``[T]`` of the base steps, and whether the
+        goal was met.
     """
     plan = planner.plan(start)
-    state, states, options = start, [start.select(*_STATE)], []
+    state, states, options, solved = start, [start.select(*_STATE)], [], False
     for option in plan.options[: int(plan.lengths)]:
         after = real.step(state.clone().set("option", option))["next"]
         duration = int(after["duration"])
         states += list(after["trajectory"][1:duration].select(*_STATE).unbind(0))
         states.append(after.select(*_STATE))
         options += [int(option)] * duration
+        solved = bool(after["terminated"])
         if bool(after["done"]):
             break
         state = after.exclude("trajectory", "reward")
-    return plan, states, options
+    return plan, states, options, solved
 
 
 def _write_curves(

@@ -109,8 +109,8 @@ def open_run(
 
     Whatever can be refused is refused before anything is written: packages and inputs that are
     missing, a folder in use, one that holds a run (unless ``config`` says ``resume`` or
-    ``overwrite``), a run with other settings to resume. Where the folder is open already, by the
-    command line for the function of an experiment, it stays the same run.
+    ``overwrite``), a run with other settings to resume. A run that is open already, with this very
+    configuration, stays the same run: the command line opens it for the function of an experiment.
 
     Args:
         config: of the experiment; ``out`` is the folder.
@@ -126,13 +126,17 @@ def open_run(
         OSError: if the folder cannot be made or written to.
     """
     outer = _current.get()
-    if outer is not None and outer.path == Path(config.out):
+    if outer is not None and outer.config is config:
         yield outer
         return
     if hasattr(config, "check_inputs"):
         config.check_inputs()
     name = experiment or next(
-        (e.name for e in ALL_EXPERIMENTS.values() if e.config.endswith(f":{type(config).__name__}")),
+        (
+            e.name
+            for e in ALL_EXPERIMENTS.values()
+            if e.config.endswith(f":{type(config).__name__}")
+        ),
         "",
     )
     with contextlib.ExitStack() as stack:
@@ -350,9 +354,7 @@ def resume_command(out: str | Path) -> str:
         ('hmcts train resume=runs/one', 'hmcts train resume=./true')
     """
     folder = str(out)
-    return shlex.join(
-        ["hmcts", "train", f"resume={'./' * (folder.lower() in BOOL_WORDS)}{folder}"]
-    )
+    return shlex.join(["hmcts", "train", f"resume={'./' * (folder.lower() in BOOL_WORDS)}{folder}"])
 
 
 def _word(key: str, value: str) -> str:

@@ -7,7 +7,7 @@
 ``log/scalars/*.csv``     the same while it runs
 ``page.json``             title of its page and captions of its pictures
 ``checkpoints/``          from which it continues
-``worker/``               networks of a finished run, by their step: what its page and evaluation show
+``worker/``               networks of a finished run, which its page shows, by their step
 ``evaluation.json``       evaluations made later by ``hmcts evaluate``
 ========================  ======================================================================
 """
