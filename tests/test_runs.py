@@ -251,7 +251,8 @@ class TestWords:
     @pytest.mark.parametrize(
         ("word", "value"),
         [
-            ("seed=1_000", 1000), ("seed=1e3", 1000), ("seed=1000.0", 1000), ("seed=4294967295", 2**32 - 1),
+            ("seed=1_000", 1000), ("seed=1e3", 1000), ("seed=1000.0", 1000),
+            ("seed=4294967295", 2**32 - 1),
             ("gamma=1e-1", 0.1), ("gamma=1", 1.0), ("toy=yes", True), ("toy=False", False),
         ],
     )  # fmt: skip
@@ -265,8 +266,8 @@ class TestWords:
         "word",
         [
             "seed=-1", "seed=99999999999999999999", "seed=1e20", "seed=1.5", "seed=true", "seed=",
-            "seed=nan", "seed=inf", "seed=0x10", "seed=null", "gamma=nan", "gamma=inf", "gamma=-0.1",
-            "num_skills=-3", "num_skills=0", "toy=2", "toy=",
+            "seed=nan", "seed=inf", "seed=0x10", "seed=null", "gamma=nan", "gamma=inf",
+            "gamma=-0.1", "num_skills=-3", "num_skills=0", "toy=2", "toy=",
         ],
     )  # fmt: skip
     @pytest.mark.parametrize("config", CONFIGS)

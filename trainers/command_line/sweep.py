@@ -65,7 +65,7 @@ def sweep(words: Sequence[str]) -> int:
     except KeyboardInterrupt as error:
         _page(plan, study, command)
         print(
-            "\nhmcts sweep: stopped. Finished trials are kept, the one under way will be continued. "
+            "\nhmcts sweep: stopped. Finished trials are kept, one under way will be continued. "
             f"Continue with: {shlex.join(['hmcts', 'sweep', *words])}",
             file=sys.stderr,
         )

@@ -144,6 +144,19 @@ def read_run(path: str | Path) -> RunFolder:
     )
 
 
+def is_run(path: str | Path) -> bool:
+    """Return whether a folder is that of a run or of a sweep.
+
+    Args:
+        path: folder; need not exist.
+
+    Example:
+        >>> is_run("nowhere")
+        False
+    """
+    return any(Path(path, name).is_file() for name in ("run.json", "metrics.json", "sweep.json"))
+
+
 def read_curves(path: Path) -> dict[str, RunCurve]:
     """Return the curves in a run's folder, those of the log while there is no ``curves.csv``.
 

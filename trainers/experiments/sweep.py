@@ -337,8 +337,11 @@ def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
     """
     sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
 
+    def known(trial: FrozenTrial) -> bool:  # a figure that was not finite came as the worst
+        return trial.value is not None and math.isfinite(trial.value)
+
     def rank(trial: FrozenTrial) -> tuple[bool, float, int]:
-        done = trial.state is TrialState.COMPLETE and trial.value is not None
+        done = trial.state is TrialState.COMPLETE and known(trial)
         return (not done, sign * float(trial.value or 0.0) if done else 0.0, trial.number)
 
     states = {TrialState.PRUNED: "given up", TrialState.RUNNING: "running or interrupted"}
@@ -346,7 +349,7 @@ def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
         {
             "trial": trial.number,
             "state": states.get(trial.state, trial.state.name.lower()),
-            "value": trial.value if trial.state is TrialState.COMPLETE else None,
+            "value": trial.value if trial.state is TrialState.COMPLETE and known(trial) else None,
             "params": dict(trial.params),
             "folder": trial.user_attrs.get("folder", ""),
             "seconds": None if trial.duration is None else round(trial.duration.total_seconds(), 1),
