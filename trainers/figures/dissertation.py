@@ -264,6 +264,8 @@ def draw_figure(
     Path(out).mkdir(parents=True, exist_ok=True)
     path = Path(out) / figure.file
     refuse_foreign(path)
+    if figure.ending == ".html" and not path.exists() and path.with_suffix(".md").exists():
+        refuse_foreign(path.with_suffix(".md"))  # the table beside the page
     caption = figure.draw(sources, path, figure.name)
     stamp(path)
     return Drawn(figure, path, caption)
