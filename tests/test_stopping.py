@@ -235,23 +235,21 @@ def test_a_process_that_the_same_signal_ended_makes_no_failed_run(
 
 def hmcts(*words: str, until: str = "", signum: int = 0, folder: Path | None = None) -> str:
     """Runs a command; sends a signal, twice, when the file ``until`` is there. Returns stderr."""
-    process = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-m", "torchrl_hmcts.trainers.cli", *words],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    if folder is not None:
-        while not any(folder.glob(until)):
-            assert process.poll() is None, process.stderr and process.stderr.read()
+    ) as process:
+        while folder is not None and not any(folder.glob(until)):
+            assert process.poll() is None
             time.sleep(0.02)
-        process.send_signal(signum)
-        time.sleep(0.05)
-        process.send_signal(signum)
-    assert process.stderr is not None
-    said = process.stderr.read()
-    process.wait()
-    return said
+        if folder is not None:
+            process.send_signal(signum)
+            time.sleep(0.05)
+            process.send_signal(signum)
+        assert process.stderr is not None
+        return process.stderr.read()
 
 
 WITHOUT_TIMES = re.compile(r"second|versions|checkpoint")
