@@ -41,9 +41,14 @@ def test_the_page_of_a_finished_run_says_finished(tmp_path: Path) -> None:
 @pytest.mark.parametrize("status", ["stopped", "failed", "interrupted"])
 def test_the_page_of_a_run_that_ended_otherwise_says_how(tmp_path: Path, status: str) -> None:
     error = {"stopped": KeyboardInterrupt, "failed": ZeroDivisionError}.get(status, SystemExit)
-    with pytest.raises(error), open_run(DemoConfig(out=str(tmp_path))) as run:
-        assert "not finished (running)" in lead(write_run_page(run.path).read_text())
-        raise error
+
+    def end() -> None:
+        with open_run(DemoConfig(out=str(tmp_path))) as run:
+            assert "not finished (running)" in lead(write_run_page(run.path).read_text())
+            raise error
+
+    with pytest.raises(error):
+        end()
     if status == "interrupted":  # by SIGKILL: nobody noted it
         record = json.loads((tmp_path / "run.json").read_text())
         (tmp_path / "run.json").write_text(json.dumps({**record, "status": "running"}))
@@ -51,9 +56,13 @@ def test_the_page_of_a_run_that_ended_otherwise_says_how(tmp_path: Path, status:
 
 
 def test_a_failure_after_the_end_leaves_the_run_finished(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="full"), open_run(DemoConfig(out=str(tmp_path))) as run:
-        run.finish({"solved": 1}, title="", pictures={})
-        raise OSError("the disk is full")
+    def end() -> None:
+        with open_run(DemoConfig(out=str(tmp_path))) as run:
+            run.finish({"solved": 1}, title="", pictures={})
+            raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        end()
     assert read_run(tmp_path).status == "finished"
 
 

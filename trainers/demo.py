@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,7 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
         >>> make_starts(WaterworldMazeEnv(), 5, seed=0)["maze_index"].tolist()
         [0, 1, 2, 3, 4]
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(index(seed))
     tiles = free_tiles(env.mazes[:num_mazes])
     picks = torch.stack(
         [torch.randperm(tiles.shape[1], generator=generator)[:2] for _ in range(num_mazes)]
