@@ -85,11 +85,21 @@ def _default_folder(config: Any) -> tuple[Any, bool]:
         return config, True
     there = [config.out, *sorted(glob(f"{escape(config.out)}_[0-9]*"))]
     there = [out for out in there if run_files(Path(out))]
+    there = [out for out in there if _fits(out, config)] or there
     if len(there) > 1:
         raise ValueError(
             f"say which run to continue: {', '.join(resume_command(out) for out in there)}."
         )
     return dataclasses.replace(config, out=there[0]) if there else config, False
+
+
+def _fits(out: str, config: Any) -> bool:
+    """Whether a folder holds a run that these keys may continue, e.g. of the same game."""
+    try:
+        saved = read_run(out).config
+    except ValueError:
+        return False
+    return all(saved.get(key) == getattr(config, key) for key in config.KEPT)
 
 
 def _go_on(folder: str, words: Sequence[str], level: str, line: Sequence[str]) -> int:
