@@ -26,8 +26,8 @@ class FolderInUse(RuntimeError):
         holder: what its lock says about the other process.
 
     Example:
-        >>> str(FolderInUse("runs/one", "process 7"))[:58]
-        "runs/one is in use: process 7 writes to it. Wait for its e"
+        >>> print(str(FolderInUse("runs/one", "process 7")).partition(". ")[0])
+        runs/one is in use: process 7 writes to it
     """
 
     def __init__(self, folder: str | Path, holder: str) -> None:
