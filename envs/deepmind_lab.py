@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
+from operator import index
 from typing import Any, Literal
 
 import numpy as np
@@ -128,7 +129,9 @@ class DeepMindLabEnv(EnvBase):
         self._is_open = True
         self._set_specs()
         self._running = False
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(
+            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
+        )
 
     def _set_specs(self) -> None:
         offered = {str(spec["name"]): spec for spec in self._lab.observation_spec()}
@@ -172,7 +175,7 @@ class DeepMindLabEnv(EnvBase):
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(seed)
+            self._generator.manual_seed(index(seed))
 
     # ---------------------------------------------------------------- playing
 

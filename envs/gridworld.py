@@ -6,6 +6,7 @@ tile index is ``row * W + col``.
 
 from __future__ import annotations
 
+from operator import index
 from typing import Any
 
 import torch
@@ -101,7 +102,9 @@ class GridworldMazeEnv(EnvBase):
         columns_rows = torch.stack((tiles % self.width, tiles // self.width), -1)
         self._centers = columns_rows + 0.5  # [H*W, 2]
         self._set_specs()
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(
+            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
+        )
 
     def _set_specs(self) -> None:
         device = self.device
@@ -150,7 +153,7 @@ class GridworldMazeEnv(EnvBase):
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(seed)
+            self._generator.manual_seed(index(seed))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         entry = tensordict._get_str  # TensorDict.get takes five times as long

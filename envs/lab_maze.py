@@ -6,6 +6,7 @@ Letters: *B batch of the tensordict, n its elements, M mazes, R rows and C colum
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import index
 from typing import Any, Literal
 
 import numpy as np
@@ -199,7 +200,9 @@ class LabMazeEnv(EnvBase):
         self._read = LabReadOuts(self.layout, read_outs)
         self._states = LabStates(self.layout, self.max_frames)
         self._set_specs()
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(
+            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
+        )
 
     @property
     def read_outs(self) -> tuple[str, ...]:
@@ -233,7 +236,7 @@ class LabMazeEnv(EnvBase):
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(seed)
+            self._generator.manual_seed(index(seed))
 
     # ---------------------------------------------------------------- stepping
 

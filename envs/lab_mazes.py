@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from operator import index
 
 from torchrl_hmcts.envs.lab_random import MersenneTwister64
 
@@ -55,6 +56,8 @@ def lab_maze(seed: int, rows: int = 9, columns: int = 9, *, mixer_seed: int = 0)
     for name, size in (("rows", rows), ("columns", columns)):
         if size < 5 or size % 2 == 0:
             raise ValueError(f"lab_maze needs an odd number of {name}, at least 5; got {size}.")
+    # Those of NumPy overflow, and are another type.
+    seed, mixer_seed, rows, columns = map(index, (seed, mixer_seed, rows, columns))
     for name, value in (("seed", seed), ("mixer_seed", mixer_seed)):
         if not 0 <= value < 2**32:
             raise ValueError(f"lab_maze needs a {name} from 0 to 2**32 - 1; got {value}.")

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from functools import lru_cache
+from operator import index
 from typing import Literal
 
 import numpy as np
@@ -114,7 +115,7 @@ def generate_mazes(
             f"None for any number."
         )
     max_draws = max(100_000, 100 * num_mazes)
-    rng_state = np.array([seed % 2**64], dtype=np.uint64)
+    rng_state = np.array([index(seed) % 2**64], dtype=np.uint64)
     kept: dict[bytes, Tensor] = {}
     wall_histogram = torch.zeros(height * width + 1, dtype=torch.int64)
     for _ in range(0, max_draws, _DRAWS_PER_CALL):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,9 @@ class WaterworldMazeEnv(EnvBase):
             time_step=self.TIME_STEP,
         )
         self._set_specs()
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(
+            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
+        )
 
     def _set_specs(self) -> None:
         device, batch_size = self.device, self.batch_size
@@ -180,7 +183,7 @@ class WaterworldMazeEnv(EnvBase):
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(seed)
+            self._generator.manual_seed(index(seed))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         # Small arrays: numpy does in one microsecond what torch does in three.

@@ -32,11 +32,13 @@ from torchrl_hmcts.trainers.atari.trials import RememberedTrials, Trial  # noqa:
 from torchrl_hmcts.trainers.checkpoints import DurableRotation, plain_checkpoint  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari import (  # noqa: E402
     AtariRun,
+    draw,
     evaluate_atari,
     load_run,
     run_atari,
 )
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig  # noqa: E402
+from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif  # noqa: E402
 
 TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)], fire=1)
 
@@ -206,6 +208,42 @@ def test_a_short_run_of_two_processes_leaves_its_figures(tmp_path) -> None:
     newest = f"checkpoint-{metrics['frames']:012d}.torchrl"
     assert checkpoints[-1] == newest
     assert len(checkpoints) == 2
+
+
+@pytest.mark.parametrize("protocol", ["deterministic", "sticky"])
+def test_the_gif_is_the_episode_that_scored(tmp_path, protocol) -> None:
+    config = AtariConfig(
+        frames=9_000, max_episode_frames=800, source="repeat", option_steps=10, ratio=2.0,
+        num_processes=0, replant_every=5, seed=4, out=str(tmp_path), protocol=protocol,
+        rollout_options=2,
+    )  # fmt: skip
+    first, saved = AtariRun(config), []
+
+    def save() -> None:
+        saved.append(first.state_dict())
+        if len(saved) == 4:  # in the middle of the first episode
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first.play(save, lambda: None)
+    assert "decisions of the next" in first.kept()
+    run = AtariRun(config)
+    run.load_state_dict(saved[-1])
+    run.play(lambda: None, lambda: None)
+    best = run.best["episode"]
+    assert run.scores[best]["score"] == run.best["score"] == max(r["score"] for r in run.scores)
+    assert len(run.best["decisions"]) == run.scores[best]["decisions"]
+    recorder = run.make_pool(
+        run.options.worker, run.tuned.option_steps, record=True, sticky=protocol == "sticky"
+    )
+    recorder.set_seed(run.start_seed(best))
+    shown, score = write_atari_gif(
+        recorder, run.best["decisions"], tmp_path / "episode.gif", real_steps=10**6
+    )
+    recorder.close()
+    assert score == run.best["score"]  # played again to its end: the same score
+    assert shown * 4 == run.scores[best]["real_frames"]
+    assert f"which scored {score:g}" in draw(run, tmp_path)["episode.gif"]
 
 
 @pytest.mark.parametrize("guide", ["none", "prior_value"])

@@ -64,15 +64,15 @@ def test_an_unknown_key_of_an_experiment_is_refused_with_the_nearest(capsys) -> 
     assert "Did you mean: num_learners" in error
 
 
-def test_ctrl_c_ends_with_how_to_go_on(capsys, monkeypatch) -> None:
+def test_ctrl_c_ends_with_the_command_that_continues(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
     def interrupted(config) -> dict:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("torchrl_hmcts.trainers.experiments.waterworld.run_waterworld", interrupted)
-    assert main(["train", "experiment=waterworld_a3c", "out=runs/mine"]) == 130
-    assert "hmcts train experiment=waterworld_a3c out=runs/mine resume=true" in (
-        capsys.readouterr().err
-    )
+    assert main(["train", "experiment=waterworld_a3c", "out=runs/my own"]) == 130
+    assert "Continue with: hmcts train 'resume=runs/my own'" in capsys.readouterr().err
 
 
 def test_the_demo_lists_its_keys_with_their_meaning(capsys) -> None:

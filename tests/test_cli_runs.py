@@ -167,7 +167,7 @@ def test_log_level_warning_is_silent_on_standard_output(tmp_path, monkeypatch, c
     words = ["train", "experiment=labmaze", f"out={tmp_path}"]
     assert main(words) == 0
     assert "talking" in capsys.readouterr().out
-    assert main([*words, "log_level=warning"]) == 0
+    assert main([*words, "overwrite=true", "log_level=warning"]) == 0
     assert capsys.readouterr().out == ""
     assert main([*words, "log_level=loud"]) == 2
     assert "log_level is one of debug, info, warning, error; got 'loud'" in capsys.readouterr().err

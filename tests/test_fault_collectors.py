@@ -160,8 +160,8 @@ def test_the_command_line_says_how_to_go_on(tmp_path: Path, monkeypatch: Any, ca
     monkeypatch.setattr("torchrl_hmcts.trainers.experiments.labmaze.run_labmaze", dies)
     assert main(["train", "experiment=labmaze", f"out={tmp_path}"]) == 1
     said = capsys.readouterr().err
-    assert "A process that collects died (Death). Or go on with: hmcts train" in said
-    assert f"out={tmp_path} resume=true" in said
+    again = f"Or continue with: hmcts train resume={tmp_path}"
+    assert f"A process that collects died (Death). {again}" in said
     assert json.loads((tmp_path / "run.json").read_text())["status"] == "failed"
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import find_experiment
+from torchrl_hmcts.trainers.experiments.evaluations import evaluate_labmaze
 from torchrl_hmcts.trainers.experiments.labmaze import run_labmaze
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
 from torchrl_hmcts.trainers.lab import training
@@ -75,6 +76,21 @@ class TestRun:
         written = json.loads((out / "metrics.json").read_text())
         assert written == json.loads(json.dumps(metrics), parse_constant=lambda _: None)
         assert any((out / "checkpoints").iterdir())
+        (worker,) = (out / "worker").iterdir()
+        frames = metrics["worker_training_frames"]
+        assert worker.name == f"worker-{frames // 4:012d}.torchrl"
+        assert f"The worker of all pictures is that after {frames:,} frames." in page
+        shown = "NOT solved" in page
+        assert shown == (metrics["test"]["solved"] == 0)
+
+    def test_an_evaluation_tests_the_worker_of_the_page(
+        self, toy: tuple[Path, dict[str, Any]]
+    ) -> None:
+        out, metrics = toy
+        again = evaluate_labmaze(LabMazeConfig(seed=1, out=str(out), toy=True))
+        assert again["checkpoint"].startswith("worker-")
+        for name in ("mazes", "solved", "unsolved", "expansions"):
+            assert again["test"][name] == metrics["test"][name], name
 
     def test_the_curves_are_those_of_the_dissertations_figures(
         self, toy: tuple[Path, dict[str, Any]]
@@ -112,7 +128,10 @@ def test_diayn_alone_learns_within_its_frames_and_is_tried_before_and_after() ->
     assert frames_curve(trained.tests, 4, 10_800)["training_steps"] == [0.0, 512.0]
 
 
-@pytest.mark.parametrize(("solved", "kept"), [([1, 2, 1], 1), ([2, 2, 2], 2), ([0, 0, 0], 2)])
+@pytest.mark.parametrize(
+    ("solved", "kept"),
+    [([1, 2, 1], 1), ([2, 2, 2], 2), ([0, 0, 0], 2), ([2, 1, 0], 1), ([2, 0, 0], 2)],
+)
 def test_the_worker_that_solved_the_most_mazes_is_kept_of_several_the_latest(
     solved: list[int], kept: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,7 +151,9 @@ def test_the_worker_that_solved_the_most_mazes_is_kept_of_several_the_latest(
     config = LabMazeConfig(
         algorithm="diayn", train_frames=600, curve_mazes=2, curve_points=2, keep="best"
     )
-    policy = train_worker(config).policy
+    trained = train_worker(config)
+    policy = trained.policy
+    assert trained.worker_step == 64 * kept  # never 0: what has not learned shows no skills
     assert len(seen) == 3
     assert not torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[1], seen[2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,19 +12,19 @@ import pytest
 from sqlalchemy.pool import NullPool
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.config import DemoConfig
+from torchrl_hmcts.trainers.config import DemoConfig, RunConfig
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, Experiment
+from torchrl_hmcts.trainers.experiments.run_folder import start_record
 from torchrl_hmcts.trainers.experiments.sweep_space import Choice, Range, parse_space
+from torchrl_hmcts.trainers.locking import folder_locked
 
 optuna = pytest.importorskip("optuna")
 
 
 @dataclass
-class ParabolaConfig:
+class ParabolaConfig(RunConfig):
     """An experiment without any training: y = -(x - 3)^2, z does nothing."""
 
-    seed: int = 0
-    """Of nothing."""
     out: str = "runs/parabola"
     """Folder."""
     x: float = 0.0
@@ -168,7 +169,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, capsys, monkeypatch) -> None:
 
     monkeypatch.setattr(Experiment, "function", property(lambda self: interrupted))
     assert sweep(tmp_path, "x=[1,2,3]", "trials=4") == 130
-    assert "go on with: hmcts sweep experiment=parabola" in capsys.readouterr().err
+    assert "Continue with: hmcts sweep experiment=parabola" in capsys.readouterr().err
     monkeypatch.setattr(Experiment, "function", property(lambda self: run_parabola))
     assert sweep(tmp_path, "x=[1,2,3]", "trials=4") == 0
     states = [t["state"] for t in told(tmp_path)["trials"]]
@@ -193,6 +194,112 @@ def test_a_folder_of_another_sweep_is_refused(tmp_path, capsys) -> None:
     assert "sweep of something else" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("storage", ["", "storage=sqlite:///{out}/trials.db"])
+def test_a_sweep_continues_where_its_folder_was_moved(tmp_path, storage: str) -> None:
+    def words(out: Path) -> list[str]:
+        return ["x=[1,2]", "prune=false", *([storage.format(out=out)] if storage else [])]
+
+    first, moved = tmp_path / "first", tmp_path / "moved"
+    assert sweep(first, *words(first), "trials=2") == 0
+    first.rename(moved)
+    before = {path: path.read_bytes() for path in moved.glob("trial_*/run.json")}
+    assert sweep(moved, *words(moved), "trials=2") == 0
+    assert len(RUNS) == 2
+    assert sweep(moved, *words(moved), "trials=3") == 0
+    assert len(told(moved)["trials"]) == 3
+    assert all(path.read_bytes() == content for path, content in before.items())
+
+
+@pytest.mark.parametrize("torn", ['{"op_code": 5, "wor', '{"op_code": 5, "wor\n', "\xff\n"])
+def test_a_journal_torn_by_a_kill_is_mended(tmp_path, capsys, torn: str) -> None:
+    assert sweep(tmp_path, "x=[1,2]", "trials=2") == 0
+    journal = tmp_path / "journal.log"
+    whole = journal.read_bytes()
+    journal.write_bytes(whole + torn.encode("latin-1"))
+    assert sweep(tmp_path, "x=[1,2]", "trials=3") == 0
+    assert len(RUNS) == 3
+    assert "its last line is not whole" in capsys.readouterr().err
+    assert journal.read_bytes().startswith(whole)
+    assert (tmp_path / "journal.log.damaged").read_bytes() == whole + torn.encode("latin-1")
+
+
+def test_a_trial_never_writes_into_a_folder_that_exists(tmp_path) -> None:
+    mine = tmp_path / "trial_0000" / "metrics.json"
+    mine.parent.mkdir()
+    mine.write_text("{}")
+    (tmp_path / "journal.log").touch()
+    assert sweep(tmp_path, "x=[1,2]", "trials=1") == 0
+    assert told(tmp_path)["trials"][0]["folder"] == "trial_0000_2"
+    assert mine.read_text() == "{}"
+
+
+def test_a_figure_that_is_not_finite_is_null_and_last(tmp_path, monkeypatch) -> None:
+    def run(config: ParabolaConfig) -> dict[str, Any]:
+        run_parabola(config)
+        return {"test": {"y": float("nan") if config.x < 2 else config.x}}
+
+    monkeypatch.setattr(Experiment, "function", property(lambda self: run))
+    for out, objective in (("up", "test.y"), ("down", "-test.y")):
+        words = ("x=[1,2,3]", "trials=6", f"objective={objective}", "prune=false")
+        assert sweep(tmp_path / out, *words) == 0
+        text = (tmp_path / out / "sweep.json").read_text()
+        values = [row["value"] for row in json.loads(text, parse_constant=pytest.fail)["trials"]]
+        numbers = [value for value in values if value is not None]
+        assert values == [*sorted(numbers, reverse=out == "up"), *[None] * (6 - len(numbers))]
+        assert 0 < len(numbers) < 6
+
+
+@pytest.mark.parametrize("alive", [False, True])
+def test_a_trial_whose_process_died_is_continued_in_its_folder(tmp_path, alive: bool) -> None:
+    assert sweep(tmp_path, "x=1..9", "trials=1") == 0
+    journal = optuna.storages.journal.JournalFileBackend(str(tmp_path / "journal.log"))
+    storage = optuna.storages.JournalStorage(journal)
+    trial = optuna.load_study(study_name=None, storage=storage).ask()
+    x = trial.suggest_float("x", 1.0, 9.0)
+    trial.set_user_attr("folder", "trial_0001")
+    folder = tmp_path / "trial_0001"
+    folder.mkdir()
+    start_record("parabola", ParabolaConfig(out=str(folder), x=x), [], {})
+    with folder_locked(folder) if alive else nullcontext():
+        assert sweep(tmp_path, "x=1..9", "trials=2") == 0
+    last = RUNS[-1]
+    assert len(RUNS) == 2
+    assert (last.out == str(folder), last.x == x, last.resume) == (not alive,) * 3
+    states = sorted(row["state"] for row in told(tmp_path)["trials"])
+    assert states == ["complete", "complete", "running or interrupted" if alive else "fail"]
+    assert sweep(tmp_path, "x=1..9", "trials=2") == 0  # nothing is left to continue or to do
+    assert len(RUNS) == 2
+
+
+def test_no_value_is_drawn_twice_by_a_sweep_that_continues(tmp_path) -> None:
+    for trials in (2, 4):
+        assert sweep(tmp_path, "x=0..6", f"trials={trials}", "prune=false") == 0
+    assert len({config.x for config in RUNS}) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["x=[1,2]", "steps=5"], "has a sweep of something else: fixed {}"),
+        (["x=[1,2]", "objective=-test.cost"], "has a sweep of something else: objective test.y"),
+    ],
+)
+def test_trials_of_other_settings_are_not_mixed(tmp_path, capsys, words, message) -> None:
+    assert sweep(tmp_path, "x=[1,2]", "trials=1") == 0
+    before = (tmp_path / "sweep.json").read_bytes()
+    assert sweep(tmp_path, *words, "trials=2") == 2
+    assert message in capsys.readouterr().err
+    assert (tmp_path / "sweep.json").read_bytes() == before
+    assert len(RUNS) == 1
+
+
+def test_the_folder_of_a_run_is_refused(tmp_path, capsys) -> None:
+    (tmp_path / "metrics.json").write_text("{}")
+    assert sweep(tmp_path, "x=[1,2]", "trials=1") == 2
+    assert "holds what is no sweep (metrics.json)" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]
+
+
 def test_any_storage_of_optunas_will_do(tmp_path) -> None:
     url = f"sqlite:///{tmp_path}/trials.db"
     assert sweep(tmp_path, "x=[1,2]", "trials=2", f"storage={url}") == 0
@@ -209,6 +316,13 @@ def test_any_storage_of_optunas_will_do(tmp_path) -> None:
         (["x=[1,2]", "trials=none"], "whole number above 0; got 'none'"),
         (["x=[1,2]", "trials=1", "objective=test.w"], "no figure 'test.w'. It has: test.cost"),
         (["y=[1,2]"], "Unknown key 'y'"),
+        (["seed=-3..3"], "seed must be 0 to 4294967295; got -3"),
+        (["seed=[0,-1]"], "seed must be 0 to 4294967295; got -1"),
+        (["seed=0..1e20"], "seed must be 0 to 4294967295; got 1"),
+        (["x=0..inf"], "two finite ends"),
+        (["x=[1,2]", "trials=1.5"], "whole number; got '1.5'"),
+        (["x=[1,2]", "storage=trials.db"], "storage=trials.db cannot be opened"),
+        (["x=[1,2]", "storage=sqlite:////nowhere/trials.db"], "cannot be opened"),
     ],
 )
 def test_what_a_sweep_cannot_do_is_said(tmp_path, capsys, words, message) -> None:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         make_guided_planner,
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
+    from torchrl_hmcts.trainers.locking import FolderInUse
     from torchrl_hmcts.trainers.restarting_collector import CollectorError
     from torchrl_hmcts.trainers.resume import GeneratorStates, ResumableTrainer, RunningEpisodes
     from torchrl_hmcts.trainers.skills.controllability import (
@@ -100,6 +101,7 @@ __all__ = [
     "OptionGoals",
     "RetrainedSource",
     "SearchGuide",
+    "FolderInUse",
     "GoalFinder",
     "GoalSearch",
     "GoalSource",
@@ -172,6 +174,7 @@ _MODULES = {
     "GrowSkills": "skills.growing",
     "HMCTSTrainer": "hmcts",
     "HindsightTransitions": "skills.hindsight",
+    "FolderInUse": "locking",
     "LearnerError": "asynchronous.learner_processes",
     "MazeNetwork": "waterworld.networks",
     "MazeView": "skills.hindsight",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
+import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,9 @@ from torchrl_hmcts.trainers.checkpoints import (
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.resume import HistoryState
+from torchrl_hmcts.trainers.locking import folder_locked
+from torchrl_hmcts.trainers.resume import FIRST_SAVE_SECONDS, SAVE_SECONDS, HistoryState
+from torchrl_hmcts.trainers.stopping import patient, raise_if_asked, unbroken
 
 MakeOptimizer = Callable[[list[nn.Parameter]], Optimizer]
 
@@ -88,8 +92,9 @@ class A3CTrainer:
     is stopped, an env that hangs) or a gradient that is not finite ends the run: the others stop, a
     checkpoint is written, and :class:`LearnerError` names the learner and carries its traceback. If
     T has been reached, a learner that does not answer is ended after 10 s, and the run ends well.
-    Ctrl-C stops all, writes a checkpoint, says how to go on, and raises ``KeyboardInterrupt``. If
-    this process is killed, the learners notice and end.
+    Ctrl-C or SIGTERM stops all, writes a checkpoint, prints the command that continues the run, and
+    raises ``KeyboardInterrupt``; a second one does not interrupt that. If this process is killed,
+    the learners notice and end.
 
     A run goes on from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
     T, the learning rate's schedule and the curves are as they were. Not exact, and not meant to be:
@@ -131,8 +136,9 @@ class A3CTrainer:
         logger (Logger, optional): of TorchRL; gets every value at its T.
         log_interval (int): frames. Default 10,000.
         save_dir (path, optional): folder of the checkpoints, which hold no pickle. Default: none.
-        save_interval (int, optional): frames between checkpoints, besides the one at the end.
-            Default: a tenth of ``total_frames``.
+        save_interval (int, optional): frames between checkpoints, besides the one after 5 seconds
+            of training, one a minute at least and the one at the end. Default: a tenth of
+            ``total_frames``.
         keep_last (int): checkpoints kept. Default 2.
         overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
             once this run has written one. Default False: ``train()`` refuses such a folder.
@@ -273,6 +279,7 @@ class A3CTrainer:
         if save_dir is not None:
             self.rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
             self.rotation.settings = self.run_settings
+        self._save_at = float("inf")  # time at which a checkpoint is due
         self.intervals = {"log": log_interval, "eval": eval_interval, "save": save_interval}
         self._checkpoint = plain_checkpoint(
             loss_module=loss_module,
@@ -321,12 +328,18 @@ class A3CTrainer:
 
         Raises:
             LearnerError: if a learner ended before its time; a checkpoint has been written.
-            KeyboardInterrupt: after Ctrl-C; a checkpoint has been written.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
             FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
                 unless ``overwrite`` is true.
+            FolderInUse: if another run writes to ``save_dir``.
         """
         if self.rotation is not None:
             self.rotation.begin()
+        with folder_locked(self.rotation.directory) if self.rotation else nullcontext(), patient():
+            return self._train()
+
+    def _train(self) -> dict[str, list[float]]:
+        self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
         self.log.start()
         self._next = {name: self._after(name) for name in self.intervals}
         self._accepted: LossModule | None = None  # what stop_when was content with
@@ -339,8 +352,11 @@ class A3CTrainer:
                 self.loss_module.load_state_dict(self._accepted.state_dict())
             self._report(at_end=True)
         except BaseException as error:
-            self.learners.stop(self.shared)
-            self._end_badly(error)
+            with unbroken():
+                self.learners.stop(self.shared)
+                self._end_badly(error)
+            if not isinstance(error, KeyboardInterrupt):
+                raise_if_asked()  # the signal came to the learners as well, and ended them first
             raise
         finally:
             self.learners.stop(self.shared)
@@ -354,7 +370,10 @@ class A3CTrainer:
         if self.rotation is None:
             raise ValueError("There is nowhere to save to. Pass save_dir when building A3CTrainer.")
         self.rotation.begin()
-        return self.rotation.save(self._checkpoint, step=self.frames)
+        with unbroken():
+            saved = self.rotation.save(self._checkpoint, step=self.frames)
+        self._save_at = time.monotonic() + SAVE_SECONDS
+        return saved
 
     def load(self, path: str | Path) -> A3CTrainer:
         """Continues from a checkpoint; call it before ``train()``.
@@ -392,6 +411,7 @@ class A3CTrainer:
                     learner.update()
                     if self._report():
                         break
+                    raise_if_asked()
             finally:
                 learner.env.close()
 
@@ -399,6 +419,7 @@ class A3CTrainer:
         start = self.frames
         self.learners.start(cloudpickle.dumps(self.settings), self.shared, start)
         while not self.learners.wait(_POLL_SECONDS, self.frames >= self.settings.total_frames):
+            raise_if_asked()
             if self.frames == start:  # they are still importing
                 self.log.restart_clock()
             elif self._report():
@@ -443,7 +464,8 @@ class A3CTrainer:
         again = self._accepted is None and not (at_end and self._evaluated())
         if self.evaluate is not None and again and self._due("eval", at_end):
             end = self._evaluate()
-        if self.rotation is not None and self._due("save", at_end):
+        overdue = time.monotonic() >= self._save_at
+        if self.rotation is not None and (self._due("save", at_end) or overdue):
             self.save()
         return end
 

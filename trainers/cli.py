@@ -17,7 +17,8 @@ _DEMO = f"""\
 Train skills in the training mazes of Waterworld, then solve test mazes by planning over them.
 
 needs   the extra `train`; about a minute of one CPU core
-writes  metrics.json, pictures, a GIF and index.html to the folder `out`
+writes  metrics.json, pictures, a GIF and index.html to the folder `out`; without out= to runs/demo,
+        or the next of runs/demo_2, ... that holds no run
 
 keys and defaults:
 {{keys}}
@@ -27,11 +28,15 @@ _TRAIN = f"""\
 Train and test one experiment.
 
     hmcts train experiment=labmaze seed=1 out=runs/labmaze_1
-    hmcts train resume=runs/labmaze_1                      goes on exactly, with the saved config
-    hmcts train experiment=labmaze out=runs/labmaze_1 resume=true train_frames=80000
-                                                           goes on with other keys
+    hmcts train resume=runs/labmaze_1                      continues it, with the saved config
+    hmcts train experiment=labmaze seed=1 out=runs/labmaze_1 resume=true train_frames=80000
+                                                           continues it for longer
 
-needs   the extra `train` (`atari` for Atari); minutes to hours; Ctrl-C saves and says how to go on
+A folder that holds a run is refused, unless resume= or overwrite=true is given. Without out= the
+run goes to runs/NAME, or the next of runs/NAME_2, ... that holds none.
+
+needs   the extra `train` (`atari` for Atari); minutes to hours; Ctrl-C and SIGTERM save, and the
+        command that continues the run is printed
 writes  run.json, metrics.json, curves.csv, log/, pictures, checkpoints/ and index.html to `out`
 
 experiments (their keys: hmcts list NAME):
@@ -88,7 +93,8 @@ Search for good values of an experiment's keys with Optuna.
 
 needs   the extra `scale`; each trial takes what a run takes
 writes  trial_0000/ ... (folders of runs), sweep.json, importances.png and index.html to the
-        folder; the same command again goes on"""
+        folder; the same command continues it, a trial that was stopped first, also where the folder
+        was moved"""
 
 _LIST = "List the experiments; the keys of one with their defaults and meaning; or the figures."
 
@@ -111,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         0; 1 if something outside went wrong (a folder, missing data or packages); 2 if the words
-        were wrong; 130 after Ctrl-C; 141 if whoever read the output has stopped.
+        were wrong; 130 after Ctrl-C; 143 after SIGTERM; 141 if whoever read the output has stopped.
 
     Example:
         >>> main(["demo", "sede=1"])
@@ -127,6 +133,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         status = run(arguments.words)
         sys.stdout.flush()
+    except KeyboardInterrupt:  # in what is no run, e.g. `hmcts report`
+        print(f"\nhmcts {arguments.verb}: stopped.", file=sys.stderr)
+        return 130
     except BrokenPipeError:  # e.g. `hmcts list figures | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141

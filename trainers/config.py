@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import importlib
+import math
+import numbers
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, TypeVar
 
 from torchrl_hmcts.arguments import name_arguments
 
@@ -14,11 +18,129 @@ C = TypeVar("C")
 NUM_TEST_MAZES = 342
 FRAMES_PER_BATCH = 64
 LOGGERS = ("csv", "tensorboard", "wandb")
+MAX_SEED = 2**32 - 1
+_TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
+BOOL_WORDS = (*_TRUE, *_FALSE)
+
+
+@dataclass
+class RunConfig:
+    """Keys that every run has; the configurations of the experiments extend it.
+
+    Whole numbers may be NumPy's, paths may be ``Path`` objects, and a ``~`` at the start of a path
+    is the home folder, once and for all.
+
+    Raises:
+        TypeError: if a value is not of its field's type.
+        ValueError: if ``seed`` is not between 0 and 2**32 - 1, a number is not finite, or ``out``
+            is empty.
+
+    Example:
+        >>> RunConfig(seed=3).seed
+        3
+    """
+
+    seed: int = 0
+    """Seed of all random numbers, 0 to 4294967295."""
+    out: str = "runs/run"
+    """Folder of the run; made if absent. Default: the first of this name, name_2, name_3, ... that
+    holds no run yet."""
+    resume: bool = False
+    """Continue the run in `out` from its newest checkpoint."""
+    overwrite: bool = False
+    """Replace the run that is in `out`; other files there stay."""
+    toy: bool = False
+    """A run of seconds, to see that everything works."""
+
+    KEPT: ClassVar[tuple[str, ...]] = ("seed", "toy")  # a run that is resumed keeps these
+    PATHS: ClassVar[tuple[str, ...]] = ("out",)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = _checked(field.name, str(field.type), getattr(self, field.name))
+            if field.name in self.PATHS:
+                value = home(value)
+            setattr(self, field.name, value)
+        if not self.out:
+            raise ValueError("out is empty; name a folder, e.g. out=runs/mine.")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise ValueError(f"seed must be 0 to {MAX_SEED}; got {self.seed}.")
+
+    def check_inputs(self) -> None:
+        """Check what the run needs from outside, before anything is written.
+
+        Raises:
+            ModuleNotFoundError: if the package of the logger is not installed.
+        """
+        logger = getattr(self, "logger", "csv")
+        if logger != "csv":
+            need_package(logger)
+
+
+def _checked(name: str, kind: str, value: Any) -> Any:
+    """A value of a field as the plain Python type that its annotation says."""
+    if kind == "bool":
+        if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):
+            raise TypeError(f"{name} is true or false; got {value!r}.")
+        return bool(value)
+    if kind == "int":
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool):
+            raise TypeError(f"{name} must be a whole number; got {value!r}.")
+        return int(value)
+    if kind == "float":
+        if not isinstance(value, numbers.Real) or isinstance(value, bool):
+            raise TypeError(f"{name} must be a number; got {value!r}.")
+        if not math.isfinite(value):
+            raise ValueError(f"{name} must be a finite number; got {value!r}.")
+        return float(value)
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be a text; got {value!r}.")
+    if "\0" in value:
+        raise ValueError(f"{name} must not hold a zero byte; got {value!r}.")
+    return value
+
+
+def home(path: str) -> str:
+    """Return a path as it was typed, with a ``~`` at its start replaced by the home folder.
+
+    Args:
+        path: as typed by a user.
+
+    Raises:
+        ValueError: if the home folder is unknown.
+
+    Example:
+        >>> home("runs/~x"), home("~").startswith("~")
+        ('runs/~x', False)
+    """
+    expanded = os.path.expanduser(path)
+    if path.partition("/")[0] == "~" and expanded == path:
+        raise ValueError(f"{path!r} begins with ~, but no home folder is known; type the path out.")
+    return expanded
+
+
+def need_package(name: str) -> None:
+    """Import an optional package, so that its absence is noticed before a run begins.
+
+    Args:
+        name: of the package.
+
+    Raises:
+        ModuleNotFoundError: if it is not installed; a mere folder of this name does not count.
+
+    Example:
+        >>> need_package("json")
+    """
+    module = importlib.import_module(name)
+    if getattr(module, "__file__", None) is None:
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
 @name_arguments
 @dataclass
-class DemoConfig:
+class DemoConfig(RunConfig):
     """What ``hmcts demo`` does; every value can be given as ``key=value`` on the command line.
 
     Raises:
@@ -30,10 +152,9 @@ class DemoConfig:
         40000
     """
 
-    seed: int = 0
-    """Seed of networks, training, and the starts and targets in the test mazes."""
     out: str = "runs/demo"
-    """Folder that receives metrics, pictures and the page; made if absent."""
+    """Folder that receives metrics, pictures, checkpoints and the page; made if absent. Default:
+    runs/demo (runs/demo_toy with toy=true), or the next of runs/demo_2, ... that holds no run."""
     mazes: int = 100
     """Test mazes to solve, at most the 342 of the test split."""
     num_skills: int = 4
@@ -57,7 +178,10 @@ class DemoConfig:
     toy: bool = False
     """1,920 base steps of training and 3 mazes, to see in seconds that everything works."""
 
+    KEPT = ("seed", "toy", "num_skills", "skill_steps")
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in (
             "mazes",
             "num_skills",
@@ -128,32 +252,57 @@ def parse_overrides(
         >>> parse_overrides(DemoConfig, ["seed=1", "out=runs/one"]).out
         'runs/one'
     """
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError  # values are read as YAML
-
-    names = [field.name for field in fields(config_class)]  # type: ignore[arg-type]
-    overrides = [word.removeprefix("env.") for word in overrides]
+    types = {field.name: str(field.type) for field in fields(config_class)}  # type: ignore[arg-type]
+    given: dict[str, Any] = {}
     for word in overrides:
-        key, separator, _ = word.partition("=")
+        word = word.removeprefix("env.")
+        key, separator, value = word.partition("=")
         if not separator:
-            raise ValueError(f"{word!r} is no key=value, e.g. {names[0]}=1.")
-        if key not in names:
-            raise ValueError(unknown_key(key, [*names, *others]))
+            raise ValueError(f"{word!r} is no key=value, e.g. {next(iter(types))}=1.")
+        if key not in types:
+            raise ValueError(unknown_key(key, [*types, *others]))
+        if key in given:
+            raise ValueError(f"{key} is given twice.")
+        given[key] = read_value(key, value, types[key])
+    return config_class(**given) if base is None else replace(base, **given)  # type: ignore[type-var]
+
+
+def read_value(key: str, value: str, kind: str) -> Any:
+    """Return a value of the command line as its type; a text is taken letter by letter.
+
+    Args:
+        key: of the configuration, for messages.
+        value: as typed.
+        kind: ``"int"``, ``"float"``, ``"bool"`` or ``"str"``.
+
+    Raises:
+        ValueError: if it is not of this type.
+
+    Example:
+        >>> read_value("mazes", "1_000", "int"), read_value("frames", "1e6", "int")
+        (1000, 1000000)
+        >>> read_value("out", "007", "str"), read_value("toy", "yes", "bool")
+        ('007', True)
+    """
+    if kind == "bool":
+        if value.lower() not in BOOL_WORDS:
+            raise ValueError(f"{key} is true or false; got {value!r}.")
+        return value.lower() in _TRUE
+    if kind == "str":
+        return value
     try:
-        merged = OmegaConf.merge(
-            OmegaConf.structured(config_class if base is None else base),
-            OmegaConf.from_dotlist(overrides),
-        )
-        return config_class(**{name: getattr(merged, name) for name in names})
-    except YAMLError as error:
-        raise ValueError(
-            f"A value of {overrides} cannot be read: {str(error).splitlines()[0]}. Close "
-            "its quotes and brackets."
-        ) from None
-    except OmegaConfBaseException as error:
-        key = f"{error.full_key}: " if getattr(error, "full_key", None) else ""
-        raise ValueError(key + str(error).splitlines()[0]) from None
+        if kind == "float":
+            return float(value)
+        try:
+            return int(value)
+        except ValueError:
+            number = float(value)
+            if not number.is_integer():
+                raise
+            return int(number)
+    except (ValueError, OverflowError):
+        what = "a whole number" if kind == "int" else "a number"
+        raise ValueError(f"{key} must be {what}; got {value!r}.") from None
 
 
 def unknown_key(key: str, known: Sequence[str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudge
 from torchrl_hmcts.trainers.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
+from torchrl_hmcts.trainers.experiments.run import Run, open_run
+from torchrl_hmcts.trainers.experiments.worker_file import save_worker
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import finish, versions
+from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
 
 
@@ -38,18 +41,26 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 4 (tree search over DIAYN skills), on the mazes of chapter 3.
     """
+    with open_run(config) as run:
+        return _run_demo(run.config, run)
+
+
+def _run_demo(config: DemoConfig, run: Run) -> dict[str, Any]:
+    """Carry the demo out in a folder that is open."""
     if config.toy:
         config = dataclasses.replace(config, train_base_steps=1_920, mazes=min(3, config.mazes))
     test_mazes = maze_pool("test")
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
-    out = Path(config.out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = run.path
     begin = time.perf_counter()
 
     print(f"Learning {config.num_skills} skills in {config.train_base_steps:,} base steps ...")
     logger = make_logger(config)
-    trainer, loss = train_worker(config, save_dir=out / "checkpoints", logger=logger)
+    trainer, loss = train_worker(
+        config, save_dir=run.checkpoints, logger=logger, resume=run.resumes
+    )
     logger.close()
+    save_worker(out, loss, trainer.collected_frames)
     train_seconds = time.perf_counter() - begin
     policy = SkillPolicy(loss.actor_network, deterministic=True)
 
@@ -85,7 +96,8 @@ def run_demo(config: DemoConfig) -> dict[str, Any]:
     )
     shown = _episode_to_show(episodes, starts, real.base_env)
     metrics["seconds"] = round(time.perf_counter() - begin, 2)
-    with finish(out, "Solving random mazes by planning over learned skills", metrics) as pictures:
+    title = "Solving random mazes by planning over learned skills"
+    with run.finish(metrics, title=title) as pictures:
         print("Drawing ...")
         maze = test_mazes[int(starts["maze_index"][shown])]
         planner.plan(starts[shown : shown + 1])
@@ -102,8 +114,13 @@ def _draw_episode(
     start: TensorDictBase,
     episode: Episode,
 ) -> None:
-    words = "A test maze as it was solved: the plan (colours are skills) and the worker that "
-    with pictures.one("episode.gif", words + "carries it out.") as path:
+    words = "A test maze as it was solved: the plan (colours are skills) and the worker's way."
+    if not episode.solved:
+        words = (
+            "A test maze that was NOT solved: the plan, if one was found (colours are skills), and "
+            "how far the worker came."
+        )
+    with pictures.one("episode.gif", words) as path:
         from torchrl_hmcts.trainers.figures.animation import write_episode_gif
 
         write_episode_gif(env, start, episode, path)
@@ -146,7 +163,7 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
         >>> make_starts(WaterworldMazeEnv(), 5, seed=0)["maze_index"].tolist()
         [0, 1, 2, 3, 4]
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(index(seed))
     tiles = free_tiles(env.mazes[:num_mazes])
     picks = torch.stack(
         [torch.randperm(tiles.shape[1], generator=generator)[:2] for _ in range(num_mazes)]
@@ -157,14 +174,19 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
 
 
 def train_worker(
-    config: DemoConfig, *, save_dir: Path | None = None, logger: Logger | None = None
+    config: DemoConfig,
+    *,
+    save_dir: Path | None = None,
+    logger: Logger | None = None,
+    resume: bool = False,
 ) -> tuple[DIAYNTrainer, Any]:
     """Train the demo's worker; return the trainer with its history, and the loss with its networks.
 
     Args:
         config: see :class:`~torchrl_hmcts.trainers.config.DemoConfig`.
-        save_dir: folder of the checkpoint that is written at the end. Default: none.
+        save_dir: folder of the checkpoints. Default: none are written.
         logger: of TorchRL; gets the training's values. Default: none.
+        resume: continue from the newest checkpoint in ``save_dir``.
     """
     env = make_training_env(num_skills=config.num_skills, skill_steps=config.skill_steps)
     loss = DIAYNTrainer.make_loss(env, config.num_skills, seed=config.seed)
@@ -178,6 +200,8 @@ def train_worker(
         save_dir=save_dir,
         logger=logger,
     )
+    if resume and save_dir is not None:
+        trainer.load(save_dir)
     trainer.train()
     return trainer, loss
 

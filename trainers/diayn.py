@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from operator import index
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -163,8 +164,8 @@ class DIAYNTrainer(ResumableTrainer):
             )
         objective = _objective(loss_module)
         if seed is not None:  # before the collector makes its first reset
-            env.set_seed(seed)
-            torch.manual_seed(seed)
+            env.set_seed(index(seed))
+            torch.manual_seed(index(seed))
         if reward is None:
             reward = SkillReward(objective, reward_key=loss_module.tensor_keys.reward)
         if coverage is None:
@@ -293,7 +294,7 @@ class DIAYNTrainer(ResumableTrainer):
         action_spec = env.action_spec_unbatched
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
             if seed is not None:
-                torch.manual_seed(seed)
+                torch.manual_seed(index(seed))
             actor = SkillActor(
                 _width(env, in_keys), action_spec, num_skills, in_keys=in_keys, hidden=hidden
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from operator import index
 from typing import Any, Literal
 
 import numpy as np
@@ -297,7 +298,7 @@ class ExpertIterationTrainer(ResumableTrainer):
         buffer = ReplayBuffer(
             storage=LazyTensorStorage(buffer_size),
             batch_size=batch_size,
-            generator=torch.Generator().manual_seed(seed),
+            generator=torch.Generator().manual_seed(index(seed)),
         )
         optimizer = torch.optim.Adam(loss_module.parameters(), lr=lr)
         super().__init__(

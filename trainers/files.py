@@ -90,7 +90,7 @@ def write_json(path: str | Path, content: Any, *, checksum: bool = False) -> Non
         >>> from torchrl_hmcts.trainers.files import write_json
         >>> write_json("metrics.json", {"solved": 0, "frames": float("nan")})
     """
-    content = _finite(content)
+    content = finite(content)
     if checksum:
         content = {**content, _CHECKSUM: digest(content)}
     write_text(path, json.dumps(content, indent=2) + "\n")
@@ -200,11 +200,23 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
                 remove(path)
 
 
-def _finite(content: Any) -> Any:
+def finite(content: Any) -> Any:
+    """Return content with None in place of a number that is not finite: JSON has no other.
+
+    Args:
+        content: dicts, lists, texts and numbers, NumPy's as well.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.files import finite
+        >>> finite({"frames": [float("inf"), 2]})
+        {'frames': [None, 2]}
+    """
     if isinstance(content, Mapping):
-        return {key: _finite(value) for key, value in content.items()}
+        return {key: finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_finite(value) for value in content]
+        return [finite(value) for value in content]
+    if hasattr(content, "tolist"):  # of NumPy and torch
+        return finite(content.tolist())
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 

@@ -13,7 +13,9 @@ from __future__ import annotations
 import math
 import random
 import sys
+import time
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,11 @@ from torchrl_hmcts.trainers.checkpoints import (
     newest_checkpoint,
     plain_checkpoint,
 )
+from torchrl_hmcts.trainers.locking import folder_locked
+from torchrl_hmcts.trainers.stopping import patient, raise_if_asked, stop_asked, unbroken
+
+FIRST_SAVE_SECONDS = 5.0  # of training, after which there is a checkpoint whatever the interval
+SAVE_SECONDS = 60.0  # between two checkpoints, at most
 
 Generator = torch.Generator | np.random.Generator | random.Random
 
@@ -225,10 +232,14 @@ class ResumableTrainer(Trainer):
     bit, if the env's whole state is in its tensordict. Checkpoints are written so that a crash
     cannot damage one (:class:`DurableRotation`) and are read without pickle.
 
+    Ctrl-C and SIGTERM stop a training after the batch under way, which is saved; then
+    ``KeyboardInterrupt`` is raised. A second Ctrl-C, a second later or more, stops it at once. One
+    trainer at a time writes to a ``save_dir``.
+
     Args:
-        save_dir (path, optional): folder of the checkpoints; one is written whenever
-            ``save_trainer_interval`` base steps have passed, and at the end. Default ``None``: no
-            checkpoints.
+        save_dir (path, optional): folder of the checkpoints; one is written after 5 seconds of
+            training, whenever ``save_trainer_interval`` base steps or a minute have passed, and at
+            the end. Default ``None``: no checkpoints.
         keep_last (int): checkpoints kept. Default ``2``.
         overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
             once this run has written one. Default ``False``: ``train()`` refuses such a folder.
@@ -242,6 +253,7 @@ class ResumableTrainer(Trainer):
         ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
             ``save_trainer_file``.
         OSError: if ``save_dir`` cannot be written to.
+        FolderInUse: on training, if another run writes to ``save_dir``.
 
     Example:
         >>> import torch
@@ -294,6 +306,7 @@ class ResumableTrainer(Trainer):
             # A buffer's own dump() writes a pickle beside the tensors; its state dict needs none.
             checkpoint.register("replay_buffer", buffer, adapter=PlainStateAdapter())
         super().__init__(**trainer_kwargs)
+        self._save_at = math.inf  # time at which a checkpoint is due
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
         self._last_log: dict[str, Any] = {}
         self._saved_frames = -1  # base steps at the newest checkpoint
@@ -311,21 +324,6 @@ class ResumableTrainer(Trainer):
     def history(self) -> dict[str, list[float]]:
         """All values logged so far, by name."""
         return {key: [float(x) for x in values] for key, values in self._log_dict.items()}
-
-    def train(self) -> None:
-        """Trains.
-
-        Raises:
-            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
-                unless ``overwrite`` is true.
-        """
-        if isinstance(self.checkpoint_rotation, DurableRotation):
-            self.checkpoint_rotation.begin()
-        super().train()
-
-    def _save_trainer(self) -> None:
-        super()._save_trainer()
-        self._saved_frames = self.collected_frames
 
     def _shutdown_hook(self) -> None:
         # A collector that ends by itself leaves TorchRL's loop without the checkpoint of the end.
@@ -366,6 +364,44 @@ class ResumableTrainer(Trainer):
         if isinstance(self.checkpoint_rotation, DurableRotation):
             self.checkpoint_rotation.continue_from(found)
         return self
+
+    def train(self) -> None:
+        """Trains until ``total_frames`` are collected.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
+            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
+                unless ``overwrite`` is true.
+            FolderInUse: if another run writes to ``save_dir``.
+        """
+        if isinstance(self.checkpoint_rotation, DurableRotation):
+            self.checkpoint_rotation.begin()
+        self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
+        folder = getattr(self.checkpoint_rotation, "directory", None)
+        with folder_locked(folder) if folder else nullcontext(), patient():
+            try:
+                super().train()
+            except KeyboardInterrupt:
+                with unbroken():
+                    self._shutdown_hook()
+                    self.collector.shutdown()
+                raise
+
+    def save_trainer(self, force_save: bool = False) -> None:
+        """Writes a checkpoint if one is due; stops here if a signal has asked for it.
+
+        Args:
+            force_save: write one in any case.
+        """
+        due = stop_asked() or time.monotonic() >= self._save_at
+        super().save_trainer(force_save or due)
+        raise_if_asked()
+
+    def _save_trainer(self) -> None:
+        with unbroken():
+            super()._save_trainer()
+        self._saved_frames = self.collected_frames
+        self._save_at = time.monotonic() + SAVE_SECONDS
 
     def compute_loss(self, sub_batch: TensorDictBase) -> TensorDictBase:
         """Returns the losses of a batch.

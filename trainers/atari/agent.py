@@ -207,6 +207,7 @@ class AtariAgent:
         self.state: TensorDictBase | None = None
         self._search: Search | None = None
         self.last_step: TensorDictBase | None = None
+        self.last_option = -1  # carried out by the latest decision
 
     @property
     def num_frames(self) -> int:
@@ -255,6 +256,7 @@ class AtariAgent:
         assert search is not None
         self.planner.resume(search)
         option = torch.from_numpy(self.planner.choose(search))
+        self.last_option = int(option)
         after = self.real.step(state.clone().set("option", option))["next"]
         self.last_step = after
         progress.score += float(after["score"].sum())
@@ -288,6 +290,7 @@ class AtariAgent:
             "greatest_reward": self.greatest_reward,
             "state": None if self.state is None else self.state["emulator_state"].clone(),
             "guide": None if self.guide is None else self.guide.state_dict(),
+            "num_calls": self.real._num_calls,  # sticky actions are drawn by their number
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -300,3 +303,4 @@ class AtariAgent:
         if rows is not None:
             td = TensorDict({"emulator_state": rows}, [1])
             self.state = self.real.reset(td, set_state=True)
+        self.real._num_calls = int(state_dict.get("num_calls", self.real._num_calls))

@@ -6,6 +6,7 @@ Letters: K examples, Z options.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import index
 from typing import Any
 
 import torch
@@ -114,12 +115,12 @@ class SearchGuide:
         self.min_visits, self.learn_every, self.updates = min_visits, learn_every, updates
         self.batch_size = batch_size
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.manual_seed(index(seed))
             network = _TwoHeads(num_options, hidden)
         self._module = TensorDictModule(network, ["ram"], ["logits", "state_value"])
         self._loss = ExpertIterationLoss(self._module, value_loss="smooth_l1")
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=lr)
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator().manual_seed(index(seed))
         self._buffer = ReplayBuffer(
             storage=LazyTensorStorage(buffer_size),
             batch_size=batch_size,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Sequence
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import split_words
-from torchrl_hmcts.trainers.config import parse_overrides
+from torchrl_hmcts.trainers.config import home, parse_overrides
 from torchrl_hmcts.trainers.experiments.run_folder import (
     add_evaluation,
     load_config,
@@ -17,6 +18,7 @@ from torchrl_hmcts.trainers.experiments.run_folder import (
     shown_word,
 )
 from torchrl_hmcts.trainers.files import left_out
+from torchrl_hmcts.trainers.locking import is_locked
 
 
 def evaluate(words: Sequence[str]) -> int:
@@ -25,7 +27,7 @@ def evaluate(words: Sequence[str]) -> int:
         own, rest = split_words(words, ["run"])
         if "run" not in own:
             raise ValueError("say which run: run=DIR, the folder that a training wrote.")
-        run = read_run(own["run"])
+        run = read_run(home(own["run"]))
         experiment, saved = load_config(run)
         changed = parse_overrides(
             experiment.config_class, rest, base=saved, others=["run", "log_level"]
@@ -37,12 +39,20 @@ def evaluate(words: Sequence[str]) -> int:
             for field in dataclasses.fields(changed)
             if getattr(changed, field.name) != getattr(saved, field.name)
         }
+        for key in ("resume", "overwrite"):
+            if key in changes:
+                raise ValueError(f"{key} is for hmcts train; an evaluation changes no run.")
         function = experiment.evaluation
+        if hasattr(changed, "check_inputs"):
+            changed.check_inputs()
     except ModuleNotFoundError as error:
         return missing(error)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         return refuse("evaluate", error)
+    if is_locked(run.path):
+        print(f"{run.path} is still running: its newest checkpoint is tested.", file=sys.stderr)
     from torchrl_hmcts.trainers.figures.report import machine, versions, write_run_page
+    from torchrl_hmcts.trainers.files import finite
 
     try:
         with said(own.get("log_level", "info")):
@@ -62,7 +72,7 @@ def evaluate(words: Sequence[str]) -> int:
         "versions": versions(),
         "machine": machine(),
     }
-    print(json.dumps(results, indent=1))
+    print(json.dumps(finite(results), indent=1))
     with left_out("evaluation.json"):
         print(f"Figures: {add_evaluation(run.path, evaluation)}")
     with left_out("index.html"):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import folders_of, split_words
+from torchrl_hmcts.trainers.config import home
 
 _OWN = ("figure", "out", "results")
 
@@ -15,6 +16,7 @@ def report(words: Sequence[str]) -> int:
     """Write the page of a run, of several compared, or a figure of the dissertation."""
     try:
         own, rest = split_words(words, _OWN)
+        own |= {key: home(own[key]) for key in ("out", "results") if key in own}
         folders = folders_of(rest, _OWN)
         with said(own.get("log_level", "info")):
             if "figure" in own:

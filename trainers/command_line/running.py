@@ -7,15 +7,24 @@ import io
 import os
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.words import set_log_level
 from torchrl_hmcts.trainers.experiments.registry import Experiment, ExperimentError
-from torchrl_hmcts.trainers.experiments.run_folder import end_record, start_record
+from torchrl_hmcts.trainers.experiments.run import open_run, resume_command
+from torchrl_hmcts.trainers.locking import FolderInUse
+from torchrl_hmcts.trainers.stopping import Stopped, signals_handled
 
 
 def run_experiment(
-    name: str, experiment: Experiment, config: Any, words: Sequence[str], log_level: str = "info"
+    name: str,
+    experiment: Experiment,
+    config: Any,
+    words: Sequence[str],
+    log_level: str = "info",
+    *,
+    fresh: bool = False,
 ) -> int:
     """Run an experiment, with ``run.json`` in its folder; return the exit status.
 
@@ -25,21 +34,27 @@ def run_experiment(
         config: its configuration.
         words: the whole command line, for the record.
         log_level: how much is said.
+        fresh: no folder was named: take the first of ``out``, ``out_2``, ... that holds nothing.
     """
+    resume = ""  # how to continue, once there is a run
     try:
-        with said(log_level):
+        with said(log_level), signals_handled():
             _ = experiment.function
-            from torchrl_hmcts.trainers.figures.report import machine, versions
-
-            facts = {"versions": versions(), "machine": machine()}
-            start_record(experiment.name, config, words, facts)
-            with recorded(config.out):
+            with open_run(config, experiment=experiment.name, command=words, fresh=fresh) as run:
+                resume = run.resume_command
+                if run.config.out != config.out:
+                    print(f"{config.out} holds a run already; this one goes to {run.config.out}.")
+                config = run.config
+                if getattr(config, "resume", False) and not run.resumes:
+                    print("The run was stopped before its first checkpoint: it begins again.")
                 experiment(config)
     except ModuleNotFoundError as error:
         return missing(error)
+    except FolderInUse as error:
+        return fail(name, error)
     except RuntimeError as error:
         if type(error).__name__ == "CollectorError":
-            return fail(name, f"{error} Or {_going_on(name, config)}")
+            return fail(name, f"{error} Or continue with: {resume or resume_command(config.out)}")
         if type(error).__name__ != "CheckpointError":  # torchrl's; not worth its import here
             raise
         return fail(name, error)
@@ -51,24 +66,19 @@ def run_experiment(
         return fail(name, f"{error}. Choose another folder with out=DIR.")
     except (ExperimentError, FloatingPointError, ImportError) as error:
         return fail(name, error)
-    except KeyboardInterrupt:
-        print(f"\nhmcts {name}: stopped; {_going_on(name, config)}", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:
+        how = f"{_saved(config.out)} Continue with: {resume}" if resume else "nothing was begun."
+        print(f"\nhmcts {name}: stopped. {how}", file=sys.stderr)
+        return error.status if isinstance(error, Stopped) else 130
     return 0
 
 
-@contextlib.contextmanager
-def recorded(out: str) -> Iterator[None]:
-    """Note in the folder's ``run.json`` how what is done in the context ends."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        end_record(out, "stopped")
-        raise
-    except BaseException:
-        end_record(out, "failed")
-        raise
-    end_record(out, "finished")
+def _saved(out: str) -> str:
+    """A sentence on what a run that was stopped has saved."""
+    names = [p.name for p in Path(out, "checkpoints").glob("[!.]*") if p.suffix != ".json"]
+    if not names:
+        return "It had written no checkpoint yet and will begin again."
+    return f"Saved: {Path(out, 'checkpoints', max(names))}."
 
 
 @contextlib.contextmanager
@@ -107,9 +117,3 @@ def missing(error: ModuleNotFoundError) -> int:
         file=sys.stderr,
     )
     return 1
-
-
-def _going_on(name: str, config: Any) -> str:
-    if hasattr(config, "resume"):
-        return f"go on with: hmcts {name} out={config.out} resume=true"
-    return "it starts anew, run it again."

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import io
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVELS, set_log_level, split_words
-from torchrl_hmcts.trainers.config import parse_overrides
-from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, find_experiment
+from torchrl_hmcts.trainers.config import parse_overrides, read_value
+from torchrl_hmcts.trainers.experiments.registry import (
+    EXPERIMENTS,
+    ExperimentError,
+    find_experiment,
+)
 from torchrl_hmcts.trainers.experiments.run_folder import shown_word
 from torchrl_hmcts.trainers.experiments.sweep_space import parse_space
 from torchrl_hmcts.trainers.files import left_out, write_json
+from torchrl_hmcts.trainers.locking import FolderInUse
+from torchrl_hmcts.trainers.stopping import Stopped, signals_handled
 
 _OWN = ("experiment", "trials", "objective", "storage", "prune", "out")
 _DEFAULT_TRIALS = 20
@@ -30,7 +37,8 @@ def sweep(words: Sequence[str]) -> int:
             )
         experiment = find_experiment(own["experiment"])
         space, fixed = parse_space(experiment.config_class, rest, [*_OWN, "log_level"])
-        folder = own.get("out", f"runs/sweep_{experiment.name}")
+        default = f"runs/sweep_{experiment.name}" + "_toy" * ("toy=true" in fixed)
+        folder = own.get("out", default)
         config = parse_overrides(experiment.config_class, [*fixed, f"out={folder}"])
         trials = _whole("trials", own.get("trials", str(_DEFAULT_TRIALS)))
         objective = own.get("objective", experiment.objective)
@@ -46,20 +54,27 @@ def sweep(words: Sequence[str]) -> int:
         study = plan.study()  # before any trial: says what is wrong with storage or folder
     except ModuleNotFoundError as error:
         return missing(error)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         return refuse("sweep", error)
     except OSError as error:
         return fail("sweep", f"{error}. Choose another folder with out=DIR.")
     command = " ".join(map(shown_word, ["hmcts", "sweep", *words]))
     try:
         # Optuna says what came of each trial; what the trials say is for those who ask for it.
-        with said(level), said_by_trials(level):
+        with signals_handled(), said(level), said_by_trials(level):
             study = plan.run(trials)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         _page(plan, study, command)
-        again = " ".join(["hmcts", "sweep", *words])
-        print(f"\nhmcts sweep: stopped; go on with: {again}", file=sys.stderr)
-        return 130
+        print(
+            "\nhmcts sweep: stopped. Finished trials are kept, one under way will be continued. "
+            f"Continue with: {shlex.join(['hmcts', 'sweep', *words])}",
+            file=sys.stderr,
+        )
+        return error.status if isinstance(error, Stopped) else 130
+    except ModuleNotFoundError as error:
+        return missing(error)
+    except (ExperimentError, FolderInUse) as error:
+        return fail("sweep", error)
     except ValueError as error:
         return refuse("sweep", error)
     best = _page(plan, study, command)
@@ -73,7 +88,12 @@ def _page(plan: object, study: object, command: str) -> str:
 
     assert isinstance(plan, Sweep)
     rows, shares = trial_rows(study), importances(study)  # type: ignore[arg-type]
-    content = {"objective": plan.objective, "trials": rows, "importances": shares}
+    content = {
+        "study": study.study_name,  # type: ignore[attr-defined]
+        "objective": plan.objective,
+        "trials": rows,
+        "importances": shares,
+    }
     with left_out("sweep.json"):
         write_json(plan.folder / "sweep.json", content)
     page = plan.folder / "index.html"
@@ -105,9 +125,10 @@ def said_by_trials(level: str) -> Iterator[None]:
 
 
 def _whole(key: str, value: str) -> int:
-    if not value.isdigit() or int(value) < 1:
+    number = read_value(key, value, "int") if value[:1].isdigit() else 0
+    if number < 1:
         raise ValueError(f"{key} must be a whole number above 0; got {value!r}.")
-    return int(value)
+    return int(number)
 
 
 def _yes_or_no(key: str, value: str) -> bool:

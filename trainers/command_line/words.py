@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Sequence
 
-from torchrl_hmcts.trainers.config import unknown_key
+from torchrl_hmcts.trainers.config import home, unknown_key
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 LOG_LEVEL_HELP = (
@@ -59,9 +59,9 @@ def folders_of(words: Sequence[str], own: Sequence[str]) -> list[str]:
     """
     for word in words:
         key, separator, _ = word.partition("=")
-        if separator and not os.path.isdir(word):
+        if separator and not os.path.isdir(home(word)):
             raise ValueError(unknown_key(key, [*own, "log_level"]))
-    return list(words)
+    return [home(word) for word in words]
 
 
 def set_log_level(level: str) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
+import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator
@@ -15,7 +17,6 @@ from torchrl.checkpoint import CheckpointError
 from tqdm import tqdm
 
 from torchrl_hmcts.envs import AtariOptionPool, OptionWorker
-from torchrl_hmcts.envs.atari_emulator import find_game
 from torchrl_hmcts.trainers.atari.agent import AtariAgent, AtariProgress, AtariSearch
 from torchrl_hmcts.trainers.atari.goals import GoalSearch
 from torchrl_hmcts.trainers.atari.guide import SearchGuide
@@ -39,8 +40,9 @@ from torchrl_hmcts.trainers.checkpoints import (
 )
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
 from torchrl_hmcts.trainers.experiments.registry import ExperimentError
+from torchrl_hmcts.trainers.experiments.run import Run, open_run
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import finish, versions
+from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.files import left_out, write_csv
 
 TOY: dict[str, Any] = {
@@ -53,7 +55,7 @@ TOY: dict[str, Any] = {
 }
 FRAMES_PER_STEP = 4
 _FRAMES_PER_POINT = 1_000 * FRAMES_PER_STEP  # of the curves: the source's 1,000 samples
-_FREE = ("out", "resume", "frames", "options_from", "num_processes")  # may change on the way
+_FREE = AtariConfig.FREE  # may change on the way
 
 
 def run_atari(config: AtariConfig) -> dict[str, Any]:
@@ -75,15 +77,16 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 5.
     """
+    with open_run(config) as folder:
+        return _run_atari(folder.config, folder)
+
+
+def _run_atari(config: AtariConfig, folder: Run) -> dict[str, Any]:
+    """Carry the experiment out in a folder that is open."""
     if config.toy:
         config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)
-    try:
-        find_game(config.game)
-    except ValueError as error:
-        raise ExperimentError(str(error)) from None
-    out = Path(config.out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = folder.path
     run = AtariRun(config)
     rotation = DurableRotation(out / "checkpoints")
     rotation.settings = run.settings()
@@ -101,6 +104,9 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     with tqdm(total=config.frames, unit=" frames", unit_scale=True, disable=None) as bar:
         try:
             run.play(save, lambda: (bar.update(run.num_frames - bar.n), None)[1])
+        except KeyboardInterrupt:
+            print(f"\n{run.kept()}", file=sys.stderr)
+            raise
         finally:
             run.close()
     metrics = {
@@ -112,7 +118,7 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     with left_out("curves.csv"):
         write_csv(out / "curves.csv", ("step", "name", "value"), _curve_rows(run))
     title = f"{config.game} by planning over options, {config.protocol}"
-    with finish(out, title, metrics) as pictures:
+    with folder.finish(metrics, title=title) as pictures:
         draw(run, pictures)
     print(
         f"{config.game}: {len(run.scores)} episodes, best {metrics['score_max']:g}, last "
@@ -161,7 +167,8 @@ class AtariRun:
 
     Attributes:
         scores: of the episodes that are over: dicts with ``frames`` (emulated so far), ``score``,
-            ``real_frames`` and ``seed``.
+            ``real_frames`` and ``decisions``.
+        best: number, score and decisions of the best episode that is over; empty before.
         options: what the source has found; None before.
         tuned: how long an option is, and PUCT's c; None before.
     """
@@ -170,6 +177,9 @@ class AtariRun:
         self.config = config
         self.scores: list[dict[str, float]] = []
         self.points: list[tuple[int, float]] = []  # running score against frames
+        self.best: dict[str, Any] = {}
+        self._decisions: list[int] = []  # options of the episode under way, in their order
+        self._saved = (0, 0)  # episodes and decisions at the latest checkpoint
         self.options: Options | None = None
         self.tuned: Tuned | None = None
         self.agent: AtariAgent | None = None
@@ -237,6 +247,7 @@ class AtariRun:
             self._seed_episode(agent)
             agent.load_state_dict(self._resumed)
             self._resumed = None
+            self._saved = len(self.scores), agent.progress.decisions
             self._frames_before -= agent.num_frames  # a console's start is no part of the run
             if agent.progress.done:  # the frames were spent then, and may be more now
                 if self.num_frames >= config.frames:
@@ -249,12 +260,14 @@ class AtariRun:
             agent.begin()
         if fresh:
             save()
+            self._saved = len(self.scores), 0
         while True:
             begin = time.perf_counter()
             # To the next checkpoint, which is where the tree is planted anew.
             rest = config.replant_every - agent.progress.decisions % config.replant_every
             for _ in range(rest):
                 done = agent.play(1).done
+                self._decisions.append(agent.last_option)
                 self._note_score(agent.progress)
                 if done:
                     break
@@ -269,6 +282,18 @@ class AtariRun:
                 self._seed_episode(agent)
                 agent.begin()
             save()
+            self._saved = len(self.scores), agent.progress.decisions
+
+    def kept(self) -> str:
+        """Return a sentence on what the latest checkpoint holds, and what is to be played again."""
+        if self.agent is None:
+            return "Kept: the trials of options so far; the search for options continues with them."
+        episodes, decisions = self._saved
+        lost = self.agent.progress.decisions - decisions if episodes == len(self.scores) else 0
+        return (
+            f"Kept: {episodes} episodes and {decisions} decisions of the next. When it is resumed, "
+            f"{max(0, lost)} decisions since are made again, the same ones."
+        )
 
     def _remembering(self) -> RememberedTrials:
         """Makes pools whose trials a run that is stopped and resumed does not play again."""
@@ -316,8 +341,13 @@ class AtariRun:
     def _seed_episode(self, agent: AtariAgent) -> None:
         """Give an episode a start and draws of its own, whatever was played before."""
         agent.seed = self.config.seed * 10_000 + len(self.scores)
-        for pool in (agent.pool, agent.real):
-            pool.set_seed(agent.seed + (7_654_321 if pool is not agent.pool else 0))
+        agent.pool.set_seed(agent.seed)
+        agent.real.set_seed(self.start_seed(len(self.scores)))
+
+    def start_seed(self, episode: int) -> int:
+        """Return the seed of the pool in which an episode is played."""
+        sticky = self.config.protocol == "sticky"
+        return self.config.seed * 10_000 + episode + (7_654_321 if sticky else 0)
 
     def _note_score(self, progress: AtariProgress) -> None:
         """Note the running score at every 1,000th base step of all kinds, and where it ends."""
@@ -334,6 +364,15 @@ class AtariRun:
             "decisions": progress.decisions,
         }
         self.scores.append(row)
+        whole = len(self._decisions) == progress.decisions  # not in one of an older version
+        if whole and progress.score > self.best.get("score", -math.inf):
+            number = len(self.scores) - 1
+            self.best = {
+                "episode": number,
+                "score": progress.score,
+                "decisions": list(self._decisions),
+            }
+        self._decisions.clear()
         print(f"episode {len(self.scores)}: {row}", flush=True)
 
     def _source(self) -> WorkerSource:
@@ -467,6 +506,8 @@ class AtariRun:
             "seconds": self.seconds,
             "scores": list(self.scores),
             "points": list(self.points),
+            "best": self.best,
+            "decisions": list(self._decisions),
             "agent": self.agent.state_dict(),
         }
 
@@ -493,6 +534,8 @@ class AtariRun:
         self.tuned = Tuned(**state_dict["tuned"])
         self.scores = [dict(row) for row in state_dict["scores"]]
         self.points = [(int(x), float(y)) for x, y in state_dict["points"]]
+        self.best = dict(state_dict.get("best", {}))
+        self._decisions = [int(option) for option in state_dict.get("decisions", [])]
         self._frames_before = int(state_dict["frames"])
         self.seconds = float(state_dict["seconds"])
         self._resumed = state_dict["agent"]
@@ -539,20 +582,30 @@ def draw(run: AtariRun, pictures: Pictures) -> None:
         from torchrl_hmcts.trainers.figures.atari_figures import plot_scores
 
         plot_scores(run.scores, path, title=run.config.game)
-    words = "The first minute of an episode, planned with fewer simulations."
-    with pictures.one("episode.gif", words) as path:
+    if not run.best:  # of a run that was begun by an older version
+        return
+    with left_out("episode.gif"):
         from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif
 
-        pool = run.make_pool(run.options.worker, run.tuned.option_steps)
-        recorder = run.make_pool(run.options.worker, run.tuned.option_steps, record=True)
+        recorder = run.make_pool(
+            run.options.worker,
+            run.tuned.option_steps,
+            record=True,
+            sticky=run.config.protocol == "sticky",
+        )
+        recorder.set_seed(run.start_seed(run.best["episode"]))
+        steps = 60 if run.config.toy else 450
         try:
-            search = dataclasses.replace(run.search(), ratio=min(run.config.ratio, 10.0))
-            agent = AtariAgent(pool, search, seed=run.config.seed)
-            steps = 60 if run.config.toy else 450
-            write_atari_gif(agent, recorder, path, real_steps=steps)
+            shown, score = write_atari_gif(
+                recorder, run.best["decisions"], pictures.folder / "episode.gif", real_steps=steps
+            )
         finally:
-            pool.close()
             recorder.close()
+        pictures.captions["episode.gif"] = (
+            f"The best episode (number {run.best['episode'] + 1}), which scored "
+            f"{run.best['score']:g}: its first {shown} base steps of {FRAMES_PER_STEP} frames, "
+            f"with a score of {score:g} up to there."
+        )
 
 
 def _trials(out: Path) -> Path:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, fields
 
 from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.trainers.config import RunConfig, need_package
+from torchrl_hmcts.trainers.experiments.registry import ExperimentError
 
 GUIDES = ("none", "prior", "prior_value")
 PROTOCOLS = ("deterministic", "sticky")
@@ -16,7 +19,7 @@ SOURCES = (
 
 @name_arguments
 @dataclass
-class AtariConfig:
+class AtariConfig(RunConfig):
     """What ``hmcts train experiment=atari`` does.
 
     A base step is 4 frames of the game. All emulated frames count: real, simulated, and those spent
@@ -29,8 +32,6 @@ class AtariConfig:
 
     game: str = "Breakout"
     """The game; needs the extra atari, which brings the games along."""
-    seed: int = 0
-    """Seed of starts, searches and of what is learned."""
     out: str = "runs/atari"
     """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
     protocol: str = "deterministic"
@@ -90,12 +91,42 @@ class AtariConfig:
     replant_every: int = 100
     """Decisions between checkpoints, at which the tree is planted anew so that a resumed run goes
     on exactly."""
-    resume: bool = False
-    """Go on from the newest checkpoint in `out`."""
     toy: bool = False
     """A run of seconds, to see that everything works."""
 
+    FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
+    PATHS = ("out", "options_from")
+
+    @property
+    def KEPT(self) -> tuple[str, ...]:  # type: ignore[override]  # noqa: N802
+        """Keys that a run keeps when it is resumed: all but those that may change on the way."""
+        return tuple(field.name for field in fields(self) if field.name not in self.FREE)
+
+    def check_inputs(self) -> None:
+        """Check what the run needs from outside, before anything is written.
+
+        Raises:
+            ModuleNotFoundError: if the emulator or optuna is needed and not installed.
+            ExperimentError: if there is no such game, or no run of it in ``options_from``.
+        """
+        super().check_inputs()
+        need_package("ale_py")
+        if self.tune_with == "optuna":
+            need_package("optuna")
+        from torchrl_hmcts.envs.atari_emulator import find_game
+
+        try:
+            find_game(self.game)
+        except ValueError as error:
+            raise ExperimentError(str(error)) from None
+        if self.options_from and not os.path.isdir(os.path.join(self.options_from, "checkpoints")):
+            raise ExperimentError(
+                f"options_from={self.options_from} is no run of this experiment: it has no folder "
+                "checkpoints. Name a folder that hmcts train experiment=atari wrote."
+            )
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, value, choices in (
             ("protocol", self.protocol, PROTOCOLS),
             ("source", self.source, SOURCES),

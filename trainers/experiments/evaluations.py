@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.checkpoints import newest_checkpoint, plain_checkpoint
+from torchrl_hmcts.trainers.checkpoints import plain_checkpoint
 from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
@@ -24,6 +24,7 @@ from torchrl_hmcts.trainers.experiments.waterworld_config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
+from torchrl_hmcts.trainers.experiments.worker_file import find_worker
 from torchrl_hmcts.trainers.lab.evaluation import (
     solve_mazes,
     solve_with_wrong_model,
@@ -35,21 +36,23 @@ from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_train
 
 
 def load_networks(loss_module: LossModule, run: str | Path) -> Path:
-    """Give a loss's networks the weights of a run's newest checkpoint, and nothing else of it.
+    """Give a loss's networks the weights of a run's worker, and nothing else of it.
+
+    That is the worker whose figures its page shows, or of a run that has not finished, its newest
+    checkpoint.
 
     Args:
         loss_module: built as in the run; changed in place.
         run: the run's folder.
 
     Returns:
-        The checkpoint.
+        The file they are from.
 
     Raises:
         FileNotFoundError: if the run has written none yet.
         ValueError: if the networks are other ones.
     """
-    folder = Path(run) / "checkpoints"
-    path = newest_checkpoint(folder)
+    path = find_worker(run)
     try:
         plain_checkpoint(loss_module=loss_module).load(path)
     except CheckpointError as error:

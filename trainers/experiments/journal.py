@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,8 @@ _CHECKSUM = "checksum"
 class CheckedJournal(JournalFileBackend):
     """Optuna's journal file, from which a sweep continues, checked when it is opened.
 
-    A last line that a killed process has written half is cut off, and a line on stderr says so.
+    A last line that a killed process has written half is cut off, and a line on stderr says so; the
+    journal as it was is kept beside it, as ``journal.log.damaged``.
 
     Args:
         path: of the file; older ones without checksums are read too.
@@ -64,8 +66,13 @@ class CheckedJournal(JournalFileBackend):
 
 def _check(path: Path) -> None:
     lines = io.BytesIO(path.read_bytes()).readlines()
-    if lines and not lines[-1].endswith(b"\n"):
-        print(f"{path}: its last line is not whole and is left out.", file=sys.stderr)
+    if lines and not (lines[-1].endswith(b"\n") and _is_json(lines[-1])):
+        kept = path.with_name(f"{path.name}.damaged")
+        shutil.copy2(path, kept)
+        print(
+            f"{path}: its last line is not whole and is left out; as it was: {kept.name}.",
+            file=sys.stderr,
+        )
         os.truncate(path, sum(map(len, lines[:-1])))
         lines.pop()
     for number, line in enumerate(lines, 1):
@@ -80,3 +87,11 @@ def _check(path: Path) -> None:
             f"{path} is damaged: line {number} {reason}. Restore it from a backup, or choose "
             "another folder with out=DIR."
         )
+
+
+def _is_json(line: bytes) -> bool:
+    try:
+        json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return True

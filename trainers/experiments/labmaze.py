@@ -19,8 +19,10 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
 from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
+from torchrl_hmcts.trainers.experiments.run import Run, open_run
+from torchrl_hmcts.trainers.experiments.worker_file import save_worker
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import finish, versions
+from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.files import left_out, replacing, write_csv
 from torchrl_hmcts.trainers.lab.evaluation import (
     frames_curve,
@@ -74,21 +76,27 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 4.
     """
+    with open_run(config) as run:
+        return _run_labmaze(run.config, run)
+
+
+def _run_labmaze(config: LabMazeConfig, run: Run) -> dict[str, Any]:
+    """Carry the experiment out in a folder that is open."""
     if config.toy:
         config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
-    out = Path(config.out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = run.path
     begin = time.perf_counter()
     print(f"Learning {config.num_skills} skills in {config.train_frames:,} frames ...", flush=True)
     logger = make_logger(config)
     trained = train_worker(
         config,
-        save_dir=out / "checkpoints",
+        save_dir=run.checkpoints,
         logger=logger,
         progress=lambda total: tqdm(total=total if total < 2**31 - 1000 else None, disable=None),
     )
     logger.close()
+    save_worker(out, trained.loss, trained.worker_step)
     curve = frames_curve(trained.tests, config.frames_per_step, config.max_frames)
     with left_out("curves.csv"):
         head = ("curve", "training_frames", "value")
@@ -109,6 +117,7 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
         "training_frames": trained.steps * config.frames_per_step,
         "training_base_steps": trained.steps,
         "training_rounds": trained.rounds,
+        "worker_training_frames": trained.worker_step * config.frames_per_step,
         "training_cpu_seconds": trained.seconds,
         "test": test,
         "wrong_model": robust,
@@ -117,7 +126,7 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     }
     metrics["seconds"] = round(time.perf_counter() - begin, 1)
     title = "DeepMind Lab's random maze, by planning over learned skills"
-    with finish(out, title, metrics) as pictures:
+    with run.finish(metrics, title=title) as pictures:
         print("Drawing ...", flush=True)
         draw(config, trained, pictures, unsolved=test["unsolved"])
     print(
@@ -128,14 +137,27 @@ def run_labmaze(config: LabMazeConfig) -> dict[str, Any]:
     return metrics
 
 
+def _captions(config: LabMazeConfig, trained: TrainedWorker, solved: bool) -> dict[str, str]:
+    """The captions, which say whether the maze was solved, and which worker is shown."""
+    captions = dict(_PICTURES)
+    if not solved:
+        captions["episode.gif"] = (
+            "A test maze that was NOT solved: the plan, if one was found (pale; colours are "
+            "skills), how far the worker came, and what the player sees."
+        )
+    frames = trained.worker_step * config.frames_per_step
+    captions["skills.png"] += f" The worker of all pictures is that after {frames:,} frames."
+    return captions
+
+
 def draw(
     config: LabMazeConfig,
     trained: TrainedWorker,
     pictures: Pictures,
     *,
     unsolved: list[int] | None = None,
-) -> None:
-    """Draw all figures of a run.
+) -> bool:
+    """Draw all figures of a run; return whether the maze of the GIF was solved.
 
     Args:
         config: of the experiment.
@@ -152,12 +174,17 @@ def draw(
     shown = [i for i in np.argsort(lengths, kind="stable") if i not in (unsolved or ())]
     start = starts[int(shown[int(0.85 * (len(shown) - 1))]) if shown else 0]
     planner = make_planner(config, model)
-    plan, states, options = play_plan(planner, real, start)
-    with _picture(pictures, "episode.gif") as path:
+    plan, states, options, solved = play_plan(planner, real, start)
+    captions = _captions(config, trained, solved)
+
+    def picture(name: str) -> AbstractContextManager[Path]:
+        return pictures.one(name, captions[name])
+
+    with picture("episode.gif") as path:
         from torchrl_hmcts.trainers.figures.lab_figures import write_episode_gif
 
         write_episode_gif(env, states, options, plan, path)
-    with _picture(pictures, "solving.png") as path:
+    with picture("solving.png") as path:
         from torchrl_hmcts.trainers.figures.lab_figures import plot_frames_curves
 
         plot_frames_curves(
@@ -167,39 +194,36 @@ def draw(
             f"{config.curve_mazes} held-out mazes of 9 x 9",
             script=curve_script_frames(config),
         )
-    with _picture(pictures, "skills.png") as path:
+    with picture("skills.png") as path:
         from torchrl_hmcts.trainers.figures.lab_figures import plot_skill_fan
 
         generator = torch.Generator().manual_seed(config.seed)
         sampling = SkillPolicy(trained.loss.actor_network, generator=generator)
         plot_skill_fan(sampling, env, path, num_skills=config.num_skills)
-    with _picture(pictures, "losses.png") as path:
+    with picture("losses.png") as path:
         from torchrl_hmcts.trainers.figures.plots import plot_losses
 
         plot_losses(trained.history, trained.steps, path)
-    with _picture(pictures, "search.png") as path:
+    with picture("search.png") as path:
         from torchrl_hmcts.trainers.figures.lab_figures import plot_search
 
         assert planner.last_search is not None
         plot_search(planner.last_search, env, path)
-    with _picture(pictures, "mazes.png") as path:
+    with picture("mazes.png") as path:
         from torchrl_hmcts.trainers.figures.lab_figures import plot_mazes
 
         plot_mazes(env, path)
-    with _picture(pictures, "view.png") as path, replacing(path) as temporary:
+    with picture("view.png") as path, replacing(path) as temporary:
         import imageio.v3 as iio
 
         view = draw_first_person(env, states[0], width=640, height=480)
         temporary.write_bytes(iio.imwrite("<bytes>", view, extension=".png"))
-
-
-def _picture(pictures: Pictures, name: str) -> AbstractContextManager[Path]:
-    return pictures.one(name, _PICTURES[name])
+    return solved
 
 
 def play_plan(
     planner: MCTSPlanner, real: Any, start: TensorDictBase
-) -> tuple[Plan, list[TensorDictBase], list[int]]:
+) -> tuple[Plan, list[TensorDictBase], list[int], bool]:
     """Plan from a start and carry the plan out; return the state after every base step.
 
     Args:
@@ -208,20 +232,22 @@ def play_plan(
         start: state without batch dimensions.
 
     Returns:
-        The plan, the states ``[T + 1]`` and the options ``[T]`` of the base steps.
+        The plan, the states ``[T + 1]`` and the options ``[T]`` of the base steps, and whether the
+        goal was met.
     """
     plan = planner.plan(start)
-    state, states, options = start, [start.select(*_STATE)], []
+    state, states, options, solved = start, [start.select(*_STATE)], [], False
     for option in plan.options[: int(plan.lengths)]:
         after = real.step(state.clone().set("option", option))["next"]
         duration = int(after["duration"])
         states += list(after["trajectory"][1:duration].select(*_STATE).unbind(0))
         states.append(after.select(*_STATE))
         options += [int(option)] * duration
+        solved = bool(after["terminated"])
         if bool(after["done"]):
             break
         state = after.exclude("trajectory", "reward")
-    return plan, states, options
+    return plan, states, options, solved
 
 
 def _curve_rows(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchrl_hmcts.arguments import name_arguments
-from torchrl_hmcts.trainers.config import check_logger
+from torchrl_hmcts.trainers.config import RunConfig, check_logger, need_package
 
 _ALGORITHMS = ("diayn", "hmcts")
 _COLLECTORS = ("local", "ray")
@@ -15,7 +15,7 @@ BATCH_STEPS = 64  # base steps of a batch of DIAYN's training
 
 @name_arguments
 @dataclass
-class LabMazeConfig:
+class LabMazeConfig(RunConfig):
     """What ``hmcts train experiment=labmaze`` does.
 
     A frame is a 60th of a second of the game. A base step of the worker is ``frames_per_step``
@@ -26,8 +26,6 @@ class LabMazeConfig:
         25
     """
 
-    seed: int = 0
-    """Seed of networks, training, searches, and of starts in the test mazes."""
     out: str = "runs/labmaze"
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     algorithm: str = "diayn"
@@ -86,12 +84,27 @@ class LabMazeConfig:
     collector: str = "local"
     """Where the worker acts for its training: "local" in this process, or "ray" in a process of a
     Ray cluster (with algorithm=diayn; a run then does not go on exactly)."""
-    resume: bool = False
-    """Go on from the newest checkpoint in `out`, if there is one."""
     toy: bool = False
     """A little training and 3 mazes, to see in seconds that everything works."""
 
+    KEPT = (
+        "seed",
+        "toy",
+        "algorithm",
+        "num_skills",
+        "option_frames",
+        "frames_per_step",
+        "updates_per_step",
+        "skill_frames",
+        "init_options",
+        "retrain_interval",
+        "round_expansions",
+        "novelty_radius",
+        "gamma",
+    )
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in (
             "mazes",
             "num_skills",
@@ -148,6 +161,16 @@ class LabMazeConfig:
                 f"of algorithm={self.algorithm!r}. Use more, or fewer init_options or "
                 f"round_expansions."
             )
+
+    def check_inputs(self) -> None:
+        """Check what the run needs from outside, before anything is written.
+
+        Raises:
+            ModuleNotFoundError: if the package of the logger or of the collector is not installed.
+        """
+        super().check_inputs()
+        if self.collector == "ray":
+            need_package("ray")
 
     @property
     def option_steps(self) -> int:

@@ -6,7 +6,8 @@
 ``curves.csv``            its curves, a value a row: name, step, value
 ``log/scalars/*.csv``     the same while it runs
 ``page.json``             title of its page and captions of its pictures
-``checkpoints/``          from which it goes on
+``checkpoints/``          from which it continues
+``worker/``               networks of a finished run, which its page shows, by their step
 ``evaluation.json``       evaluations made later by ``hmcts evaluate``
 ========================  ======================================================================
 """
@@ -22,6 +23,7 @@ from typing import Any
 
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, Experiment
 from torchrl_hmcts.trainers.files import left_out, read_json, write_json
+from torchrl_hmcts.trainers.locking import folder_locked, is_locked
 
 _NAME_COLUMNS = ("name", "curve")
 _STEP_LABELS = {
@@ -96,8 +98,17 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether it came to its end."""
-        return bool(self.metrics)
+        """Whether it came to its end; one that is being extended has not yet."""
+        return bool(self.metrics) and self.status in ("", "finished")
+
+    @property
+    def status(self) -> str:
+        """State that ``run.json`` notes; ``"interrupted"`` if its process ended without noting it.
+
+        Empty if unknown.
+        """
+        status = str(self.record.get("status", ""))
+        return "interrupted" if status == "running" and not is_locked(self.path) else status
 
 
 def read_run(path: str | Path) -> RunFolder:
@@ -144,6 +155,19 @@ def read_run(path: str | Path) -> RunFolder:
         curves,
         damage,
     )
+
+
+def is_run(path: str | Path) -> bool:
+    """Return whether a folder is that of a run or of a sweep.
+
+    Args:
+        path: folder; need not exist.
+
+    Example:
+        >>> is_run("nowhere")
+        False
+    """
+    return any(Path(path, name).is_file() for name in ("run.json", "metrics.json", "sweep.json"))
 
 
 def read_curves(path: Path) -> dict[str, RunCurve]:
@@ -213,7 +237,7 @@ def load_config(run: RunFolder) -> tuple[Experiment, Any]:
 def start_record(
     experiment: str, config: Any, command: Sequence[str], facts: Mapping[str, Any]
 ) -> None:
-    """Write ``run.json`` into the folder of a run that begins, or goes on.
+    """Write ``run.json`` into the folder of a run that begins, or is resumed.
 
     Args:
         experiment: its name.
@@ -222,18 +246,17 @@ def start_record(
         facts: further entries, e.g. versions and machine.
     """
     path = Path(config.out)
-    path.mkdir(parents=True, exist_ok=True)
-    before = _json(path / "run.json", [], config=dict, commands=list)
-    going_on = bool(getattr(config, "resume", False))
-    commands = before.get("commands", []) if going_on else []
+    resumed = getattr(config, "resume", False)
+    before = _json(path / "run.json", [], config=dict, commands=list) if resumed else {}
     values = asdict(config)
-    if going_on and before.get("config"):
-        values["resume"] = before["config"].get("resume", False)
+    # What the command asked for, not what the run is.
+    values |= {key: False for key in ("resume", "overwrite") if key in values}
     values["out"] = shown_path(config.out)
+    commands = [*before.get("commands", []), " ".join(shown_word(word) for word in command)]
     record = {
         "experiment": experiment,
         "config": values,
-        "commands": [*commands, " ".join(shown_word(word) for word in command)],
+        "commands": [line for line in commands if line],
         **facts,
         "status": "running",
     }
@@ -241,15 +264,15 @@ def start_record(
 
 
 def end_record(path: str | Path, status: str) -> None:
-    """Note in ``run.json`` how a run ended.
+    """Note in ``run.json`` how a run ended; one that has finished stays so.
 
     Args:
         path: folder of the run.
-        status: ``"finished"``, ``"stopped"`` or ``"failed"``.
+        status: ``"finished"``, ``"stopped"``, ``"failed"`` or ``"given up"``.
     """
     file = Path(path) / "run.json"
     record = _json(file, [])
-    if record:
+    if record and record.get("status") != "finished":
         with left_out(f"{file.name}'s status"):  # of what is over, e.g. on a full disk
             write_json(file, {**record, "status": status}, checksum=True)
 
@@ -265,12 +288,11 @@ def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
         The file.
     """
     file = Path(path) / "evaluation.json"
-    others = [
-        e
-        for e in _json(file, [], evaluations=list).get("evaluations", [])
-        if e.get("changes") != evaluation.get("changes")
-    ]
-    write_json(file, {"evaluations": [*others, dict(evaluation)]})
+    changes = evaluation.get("changes")
+    with folder_locked(path, name=".evaluation.lock", wait=True):  # two evaluations at a time
+        before = _json(file, [], evaluations=list).get("evaluations", [])
+        others = [e for e in before if e.get("changes") != changes]
+        write_json(file, {"evaluations": [*others, dict(evaluation)]})
     return file
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from torchrl_hmcts.trainers.config import parse_overrides, unknown_key
+from torchrl_hmcts.trainers.config import RunConfig, parse_overrides, read_value, unknown_key
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Range:
     kind: str = "range"
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            raise ValueError(f"{self.key}={self.low}..{self.high} needs two finite ends.")
         if not self.low < self.high:
             raise ValueError(f"{self.key}={self.low}..{self.high} is an empty range.")
         if self.log and not self.low > 0:
@@ -92,6 +95,8 @@ def parse_space(
             raise ValueError(f"{word!r} is no key=value.")
         if key not in types:
             raise ValueError(unknown_key(key, [*types, *others]))
+        if key in ("resume", "overwrite"):
+            raise ValueError(f"{key} is for hmcts train; the same command continues a sweep.")
         if any(dimension.key == key for dimension in dimensions):
             raise ValueError(f"{key} is given twice.")
         if value.startswith("[") and value.endswith("]"):
@@ -112,15 +117,19 @@ def parse_space(
 def _range(key: str, value: str, integer: bool) -> Range:
     ends, _, how = value.partition(":")
     low, _, high = ends.partition("..")
-    number = int if integer else float
     try:
-        step = None if how in ("", "log") else number(how)
-        return Range(key, number(low), number(high), integer, step, how == "log")
-    except ValueError as error:
-        if "could not convert" not in str(error) and "invalid literal" not in str(error):
-            raise
+        low, high, step = (
+            None if text in ("", "log") else read_value(key, text, "int" if integer else "float")
+            for text in (low, high, how)
+        )
+        if low is None or high is None:
+            raise ValueError
+    except ValueError:
         kind = "whole numbers" if integer else "numbers"
         raise ValueError(
             f"{key}={value} is no range of {kind}, e.g. {key}=1..10, {key}=1..10:log or "
             f"{key}=1..10:2 (in steps of 2)."
         ) from None
+    if key == "seed":
+        RunConfig(seed=low), RunConfig(seed=high)  # raise
+    return Range(key, low, high, integer, step, how == "log")

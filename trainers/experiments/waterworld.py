@@ -21,14 +21,16 @@ from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.trainers.a3c import A3CTrainer
 from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.experiments.loggers import make_logger
+from torchrl_hmcts.trainers.experiments.run import Run, open_run
 from torchrl_hmcts.trainers.experiments.waterworld_config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
+from torchrl_hmcts.trainers.experiments.worker_file import save_worker
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import finish, versions
+from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.files import left_out, write_csv
-from torchrl_hmcts.trainers.waterworld.agents import make_maze_networks, play_mazes
+from torchrl_hmcts.trainers.waterworld.agents import MazeTest, make_maze_networks, play_mazes
 from torchrl_hmcts.trainers.waterworld.goal_episodes import run_goal_episodes
 from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
 
@@ -102,11 +104,16 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 3.
     """
+    with open_run(config) as run:
+        return _run_waterworld(run.config, run)
+
+
+def _run_waterworld(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
+    """Carry the experiment out in a folder that is open."""
     if config.toy:
         config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
-    out = Path(config.out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = run.path
     with_goals = isinstance(config, WaterworldGoalsConfig)
     tests = make_agent_env(config, maze_pool("test"))
     starts = make_starts(tests.base_env if with_goals else tests, config.test_mazes, config.seed)
@@ -131,20 +138,21 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
         evaluate=evaluate,
         eval_interval=config.eval_interval,
         logger=logger,
-        save_dir=out / "checkpoints",
+        save_dir=run.checkpoints,
         progress=lambda total: tqdm(total=total, desc="train", unit="step", disable=None),
         seed=config.seed,
     )
-    kept = ("seed", "gamma", "entropy_coeff", "critic_coeff", "hidden", "max_episode_steps")
+    kept = [key for key in config.KEPT if key != "toy"]
     trainer.run_settings.update({name: getattr(config, name) for name in kept})
-    if config.resume:
-        trainer.load(out / "checkpoints")
+    if run.resumes:
+        trainer.load(run.checkpoints)
     name = "the worker of the goal-based agent" if with_goals else "A3C without goals"
     print(f"Training {name}, {config.total_frames:,} base steps ...", flush=True)
     begin = time.perf_counter()
     history = trainer.train()
     train_seconds = time.perf_counter() - begin
     logger.close()
+    save_worker(out, loss, trainer.frames)
     with left_out("curves.csv"):
         write_curves(history, out / "curves.csv")
 
@@ -164,7 +172,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
             metrics["test"][f"{key}_mean"] = round(float(sampled.last[key].double().mean()), 3)
     metrics["config"] = dataclasses.asdict(config)
     metrics["versions"] = versions()
-    with finish(out, f"Random mazes: {name}", metrics) as pictures:
+    with run.finish(metrics, title=f"Random mazes: {name}") as pictures:
         words = "Test mazes solved and base steps of an episode while it learns."
         with pictures.one("learning.png", words) as path:
             from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
@@ -176,7 +184,7 @@ def run_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
                 max_steps=config.max_episode_steps,
             )
         if with_goals:
-            draw_episode(policy, tests, starts, greedy.base_steps, pictures)
+            draw_episode(policy, tests, starts, greedy, pictures)
     print(json.dumps({k: metrics[k] for k in ("train_seconds", "test", "test_greedy")}, indent=1))
     return metrics
 
@@ -185,7 +193,7 @@ def draw_episode(
     policy: TensorDictModuleBase,
     env: EnvBase,
     starts: TensorDictBase,
-    steps: Tensor,
+    test: MazeTest,
     pictures: Pictures,
 ) -> None:
     """Draw a rather long episode of the goal-based agent: Figure 3.5, the search, and a GIF.
@@ -194,13 +202,18 @@ def draw_episode(
         policy: the worker; it takes its most probable actions.
         env: of :func:`make_agent_env`, with goals.
         starts: states ``[S]``.
-        steps: int64 ``[S]``, base steps of the episodes from them.
+        test: what it did from them; an episode that was solved is drawn if there is one.
         pictures: of the run.
     """
-    index = int(steps.argsort()[int(0.85 * (len(steps) - 1))])
+    among = torch.nonzero(test.solved).flatten() if test.solved.any() else torch.arange(len(starts))
+    by_length = among[test.base_steps[among].argsort(stable=True)]
+    index = int(by_length[int(0.85 * (len(by_length) - 1))])
     start = starts[index]
     track = run_goal_episodes(env, policy, starts[index : index + 1], record=True).tracks[0]
     words = "A test maze: the player (blue) on its way along the goals (red) to the target (green)."
+    if not track.solved:
+        steps = len(track.positions) - 1
+        words = words.replace("maze", f"maze that was NOT solved in {steps} base steps")
     with pictures.one("episode.gif", words) as path:
         from torchrl_hmcts.trainers.figures.goal_figures import write_goal_gif
 

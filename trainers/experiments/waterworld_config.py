@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchrl_hmcts.arguments import name_arguments
-from torchrl_hmcts.trainers.config import NUM_TEST_MAZES, check_logger
+from torchrl_hmcts.trainers.config import NUM_TEST_MAZES, RunConfig, check_logger
 
 
 @name_arguments
 @dataclass
-class WaterworldA3CConfig:
+class WaterworldA3CConfig(RunConfig):
     """What ``hmcts train experiment=waterworld_a3c`` does; each field is a key.
 
     Example:
@@ -18,12 +18,8 @@ class WaterworldA3CConfig:
         2000000
     """
 
-    seed: int = 0
-    """Seed of networks, learners, and the starts and targets in the test mazes."""
     out: str = "runs/waterworld_a3c"
     """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
-    resume: bool = False
-    """Go on from the newest checkpoint in the folder."""
     total_frames: int = 2_000_000
     """Base steps of training, all learners together (the source's T_max)."""
     num_learners: int = 2
@@ -57,7 +53,18 @@ class WaterworldA3CConfig:
     toy: bool = False
     """Seconds instead of minutes: 4,000 base steps and 3 mazes, to see that everything works."""
 
+    KEPT = (
+        "seed",
+        "toy",
+        "gamma",
+        "entropy_coeff",
+        "critic_coeff",
+        "hidden",
+        "max_episode_steps",
+    )
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in (
             "total_frames",
             "envs_per_learner",
@@ -70,9 +77,8 @@ class WaterworldA3CConfig:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
-        for name in ("seed", "num_learners"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative; got {getattr(self, name)}.")
+        if self.num_learners < 0:
+            raise ValueError(f"num_learners must not be negative; got {self.num_learners}.")
         for name in ("learning_rate", "clip_norm"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")

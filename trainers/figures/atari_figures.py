@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
+from tensordict import TensorDict
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv
-from torchrl_hmcts.trainers.atari.agent import AtariAgent
 from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.pictures import save_figure
 
@@ -40,30 +41,35 @@ def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: s
 
 
 def write_atari_gif(
-    agent: AtariAgent, recorder: AtariOptionPool, path: Path, *, real_steps: int = 450
-) -> None:
-    """Play the beginning of an episode and write what the screen shows.
+    recorder: AtariOptionPool, options: Sequence[int], path: Path, *, real_steps: int = 450
+) -> tuple[int, float]:
+    """Carry the options of an episode out once more and write what the screen shows.
 
     Args:
-        agent: plays in the pool it plans in; its episode begins anew.
-        recorder: a pool of the same options with ``record=True``: what the agent plays in.
+        recorder: a pool with ``record=True``, seeded as the one in which they were carried out.
+        options: of the episode's decisions, in their order.
         path: GIF to write.
         real_steps: base steps to show at most.
+
+    Returns:
+        How many base steps are shown, and their score.
     """
     env = AtariRAMEnv(recorder.game, repeat_action_probability=0.0)
     pictures = []
-    agent.real = recorder
-    agent.begin()
-    while not agent.progress.done and agent.progress.real_steps < real_steps:
-        assert agent.state is not None
-        before = agent.state
-        agent.play(1)
-        assert agent.last_step is not None
-        td = env.reset(before.squeeze(0).select("emulator_state"), set_state=True)
-        for i in range(int(agent.last_step["duration"])):
-            td = env.step(td.set("action", agent.last_step["inner_action"][0, i]))["next"]
+    shown, score = 0, 0.0
+    state = recorder.reset(TensorDict(batch_size=[1]))
+    for option in options:
+        after = recorder.step(state.clone().set("option", torch.tensor([option])))["next"]
+        td = env.reset(state.squeeze(0).select("emulator_state"), set_state=True)
+        for i in range(int(after["duration"])):
+            td = env.step(td.set("action", after["inner_action"][0, i]))["next"]
             if i % _EVERY == 0:
                 pictures.append(env.render())
+        shown, score = shown + int(after["duration"]), score + float(after["score"].sum())
+        state = after.select("emulator_state", "ram", "observation", strict=False)
+        if shown >= real_steps or bool(after["done"].any()):
+            break
     seconds = _EVERY * recorder.frame_skip / 60.0
     frames = [p.repeat(2, axis=1) for p in pictures]  # a console's pixels are wide
     write_gif(frames, path, milliseconds=1000.0 * seconds, last=None)
+    return shown, score

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
+from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, is_run, read_run
 from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS, panel
+from torchrl_hmcts.trainers.figures.foreign_files import refuse_foreign
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
 from torchrl_hmcts.trainers.figures.page_parts import (
     Html,
@@ -105,7 +106,8 @@ def write_comparison(folders: Sequence[str | Path], out: str | Path) -> Path:
         The file.
 
     Raises:
-        ValueError: if one is no folder of a run, or one is given twice.
+        ValueError: if one is no folder of a run, one is given twice, or ``out`` is a run's folder
+            or a file that this package did not write.
     """
     paths = [Path(folder) for folder in folders]
     resolved = [path.resolve() for path in paths]
@@ -115,6 +117,9 @@ def write_comparison(folders: Sequence[str | Path], out: str | Path) -> Path:
     file = Path(out)
     if file.suffix.lower() not in (".html", ".htm"):
         file = file / "index.html"
+        if is_run(file.parent):
+            raise ValueError(f"out={out} is the folder of a run, whose page is index.html.")
+    refuse_foreign(file)
     file.parent.mkdir(parents=True, exist_ok=True)
     runs = [read_run(path) for path in paths]
     say_damage(*runs)
@@ -270,7 +275,7 @@ def _runs(runs: Sequence[RunFolder]) -> Html:
             [
                 run.name,
                 str(run.seed),
-                run.record.get("status", "finished" if run.finished else "unknown"),
+                run.status or ("finished" if run.finished else "unknown"),
                 Html(f"<code>{text(' ; '.join(run.record.get('commands', [])) or '-')}</code>"),
                 ", ".join(f"{name} {version}" for name, version in versions.items()),
                 f"{machine['cpus']} CPUs, {machine['platform']}" if machine else "-",

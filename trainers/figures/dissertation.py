@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
+from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, is_run, read_run
+from torchrl_hmcts.trainers.figures.foreign_files import refuse_foreign, stamp
 from torchrl_hmcts.trainers.files import write_text
 
 _LAB_RUNS = "hmcts train experiment=labmaze seed={seed} out=runs/labmaze_{seed}"
@@ -256,13 +257,19 @@ def draw_figure(
 
     Raises:
         MissingData: if what it is drawn from is not there.
-        ValueError: if the name is unknown, or a folder is none of a run.
+        ValueError: if the name is unknown, a folder is none of a run, or a file that was not drawn
+            by this package would be replaced.
     """
     figure = find_figure(name)
     sources = Sources(tuple(read_run(folder) for folder in folders), results)
     Path(out).mkdir(parents=True, exist_ok=True)
     path = Path(out) / figure.file
-    return Drawn(figure, path, figure.draw(sources, path, figure.name))
+    refuse_foreign(path)
+    if figure.ending == ".html" and not path.exists() and path.with_suffix(".md").exists():
+        refuse_foreign(path.with_suffix(".md"))  # the table beside the page
+    caption = figure.draw(sources, path, figure.name)
+    stamp(path)
+    return Drawn(figure, path, caption)
 
 
 def draw_all(
@@ -280,6 +287,11 @@ def draw_all(
     """
     from torchrl_hmcts.trainers.figures.page_parts import Html, page, picture, section, text
 
+    file = Path(out) / "index.html"
+    for path in (file, *(Path(out) / figure.file for figure in FIGURES.values())):
+        refuse_foreign(path)
+    if is_run(out):
+        raise ValueError(f"out={out} is the folder of a run, whose page is index.html.")
     parts, lacking = [], []
     for figure in FIGURES.values():
         title = figure.name.replace("table", "Table ")
@@ -296,6 +308,5 @@ def draw_all(
             parts.append(section(title, there, Html(link)))
         else:
             parts.append(section(title, there, picture(drawn.path, drawn.caption, embed=True)))
-    file = Path(out) / "index.html"
     write_text(file, page("The dissertation's figures, drawn of this package", *parts))
     return file, lacking

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts import __version__
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, read_run
+from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, is_run, read_run
+from torchrl_hmcts.trainers.figures.foreign_files import refuse_foreign
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.files import left_out, write_json, write_text
 
@@ -111,11 +112,16 @@ def write_run_page(path: str | Path, out: str | Path | None = None) -> Path:
         The file.
 
     Raises:
-        ValueError: if it is no folder of a run.
+        ValueError: if it is no folder of a run, or ``out`` is the page of another run or a file
+            that this package did not write.
     """
     run = read_run(path)
     say_damage(run)
     file = run.path / "index.html" if out is None else Path(out)
+    if out is not None and file.name == "index.html" and is_run(file.parent):
+        if not file.parent.samefile(run.path):
+            raise ValueError(f"{file} is the page of another run. Choose another place with out=.")
+    refuse_foreign(file)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_text(file, render_run(run, embed=out is not None))
     return file

@@ -74,6 +74,9 @@ def _tables(metrics: Mapping[str, Any], prefix: str) -> list[Html]:
         if is_spread(value):
             others = ", ".join(f"{k} {plain(v)}" for k, v in value.items() if k != "mean")
             rows.append((key, Html(f"{text(value['mean'])} <small>{text(others)}</small>")))
+        elif name == "unsolved" and isinstance(value, list):  # which mazes, not how many
+            rows.append((key, len(value)))
+            rows.append(("indices of the unsolved mazes", value))
         elif isinstance(value, Mapping):
             inner += _tables(value, f"{prefix}{name}.")
         elif _are_records(value):
@@ -160,8 +163,8 @@ def made_by(run: RunFolder) -> Html:
     machine = run.record.get("machine") or {}
     if machine:
         facts.append(("machine", f"{machine.get('cpus')} CPUs, {machine.get('platform')}"))
-    if run.record.get("status"):
-        facts.append(("status", run.record["status"]))
+    if run.status:
+        facts.append(("status", run.status))
     return Html(commands + (table(facts) if facts else ""))
 
 
@@ -170,7 +173,7 @@ def _lead(run: RunFolder) -> str:
     if run.seed is not None:
         words.append(f"seed {run.seed}")
     if not run.finished:
-        words.append("not finished")
+        words.append(f"not finished ({run.status})" if run.status else "not finished")
     if run.config.get("toy"):
         words.append("toy size: shows that everything works, not what can be reached")
     return ", ".join(words)

@@ -41,20 +41,6 @@ from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform
 
 _CURVE_EXPANSIONS = 300  # of a search while the worker learns
-_KEPT = (  # by a run that goes on
-    "seed",
-    "algorithm",
-    "num_skills",
-    "option_frames",
-    "frames_per_step",
-    "updates_per_step",
-    "skill_frames",
-    "init_options",
-    "retrain_interval",
-    "round_expansions",
-    "novelty_radius",
-    "gamma",
-)
 
 
 @dataclass
@@ -62,8 +48,9 @@ class TrainedWorker:
     """A worker and how it became what it is.
 
     ``loss`` with its networks; ``history`` of all logged curves; ``tests`` in held-out mazes;
-    ``steps`` base steps of training, simulated ones included; ``rounds`` of Algorithm 3;
-    ``seconds`` of the processor, tests included.
+    ``steps`` base steps of training, simulated ones included; ``worker_step``, those that the
+    networks have seen that are kept; ``rounds`` of Algorithm 3; ``seconds`` of the processor, tests
+    included.
     """
 
     loss: DiscreteSkillSACLoss
@@ -72,6 +59,7 @@ class TrainedWorker:
     steps: int
     rounds: int
     seconds: float
+    worker_step: int
 
     @property
     def policy(self) -> SkillPolicy:
@@ -102,12 +90,14 @@ def train_worker(
     loss = make_worker_loss(config.num_skills, seed=config.seed)
     make = _make_hmcts if config.algorithm == "hmcts" else _make_diayn
     trainer, tests = make(config, loss, save_dir, progress, logger)
-    trainer.run_settings.update({name: getattr(config, name) for name in _KEPT})
+    kept = [key for key in config.KEPT if key != "toy"]
+    trainer.run_settings.update({name: getattr(config, name) for name in kept})
     if config.resume and save_dir is not None and any(Path(save_dir).glob("checkpoint-*")):
         trainer.load(save_dir)
     trainer.train()
+    step = trainer.collected_frames
     if isinstance(tests, CurveTests) and config.keep == "best":
-        tests.restore_best()
+        step = tests.restore_best()
     return TrainedWorker(
         loss,
         Curves(trainer.history),
@@ -115,6 +105,7 @@ def train_worker(
         trainer.collected_frames,
         len(trainer.records) if isinstance(trainer, HMCTSTrainer) else 0,
         round(time.process_time() - begin, 1),
+        step,
     )
 
 
@@ -211,7 +202,8 @@ class CurveTests:
     """Tries the worker in held-out mazes while a ``DIAYNTrainer`` trains it, for Figure 4.10.
 
     Random numbers of the training are not touched. The networks that solved the most mazes are
-    kept, of several the latest: skills go on changing, and the last ones need not be the best.
+    kept, of several the latest: skills keep changing, and the last ones need not be the best. Those
+    of the test before the training are never kept: they are no learned skills.
 
     Args:
         trainer: whose loss has the actor.
@@ -223,7 +215,7 @@ class CurveTests:
         self.trainer, self.config, self.interval = trainer, config, interval
         self.records = RoundRecords()
         self._at = -1  # base steps at the latest test
-        self._best: dict[str, Any] = {}  # "solved", how many, and the "loss" that did
+        self._best: dict[str, Any] = {}  # "solved", how many, the "loss" that did, and its "step"
         worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
         mazes = held_out_seeds(config.curve_mazes, first=CURVE_SEED)
         self.model, self.real = (make_maze_env(config, worker, mazes, 9) for _ in range(2))
@@ -246,10 +238,11 @@ class CurveTests:
             results = plan_and_carry_out(planner, self.real, self.starts)
         self.records.add(results, np.arange(len(results.solved)), steps)
         solved = int(results.solved.sum())
-        if solved >= self._best.get("solved", 0):
+        if steps > 0 and solved >= self._best.get("solved", 0):
             state = self.trainer.loss_module.state_dict()
             self._best = {
                 "solved": solved,
+                "step": steps,
                 "loss": {name: value.clone() for name, value in state.items()},
             }
         logger = self.trainer.logger
@@ -262,13 +255,15 @@ class CurveTests:
             logger.log_scalar("test_solved", float(results.solved.mean()), step=steps)
             logger.log_scalar("test_frames", float(frames.mean()), step=steps)
 
-    def restore_best(self) -> None:
-        """Give the loss back the networks that solved the most mazes.
+    def restore_best(self) -> int:
+        """Give the loss back the networks that solved the most mazes; return their base steps.
 
-        Those of the end stay where nothing is known of them, in a run from before they were kept.
+        Those of the end stay where nothing is known of others, in a run of an older version.
         """
-        if self._best:
-            self.trainer.loss_module.load_state_dict(self._best["loss"])
+        if not self._best:
+            return self.trainer.collected_frames
+        self.trainer.loss_module.load_state_dict(self._best["loss"])
+        return int(self._best["step"])
 
     def state_dict(self) -> dict[str, Any]:
         return {"at": self._at, "records": self.records.state_dict(), "best": self._best}
@@ -276,4 +271,5 @@ class CurveTests:
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         self._at = int(state_dict["at"])
         self.records.load_state_dict(state_dict["records"])
-        self._best = dict(state_dict.get("best", {}))
+        best = dict(state_dict.get("best", {}))
+        self._best = best if "step" in best else {}  # an older version may have kept the untrained

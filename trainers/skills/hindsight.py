@@ -5,6 +5,8 @@ Letters: C copies, T base steps of each, *B batch of the tensordict, b batch of 
 
 from __future__ import annotations
 
+from operator import index
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -139,7 +141,7 @@ class HindsightTransitions:
             )
         self.every, self.horizon, self.gamma = every, horizon, gamma
         self.touch = touch
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(index(seed))
 
     def sample(self, batch_size: int) -> TensorDict:
         """Return at most ``batch_size`` transitions ``[b]``, none of which begins at its target.

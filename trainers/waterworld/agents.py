@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,7 @@ def make_maze_networks(
     num_actions = int(env.action_spec.space.n)
 
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(index(seed))
         logits = MazeNetwork(size, num_actions, hidden=hidden, half_size=half_size)
         value = MazeNetwork(size, 1, hidden=hidden, half_size=half_size)
     with torch.no_grad():
@@ -167,7 +168,7 @@ def play_mazes(
     steps = torch.zeros(count, dtype=torch.int64)
     last: list[TensorDictBase] = []
     with torch.random.fork_rng(devices=[]), set_exploration_type(mode):
-        torch.manual_seed(seed)
+        torch.manual_seed(index(seed))
         while len(state):
             transition = env.step(policy(state))
             if watch is not None:

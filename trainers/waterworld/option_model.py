@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from operator import index
 from typing import Any
 
 import torch
@@ -146,7 +147,7 @@ def relabel_targets(data: TensorDictBase, *, gamma: float, seed: int) -> TensorD
     """
     after, _start = data["next"], data["position"]
     path, there = after["trajectory", "next", "position"], after["trajectory", "mask"]
-    target, usable = _draw_targets(data, torch.Generator().manual_seed(seed))
+    target, usable = _draw_targets(data, torch.Generator().manual_seed(index(seed)))
     touches = ((path - target.unsqueeze(1)).norm(dim=-1) < _TOUCH) & there  # [N, T]
     hit = (touches.any(-1) & usable).unsqueeze(-1)
     first = touches.to(torch.int8).argmax(-1)
