@@ -39,6 +39,7 @@ from torchrl_hmcts.trainers.experiments.atari import (  # noqa: E402
 )
 from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig  # noqa: E402
 from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif  # noqa: E402
+from torchrl_hmcts.trainers.figures.pictures import Pictures  # noqa: E402
 
 TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)], fire=1)
 
@@ -243,7 +244,9 @@ def test_the_gif_is_the_episode_that_scored(tmp_path, protocol) -> None:
     recorder.close()
     assert score == run.best["score"]  # played again to its end: the same score
     assert shown * 4 == run.scores[best]["real_frames"]
-    assert f"which scored {score:g}" in draw(run, tmp_path)["episode.gif"]
+    pictures = Pictures(tmp_path)
+    draw(run, pictures)
+    assert f"which scored {score:g}" in pictures.captions["episode.gif"]
 
 
 @pytest.mark.parametrize("guide", ["none", "prior_value"])

@@ -245,7 +245,7 @@ def test_an_unknown_game_names_the_nearest_ones():
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"frame_skip": 0}, "frame_skip is an int >= 1; got 0"),
+        ({"frame_skip": 0}, "frame_skip is an int >= 1 and < 2\\*\\*31; got 0"),
         ({"repeat_action_probability": 1.0}, r"in \[0, 1\)"),
         ({"mode": 99}, "mode is one of"),
         ({"reward_clip": 0.0}, "reward_clip"),

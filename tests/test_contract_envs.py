@@ -26,6 +26,7 @@ from torchrl_hmcts.envs import (
     GridworldMazeEnv,
     LabMazeEnv,
     RepeatActions,
+    SettableGymEnv,
     StatelessSimulator,
     WaterworldMazeEnv,
 )
@@ -228,4 +229,4 @@ def test_no_env_that_is_exported_is_left_out() -> None:
     envs = {c for c in exported if isinstance(c, type) and issubclass(c, EnvBase)}
     made = [*MACRO_ENVS.values(), *ATARI_ENVS.values(), LAB]
     covered = {make.func if isinstance(make, functools.partial) else make for make in made}
-    assert envs == covered | {OptionModelEnv, StatelessSimulator}  # see test_planning_envs
+    assert envs == covered | {OptionModelEnv, StatelessSimulator, SettableGymEnv}  # have tests

@@ -320,6 +320,11 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(["AtariOptionPool", "AtariRAMEnv", "DeepMindLabEnv"], "starts processes"),
     "StatelessSimulator": "takes an env, and has its own tests",
     **dict.fromkeys(
+        ["AttributeSnapshot", "ReplaySnapshot", "SettableGymEnv", "Snapshot", "SnapshotError"],
+        "takes a Gymnasium env: test_settable_gym.py",
+    ),
+    "SkillRewardHook": "hands its arguments to SkillReward",
+    **dict.fromkeys(
         ["ByteGoal", "FollowGoals", "JoinedWorkers", "OccasionalAction"], "belongs to an Atari game"
     ),
     **dict.fromkeys(
@@ -345,7 +350,7 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(["ContinuousDIAYNLoss"], "SkillSACLoss with a discriminator"),
     **dict.fromkeys(["NStepReturn"], "the arguments of TorchRL's ValueEstimatorBase"),
     **dict.fromkeys(["OptionModelEnv", "TorchRLGymnasiumEnv"], "reads another env's specs first"),
-    **dict.fromkeys(["CollectorError", "LearnerError"], "an exception"),
+    **dict.fromkeys(["CollectorError", "FolderInUse", "LearnerError"], "an exception"),
     **dict.fromkeys(["DurableRotation"], "takes a folder: test_fault_checkpoints.py"),
     **dict.fromkeys(["ResumableTrainer"], "the base of the trainers, which are fuzzed"),
     **dict.fromkeys(

@@ -19,12 +19,15 @@ from torchrl_hmcts.trainers.experiments.run import open_run
 from torchrl_hmcts.trainers.experiments.run_folder import end_record, read_run
 from torchrl_hmcts.trainers.experiments.worker_file import find_worker, save_worker
 from torchrl_hmcts.trainers.figures.report import write_run_page
+from torchrl_hmcts.trainers.files import read_json, write_json
 from torchrl_hmcts.trainers.waterworld.worker import make_training_env
 
 
 def finish(out: Path, metrics: dict[str, Any], **captions: str) -> str:
     with open_run(DemoConfig(out=str(out))) as run:
-        return run.finish(metrics, title="A run", pictures=captions).read_text()
+        with run.finish(metrics, title="A run") as pictures:
+            pictures.captions.update(captions)
+        return (run.path / "index.html").read_text(encoding="utf-8")
 
 
 def lead(page: str) -> str:
@@ -50,15 +53,16 @@ def test_the_page_of_a_run_that_ended_otherwise_says_how(tmp_path: Path, status:
     with pytest.raises(error):
         end()
     if status == "interrupted":  # by SIGKILL: nobody noted it
-        record = json.loads((tmp_path / "run.json").read_text())
-        (tmp_path / "run.json").write_text(json.dumps({**record, "status": "running"}))
+        record = read_json(tmp_path / "run.json")
+        write_json(tmp_path / "run.json", {**record, "status": "running"}, checksum=True)
     assert f"not finished ({status})" in lead(write_run_page(tmp_path).read_text())
 
 
 def test_a_failure_after_the_end_leaves_the_run_finished(tmp_path: Path) -> None:
     def end() -> None:
         with open_run(DemoConfig(out=str(tmp_path))) as run:
-            run.finish({"solved": 1}, title="", pictures={})
+            with run.finish({"solved": 1}, title=""):
+                pass
             raise OSError("the disk is full")
 
     with pytest.raises(OSError, match="full"):
@@ -112,7 +116,8 @@ def test_a_run_that_has_not_finished_shows_its_newest_checkpoint(tmp_path: Path)
         rotation = DurableRotation(run.checkpoints)
         newest = rotation.save(plain_checkpoint(loss_module=make_loss(1)), step=128)
         assert find_worker(run.path) == newest
-        run.finish({"solved": 1}, title="", pictures={})
+        with run.finish({"solved": 1}, title=""):
+            pass
     assert find_worker(tmp_path).name == "worker-000000000064.torchrl"
     find_worker(tmp_path).write_bytes(b"damaged")
     assert find_worker(tmp_path) == newest
@@ -181,6 +186,7 @@ class TestEvaluations:
             "torchrl_hmcts.trainers.experiments.evaluations.evaluate_demo",
             lambda config: {"test": {"frames": float("nan"), "solved": np.int64(3)}},
         )
+        capsys.readouterr()
         assert main(["evaluate", f"run={tmp_path}", "seed=2"]) == 0
         printed = capsys.readouterr().out.partition("\nFigures:")[0]
         for text in (printed, (tmp_path / "evaluation.json").read_text()):

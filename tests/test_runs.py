@@ -48,7 +48,8 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[DemoConfig]:
             found.append(run.config)
             run.checkpoints.mkdir(exist_ok=True)
             (run.checkpoints / "checkpoint-000000000064.torchrl").write_text(str(config.seed))
-            run.finish({"seed": config.seed, "solved": 1}, title="A demo", pictures={})
+            with run.finish({"seed": config.seed, "solved": 1}, title="A demo"):
+                pass
         return {}
 
     monkeypatch.setattr(DEMO, run_demo)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import os
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -227,3 +229,25 @@ def test_attributes_that_the_restored_state_lacks_are_removed() -> None:
     snapshot.note_step(0)
     snapshot.restore(row)
     assert not hasattr(env.unwrapped, "later")
+
+
+class Malicious:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (self.folder,)
+
+
+def test_a_row_that_somebody_else_wrote_executes_nothing(tmp_path: Path) -> None:
+    env = gymnasium.make("CartPole-v1")
+    snapshot = AttributeSnapshot(env)
+    env.unwrapped.x_threshold = Malicious(str(tmp_path / "made"))  # type: ignore[attr-defined]
+    snapshot.note_step(0)
+    row = snapshot.read()
+    snapshot.note_step(0)
+    with pytest.raises(SnapshotError, match="mkdir, which is no class of this env"):
+        snapshot.restore(row)
+    assert not (tmp_path / "made").exists()

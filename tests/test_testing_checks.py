@@ -213,7 +213,7 @@ def test_a_transform_of_data_is_checked_on_data() -> None:
 
     class Plus(Transform):
         def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-            return tensordict.set("plus", tensordict["state"] + 1)
+            return tensordict.copy().set("plus", tensordict["state"] + 1)
 
     places = ["no_env", "compose", "model", "replay_buffer"]
     check_transform(Plus, ChainEnv, data=data, data_writes=["plus"], checks=places)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.snapshots import AttributeSnapshot, SnapshotError
+from torchrl_hmcts.envs.gym.snapshots import AttributeSnapshot, RowUnpickler, SnapshotError
 
 _UNMOVED = frozenset({"wall", "floor", "goal", "lava"})
 _CHANGES = 1_024  # bytes for cells and objects that differ from the reference
@@ -85,7 +86,8 @@ class MiniGridSnapshot(AttributeSnapshot):
         for clock, steps in zip(self._clocks, clocks, strict=True):
             clock["_elapsed_steps"] = steps
         self._load_attributes(whole[first + second :])
-        changed, objects = pickle.loads(whole[first : first + second])
+        changes = io.BytesIO(whole[first : first + second])
+        changed, objects = RowUnpickler(changes, self._fixed).load()
         grid = self.env.unwrapped.grid.grid  # type: ignore[attr-defined]
         grid[:] = self._cells
         for i, number in changed:

@@ -34,8 +34,8 @@ class Snapshot(ABC):
     """Reads the whole state of one env into a row of bytes, and restores it.
 
     A row of one instance fits every instance that was made in the same way, in another process
-    too. It holds pickled data where the env's state is Python objects: restore only rows of your
-    own.
+    too. Where the state is Python objects, a row holds them pickled; only arrays, containers and
+    classes of the env's own packages are read, so that no row can execute anything else.
 
     Args:
         env (gymnasium.Env): the env with its wrappers. It is reset with seed 0, so that instances
@@ -239,8 +239,8 @@ class AttributeSnapshot(Snapshot):
     def _load_attributes(self, content: bytes) -> None:
         """Sets the attributes of all layers."""
         stream = io.BytesIO(content)
-        values, generators, with_others = pickle.load(stream)
-        others = _Unpickler(stream, self._fixed).load() if with_others else [{}] * len(values)
+        values, generators, with_others = RowUnpickler(stream, self._fixed).load()
+        others = RowUnpickler(stream, self._fixed).load() if with_others else [{}] * len(values)
         parts = zip(self._layers, values, others, generators, strict=True)
         for number, (layer, plain, other, generator) in enumerate(parts):
             now = vars(layer)
@@ -310,6 +310,13 @@ class AttributeSnapshot(Snapshot):
         return f"The state of {self.env} cannot be stored: {error}."
 
 
+_NUMPY = frozenset(
+    "ndarray dtype _reconstruct scalar _frombuffer __generator_ctor __bit_generator_ctor "
+    "__randomstate_ctor PCG64 MT19937 Philox SFC64 PCG64DXSM SeedSequence "
+    "__pyx_unpickle_SeedSequence".split()
+)
+
+
 class _Kept:
     """Marks an attribute that was no state when the row was read: it stays as it is."""
 
@@ -349,10 +356,41 @@ def _has_a_path(obj: Any) -> bool:
     return isinstance(obj, (type, types.FunctionType, types.BuiltinFunctionType))
 
 
-class _Unpickler(pickle.Unpickler):
+_SAFE = frozenset(
+    {
+        *(("builtins", name) for name in ("set", "frozenset", "bytearray", "complex", "range")),
+        *(("collections", name) for name in ("deque", "OrderedDict", "defaultdict", "Counter")),
+        ("copyreg", "_reconstructor"),
+        ("builtins", "object"),
+        ("builtins", "slice"),
+        ("random", "Random"),
+    }
+)
+
+
+_LIBRARIES = frozenset({"builtins", "types", "numpy", "os", "subprocess", "functools"})
+
+
+class RowUnpickler(pickle.Unpickler):
+    """Reads a row: plain data, NumPy's, and classes of the packages that the env is made of."""
+
     def __init__(self, content: io.BytesIO, fixed: list[Any]) -> None:
         super().__init__(content)
         self._fixed = fixed
+
+    def find_class(self, module: str, name: str) -> Any:
+        package = module.partition(".")[0]
+        numbers = package == "numpy" and name in _NUMPY
+        own = {type(item).__module__.partition(".")[0] for item in self._fixed} - _LIBRARIES
+        if not (numbers or (module, name) in _SAFE or package in own):
+            raise SnapshotError(
+                f"The row holds {module}.{name}, which is no class of this env. It was not written "
+                "by a snapshot of such an env."
+            )
+        found = super().find_class(module, name)
+        if package in own and not isinstance(found, type):
+            raise SnapshotError(f"The row calls {module}.{name}, which is no class.")
+        return found
 
     def persistent_load(self, number: int) -> Any:
         return _KEPT if number < 0 else self._fixed[number]

@@ -6,7 +6,6 @@ Letters: T steps of an episode.
 from __future__ import annotations
 
 import multiprocessing
-import pickle
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -134,7 +133,11 @@ def _elsewhere(make_env: Callable[[], EnvBase], *work: Any) -> tuple[NestedKey, 
     ours, theirs = context.Pipe()
     process = context.Process(
         target=_replay_there,
-        args=(theirs, CloudpickleWrapper(make_env), pickle.dumps(work)),  # no shared memory
+        args=(
+            theirs,
+            CloudpickleWrapper(make_env),
+            CloudpickleWrapper(lambda: work),
+        ),  # no shared memory
         daemon=True,
     )
     process.start()
@@ -150,9 +153,11 @@ def _elsewhere(make_env: Callable[[], EnvBase], *work: Any) -> tuple[NestedKey, 
     return answer  # type: ignore[no-any-return]
 
 
-def _replay_there(connection: Any, make_env: Callable[[], EnvBase], work: bytes) -> None:
+def _replay_there(
+    connection: Any, make_env: Callable[[], EnvBase], work: Callable[[], Any]
+) -> None:
     try:
-        connection.send(_replay(make_env(), *pickle.loads(work)))
+        connection.send(_replay(make_env(), *work()))
     except Exception as error:
         connection.send(error)
 

@@ -246,6 +246,7 @@ def start_record(
         facts: further entries, e.g. versions and machine.
     """
     path = Path(config.out)
+    path.mkdir(parents=True, exist_ok=True)
     resumed = getattr(config, "resume", False)
     before = _json(path / "run.json", [], config=dict, commands=list) if resumed else {}
     values = asdict(config)

@@ -5,15 +5,14 @@ The page of the run shows them, and ``hmcts evaluate`` tests them.
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
 from torchrl.objectives import LossModule
 
-from torchrl_hmcts.trainers.checkpoints import find_damage, plain_checkpoint
+from torchrl_hmcts.trainers.checkpoints import find_damage, newest_checkpoint, plain_checkpoint
 from torchrl_hmcts.trainers.experiments.run_folder import read_run
-from torchrl_hmcts.trainers.resume import newest_checkpoint
+from torchrl_hmcts.trainers.files import replacing
 from torchrl_hmcts.trainers.stopping import unbroken
 
 _NAME = re.compile(r"worker-(\d+)\.torchrl")
@@ -33,10 +32,9 @@ def save_worker(run: str | Path, loss_module: LossModule, step: int) -> Path:
     folder = Path(run) / "worker"
     folder.mkdir(exist_ok=True)
     path = folder / f"worker-{step:012d}.torchrl"
-    half = folder / f".{path.name}.writing-{os.getpid()}"
     with unbroken():
-        plain_checkpoint(loss_module=loss_module).save(half)
-        os.replace(half, path)
+        with replacing(path) as temporary:
+            plain_checkpoint(loss_module=loss_module).save(temporary)
         for other in folder.iterdir():
             if other != path and _NAME.fullmatch(other.name):
                 other.unlink()
