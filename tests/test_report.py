@@ -197,7 +197,6 @@ def test_a_comparison_shows_means_intervals_and_every_run(tmp_path) -> None:
         (["nothing-here"], "no folder of a run"),
         (["figur=3.1"], "Did you mean: figure"),
         (["results=x", "{run}"], "results=DIR is for figure=NAME"),
-        (["{run}", "{run}"], "given twice"),
     ],
 )
 def test_what_report_cannot_do_is_said(tmp_path, capsys, words, message) -> None:

@@ -281,10 +281,9 @@ def to_yaml(component: type) -> str:
     fields = [f for f in dataclasses.fields(config_of(component)) if f.name != "_partial_"]
     for field in sorted(fields, key=lambda f: f.name.startswith("_")):
         if field.name in meanings:
-            indents = {"initial_indent": "# ", "subsequent_indent": "# "}
-            parts.append(textwrap.fill(meanings[field.name], 98, **indents))
-        made = field.default_factory is not dataclasses.MISSING
-        value = field.default_factory() if made else field.default
+            parts.append(textwrap.indent(textwrap.fill(meanings[field.name], 96), "# "))
+        factory = field.default_factory
+        value = field.default if factory is dataclasses.MISSING else factory()
         parts.append(OmegaConf.to_yaml({field.name: value}).rstrip())
     return "\n".join(parts) + "\n"
 

@@ -80,7 +80,7 @@ def _handle(signum: int, frame: FrameType | None) -> None:
 
 def _say(words: str) -> None:
     """Say it once; not by ``print``, whose buffer the signal may have interrupted."""
-    if not _state.told:
+    if not _state.told and sys.__stderr__ is not None:
         _state.told = True
         with contextlib.suppress(OSError, ValueError):
             os.write(sys.__stderr__.fileno(), f"\n{words} ...\n".encode())

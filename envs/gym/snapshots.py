@@ -109,7 +109,7 @@ _FIXED_TYPES = (
     types.ModuleType,
     type,
 )
-_ATOMS = frozenset({int, float, str, bool, bytes, type(None)})
+_ATOMS: frozenset[type] = frozenset({int, float, str, bool, bytes, type(None)})
 _NO_OBJECTS = frozenset({*_ATOMS, list, dict, tuple, np.ndarray, np.dtype})
 _FIXED, _PLAIN, _OTHER = range(3)
 
@@ -580,7 +580,8 @@ def snapshot_of(env: gymnasium.Env, snapshot: Any = None, *, cap: int = DEFAULT_
     """
     if snapshot is None:
         kind = next(kind for kind in _kinds() if kind.fits(env))
-        return kind(env, cap=cap) if issubclass(kind, AttributeSnapshot) else kind(env)
+        room = {"cap": cap} if issubclass(kind, AttributeSnapshot) else {}
+        return kind(env, **room)
     if isinstance(snapshot, tuple) and len(snapshot) == 2 and all(map(callable, snapshot)):
         return FunctionSnapshot(env, *snapshot)
     made = snapshot(env) if callable(snapshot) else snapshot
@@ -591,7 +592,7 @@ def snapshot_of(env: gymnasium.Env, snapshot: Any = None, *, cap: int = DEFAULT_
     return made
 
 
-def _kinds() -> tuple[type[Snapshot], ...]:
+def _kinds() -> tuple[Any, ...]:
     """The kinds of snapshots, special ones first."""
     from torchrl_hmcts.envs.gym.atari import ALESnapshot
     from torchrl_hmcts.envs.gym.box2d import Box2DSnapshot

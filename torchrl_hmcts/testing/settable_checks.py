@@ -88,7 +88,8 @@ def _record(
     """Random episodes, and the steps at which their states are to be restored."""
     generator = torch.Generator().manual_seed(seed)
     env.set_seed(seed)
-    episodes, left = [], num_states
+    episodes: list[tuple[list[TensorDictBase], list[int]]] = []
+    left = num_states
     while left > 0:
         with seeded(seed + len(episodes)):
             episode = [step.clone() for step in env.rollout(2 * num_steps).unbind(-1)]

@@ -59,8 +59,8 @@ def check_worker(
     """
     name = type(worker).__name__
     with during(name, "as the worker of an OptionTransform"):
-        options = OptionTransform(worker, num_options, 1, skill_key=skill_key)
-        TransformedEnv(env, options, auto_unwrap=False)
+        transform = OptionTransform(worker, num_options, 1, skill_key=skill_key)
+        TransformedEnv(env, transform, auto_unwrap=False)
     states = _states(env, num_options)
     options = torch.arange(states.batch_size.numel()).reshape(states.batch_size) % num_options
     given = states.clone().set(skill_key, options.to(states.device or "cpu"))

@@ -311,8 +311,8 @@ class OptionTransform(Transform):
         self, fit: WorkerEnv, root: TensorDictBase, after: TensorDictBase, taken: int
     ) -> bool:
         if self.termination is None and len(fit.done_keys) == 1:
-            return after.get(fit.done_keys[0]).item()
-        return self._ended(fit, root, after, taken).item()
+            return bool(after.get(fit.done_keys[0]))
+        return bool(self._ended(fit, root, after, taken))
 
     def _run_locked(
         self,

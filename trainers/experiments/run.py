@@ -239,7 +239,7 @@ def _check_folder(config: Any, experiment: str) -> None:
     run = None
     with contextlib.suppress(ValueError):
         run = read_run(path)
-        if not (run.experiment or run.metrics):  # nothing in it can be read: whose it is nobody knows
+        if not (run.experiment or run.metrics):  # nothing in it can be read
             run = None
     if overwrite and run is not None:
         return

@@ -116,11 +116,13 @@ def parse_space(
 
 def _range(key: str, value: str, integer: bool) -> Range:
     ends, _, how = value.partition(":")
-    low, _, high = ends.partition("..")
+    first, _, last = ends.partition("..")
+    low: Any
+    high: Any
     try:
         low, high, step = (
             None if text in ("", "log") else read_value(key, text, "int" if integer else "float")
-            for text in (low, high, how)
+            for text in (first, last, how)
         )
         if low is None or high is None:
             raise ValueError

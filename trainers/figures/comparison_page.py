@@ -99,21 +99,17 @@ def write_comparison(folders: Sequence[str | Path], out: str | Path) -> Path:
     """Write the page that compares runs; it holds all its pictures.
 
     Args:
-        folders: of the runs, two or more.
+        folders: of the runs; one that is given twice counts once.
         out: file to write, or a folder for ``index.html``.
 
     Returns:
         The file.
 
     Raises:
-        ValueError: if one is no folder of a run, one is given twice, or ``out`` is a run's folder
-            or a file that this package did not write.
+        ValueError: if one is no folder of a run, or ``out`` is a run's folder or a file that this
+            package did not write.
     """
-    paths = [Path(folder) for folder in folders]
-    resolved = [path.resolve() for path in paths]
-    for path, where in zip(paths, resolved, strict=True):
-        if resolved.count(where) > 1:
-            raise ValueError(f"{path} is given twice.")
+    paths = list({path.resolve(): path for path in map(Path, folders)}.values())
     file = Path(out)
     if file.suffix.lower() not in (".html", ".htm"):
         file = file / "index.html"

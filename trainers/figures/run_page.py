@@ -68,7 +68,8 @@ def result_tables(metrics: Mapping[str, Any]) -> Html:
 
 def _tables(metrics: Mapping[str, Any], prefix: str) -> list[Html]:
     """The table of a group, and those of the groups in it; ``prefix`` ends with a dot."""
-    rows, inner = [], []
+    rows: list[tuple[Any, Any]] = []
+    inner: list[Html] = []
     for name, value in metrics.items():
         key = Html(f'<span title="{text(prefix + name)}">{text(name.replace("_", " "))}</span>')
         if is_spread(value):
