@@ -18,7 +18,7 @@ import types
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import numpy as np
@@ -31,11 +31,10 @@ from numba.core.caching import (
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
-F = TypeVar("F", bound=Callable[..., Any])
 _DIGEST = hashlib.sha256().digest_size
 
 
-def njit(**options: Any) -> Callable[[F], F]:
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function and keeps the code for other processes.
 
     The code is kept in the first of these folders that can be written: ``NUMBA_CACHE_DIR``,
@@ -59,11 +58,11 @@ def njit(**options: Any) -> Callable[[F], F]:
         1.5
     """
 
-    def compiled(function: F) -> F:
+    def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
         if isinstance(dispatcher, Dispatcher):  # NUMBA_DISABLE_JIT gives the function back
             with contextlib.suppress(Exception):  # e.g. no folder at all
-                dispatcher._cache = _CodeCache(dispatcher)  # type: ignore[attr-defined]
+                dispatcher._cache = _CodeCache(dispatcher)
         return dispatcher
 
     return compiled
