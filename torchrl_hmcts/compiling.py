@@ -62,7 +62,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         dispatcher = numba.njit(**options)(function)
         if isinstance(dispatcher, Dispatcher):  # NUMBA_DISABLE_JIT gives the function back
             with contextlib.suppress(Exception):  # e.g. no folder at all
-                dispatcher._cache = _CodeCache(dispatcher)
+                dispatcher._cache = _CodeCache(dispatcher)  # type: ignore[attr-defined]
         return dispatcher
 
     return compiled
