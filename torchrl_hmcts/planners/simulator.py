@@ -64,10 +64,11 @@ class Simulator:
             raise ValueError(
                 f"MCTSPlanner needs an env it can set to any state; {name} cannot "
                 f"(_supports_set_state={env._supports_set_state}, "
-                f"batch_locked={env.batch_locked}). Use one that is stateless, e.g. "
-                f"WaterworldMazeEnv() or GridworldMazeEnv(), or one whose reset(td, "
-                f"set_state=True) restores the state in td. If all that its step reads is in the "
-                f"tensordict already, say so by StatelessSimulator(env)."
+                f"batch_locked={env.batch_locked}). Make a Gymnasium env by "
+                f"SettableGymEnv(its id). Of others use one that is stateless, e.g. "
+                f"WaterworldMazeEnv(), or one whose reset(td, set_state=True) restores the state "
+                f"in td. If all that its step reads is in the tensordict already, declare it by "
+                f"StatelessSimulator(env)."
             )
         if len(env.action_keys) != 1:
             raise ValueError(
