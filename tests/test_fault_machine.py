@@ -422,6 +422,45 @@ def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> No
 
 
 @linux
+@pytest.mark.parametrize(("number", "pipes"), [(24, 3), (14, 14)], ids=["pool", "a3c"])
+def test_each_process_counts_two_descriptors_before_any_is_started(
+    number: int, pipes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import resource
+
+    open_files = len(os.listdir("/proc/self/fd"))
+    needed = 2 * number + pipes + 16  # to start one
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (open_files + needed, 4096))
+    processes.need_descriptors(number, pipes)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (open_files + needed - 1, 4096))
+    with pytest.raises(OSError, match=f"it needs {needed} more files, and {needed - 1} are left"):
+        processes.need_descriptors(number, pipes)
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
+def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
+    limited = (
+        "import os, resource\n"
+        "from torchrl_hmcts import processes\n"
+        "check = processes.need_descriptors\n"
+        "def limit(number, pipes):\n"
+        "    few = len(os.listdir('/proc/self/fd')) + 2 * number + pipes + 16\n"
+        "    resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
+        "    check(number, pipes)\n"
+        "import torchrl_hmcts.envs.atari_process as a\n"
+        "import torchrl_hmcts.trainers.asynchronous.learner_processes as b\n"
+        "a.need_descriptors = b.need_descriptors = limit\n"
+    )
+    imports, attempt = code.split("try:\n")
+    attempt = attempt.replace("except Exception", "    print('done')\nexcept Exception")
+    words = [sys.executable, "-c", f"{imports}{limited}try:\n{attempt}"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "done\n", done
+
+
+@linux
 @pytest.mark.parametrize("length", [10, pytest.param(90, marks=pytest.mark.slow), 200])
 def test_the_forkserver_has_a_socket_whatever_the_temporary_folder(
     tmp_path: Path, length: int

@@ -25,6 +25,7 @@ _SOCKET_NAME = len("/listener-12345678")
 _SOCKET_FOLDERS = ("", "/tmp", "/var/tmp", "/dev/shm")
 _LONGEST_LOOK_AWAY = 2.0  # seconds
 _PR_SET_PDEATHSIG = 1
+_TO_START = 16  # files: the ends of pipes of a process that starts, two servers, what it reads
 
 
 def start_context(method: str) -> Any:
@@ -127,18 +128,21 @@ def system_errors(what: str) -> Iterator[None]:
         ) from error
 
 
-def need_descriptors(number: int) -> None:
-    """Raise at once if this process may not open so many more files.
+def need_descriptors(processes: int, pipes: int) -> None:
+    """Raise at once if this process may not open the files that it takes to start others.
+
+    Multiprocessing keeps two ends of pipes for each process that it has started.
 
     Args:
-        number: of files, pipes included.
+        processes: number to start.
+        pipes: ends of pipes that this process keeps besides.
 
     Raises:
         OSError: with ``errno.EMFILE``; :func:`system_errors` says the fix.
 
     Example:
         >>> from torchrl_hmcts.processes import need_descriptors
-        >>> need_descriptors(3)
+        >>> need_descriptors(2, pipes=3)
     """
     try:
         import resource
@@ -147,6 +151,7 @@ def need_descriptors(number: int) -> None:
         left = limit - len(os.listdir("/proc/self/fd"))
     except (ImportError, OSError):  # not Linux
         return
+    number = 2 * processes + pipes + _TO_START
     if left < number:
         why = f"it needs {number} more files, and {left} are left"
         raise OSError(errno.EMFILE, why)
