@@ -38,9 +38,10 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 HMCTS = """
-import random, sys
+import random, sys, torch
 import numpy
-random.seed(0), numpy.random.seed(0)  # saved, though no experiment draws from them
+for seed in (random.seed, numpy.random.seed, torch.manual_seed):
+    seed(0)  # saved, though nothing that counts is drawn from them
 from torchrl_hmcts.trainers import a3c, resume
 for module in (a3c, resume):
     module.FIRST_SAVE_SECONDS, module.SAVE_SECONDS = 0.3, 1.0
