@@ -131,10 +131,15 @@ class Life:
             status = self.process.wait(SECONDS)
         except subprocess.TimeoutExpired:
             status = 1000  # it hangs
-        deadline = time.monotonic() + 12.0
+        deadline = time.monotonic() + 20.0
         while self.children() and time.monotonic() < deadline:
             time.sleep(0.1)
         self.left = self.children()
+        for pid in self.left:
+            with contextlib.suppress(OSError):
+                words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[-2][:200]
+                stat = Path(f"/proc/{pid}/stat").read_text().split()
+                print(f"left: {words!r} {stat[2]} after {stat[13]} ticks", file=sys.stderr)
         for pid in [self.process.pid] * (status == 1000) + self.left:
             os.kill(pid, signal.SIGKILL)
         return status
