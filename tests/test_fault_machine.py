@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import errno
 import os
 import pickle
 import shutil
@@ -369,6 +370,18 @@ try:
 except Exception as error:
     print(type(error).__name__, error)
 """
+BUFFER = """
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl_hmcts.arguments import name_arguments
+@name_arguments
+class Trainer:
+    def __init__(self):
+        self.buffers = [ReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(9)]
+try:
+    Trainer()
+except Exception as error:
+    print(type(error).__name__, error)
+"""
 NETWORK = """
 from torchrl_hmcts.envs import SharedMLP
 try:
@@ -384,9 +397,10 @@ except Exception as error:
     [
         pytest.param(A3C, marks=pytest.mark.slow),
         pytest.param(POOL, marks=pytest.mark.slow),
+        pytest.param(BUFFER, marks=pytest.mark.slow),
         NETWORK,
     ],
-    ids=["a3c", "pool", "network"],
+    ids=["a3c", "pool", "buffer", "network"],
 )
 def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) -> None:
     done = python(
@@ -419,6 +433,26 @@ def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> No
     assert done.stdout.startswith("OSError"), done
     assert "ulimit -n" in done.stdout
     assert time.monotonic() - begin < 60.0  # the imports included
+
+
+@linux
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (BlockingIOError(errno.EAGAIN, "unavailable"), "This user may have 8 processes"),
+        (EOFError("unexpected EOF"), "The process that starts the others has ended"),
+    ],
+    ids=["spawn", "forkserver"],
+)
+def test_too_few_processes_are_named_with_their_limit(
+    error: Exception, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import resource
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (8, 8))
+    with pytest.raises(OSError, match=words) as raised, processes.system_errors("it cannot start"):
+        raise error
+    assert "8 processes and threads (`ulimit -u`)" in str(raised.value)
 
 
 @linux

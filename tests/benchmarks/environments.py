@@ -268,7 +268,7 @@ def _last(said: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="*", help="situations, by name; default: all")
+    parser.add_argument("--only", nargs="*", help="situations, by name; the others stay")
     parser.add_argument("--actions", nargs="*", default=ACTIONS, choices=ACTIONS)
     parser.add_argument(
         "--out",
@@ -293,13 +293,18 @@ def main() -> None:
     situations: dict[str, Any] = {
         s.what: {"skipped": s.lacking()} if s.lacking() else {} for s in chosen
     }
+    if arguments.only and arguments.out.exists():
+        situations = {**json.loads(arguments.out.read_text())["situations"], **situations}
     with ThreadPoolExecutor(2) as pool:
         for (situation, action), found in zip(tried, pool.map(one, tried), strict=True):
             situations[situation.what][action] = found
+    seconds = round(time.time() - begin, 1)
+    if arguments.only and arguments.out.exists():
+        seconds = json.loads(arguments.out.read_text())["wall_seconds"]
     record = {
         "command": "python tests/benchmarks/environments.py",
         "python": platform.python_version(),
-        "wall_seconds": round(time.time() - begin, 1),
+        "wall_seconds": seconds,
         "situations": situations,
     }
     arguments.out.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")

@@ -159,7 +159,8 @@ def newest_step(folder: Path) -> int:
 def compared(folder: Path, run: Run) -> dict[str, Any]:
     """What a finished run found, without what a clock measured."""
     if not run.continued:
-        return dict(_trial(path) for path in sorted(folder.glob("trial_*")))
+        trials = [path.parent for path in folder.glob("trial_*/metrics.json")]
+        return {"number of trials": len(trials), **dict(_trial(path) for path in trials)}
     found: dict[str, Any] = {
         "metrics": _timeless(json.loads((folder / "metrics.json").read_text()))
     }

@@ -61,9 +61,9 @@ def run_experiment(
     except FileNotFoundError as error:
         if error.errno is None:  # there is no checkpoint to go on from
             return fail(name, error)
-        return fail(name, f"{error}. Choose another folder with out=DIR.")
+        return fail(name, _with_advice(error))
     except OSError as error:  # e.g. a folder that cannot be written
-        return fail(name, f"{error}. Choose another folder with out=DIR.")
+        return fail(name, _with_advice(error))
     except (ExperimentError, FloatingPointError, ImportError) as error:
         return fail(name, error)
     except KeyboardInterrupt as error:
@@ -117,3 +117,11 @@ def missing(error: ModuleNotFoundError) -> int:
         file=sys.stderr,
     )
     return 1
+
+
+def _with_advice(error: OSError) -> str:
+    """Another folder helps where a file could not be written, not where the system lacks more."""
+    text = str(error).rstrip(".")
+    if any(word in text for word in ("/dev/shm", "ulimit", "TMPDIR")):
+        return f"{text}."
+    return f"{text}. Choose another folder with out=DIR."
