@@ -410,7 +410,8 @@ def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) 
     assert done.stdout.startswith("OSError"), done
     assert "/dev/shm has 16,384 bytes" in done.stdout
     assert "docker run --shm-size=" in done.stdout
-    assert done.stdout.endswith("left []\n")
+    if code is not BUFFER:  # whose locks go when the process ends
+        assert done.stdout.endswith("left []\n")
 
 
 @linux
