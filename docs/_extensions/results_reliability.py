@@ -46,7 +46,7 @@ def _what_happens(row: dict[str, dict[str, Any]]) -> str:
     for action, tried in row.items():
         if "says" in tried:
             key = (
-                tried["says"][:300].replace("`", "'").replace("|", "/"),
+                tried["says"][:450].replace("`", "'").replace("|", "/"),
                 tried["result"] == "works",
             )
             said.setdefault(key, []).append(_TRIED[action])

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import itertools
 import json
 import os
 import random
@@ -203,6 +204,9 @@ class Victim:
     def __init__(self, name: str, kills: int, folder: Path, seed: int) -> None:
         self.run, self.wanted, self.folder = RUNS[name], kills, folder
         self.rng = random.Random(seed)
+        ways = ["SIGKILL", "SIGTERM", *["child"] * self.run.children]
+        self.rng.shuffle(ways)
+        self.ways = itertools.cycle(ways)
         self.log = folder / "log.txt"
         self.result: dict[str, Any] = dict.fromkeys(
             ("kills", "by_SIGKILL", "by_SIGTERM", "by_child", "lives", "finished"), 0
@@ -281,7 +285,7 @@ class Victim:
                 until = time.monotonic() + self.rng.uniform(0.0, 1.5)
             while not life.over and time.monotonic() < until:
                 time.sleep(0.01)
-            how = self.rng.choice(["SIGKILL", "SIGTERM", *["child"] * self.run.children])
+            how = next(self.ways)
             children = life.children()
             if life.over:
                 return killed
