@@ -393,7 +393,11 @@ class ResumableTrainer(Trainer):
         folder = getattr(self.checkpoint_rotation, "directory", None)
         with folder_locked(folder) if folder else nullcontext(), patient():
             try:
-                super().train()
+                if self.collected_frames < self.total_frames:
+                    super().train()
+                else:  # a run that was stopped once its training had ended
+                    self._shutdown_hook()
+                    self.collector.shutdown()
             except KeyboardInterrupt:
                 with unbroken():
                     self._shutdown_hook()
