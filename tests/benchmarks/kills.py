@@ -1,6 +1,6 @@
 """Kills runs of every experiment at random moments and compares them with runs left alone.
 
-    python tests/benchmarks/kills.py --kills 60             (about 8 minutes on two cores)
+    python tests/benchmarks/kills.py --kills 60             (about 12 minutes on two cores)
     python tests/benchmarks/kills.py --runs demo atari --kills 8
 
 Experiments of the command line are started by their words and continued by ``hmcts train
