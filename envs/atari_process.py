@@ -265,7 +265,7 @@ class EmulatorProcesses:
                 self._start()
 
     def _start(self) -> None:
-        need_descriptors(self.num_processes + 10)
+        need_descriptors(self.num_processes, pipes=3)
         theirs: list[Any] = []
         ours: list[Any] = []
         try:

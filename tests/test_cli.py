@@ -84,3 +84,20 @@ def test_the_demo_lists_its_keys_with_their_meaning(capsys) -> None:
 
 def test_an_experiment_is_found_by_name() -> None:
     assert find_experiment("labmaze").name == "labmaze"
+
+
+@pytest.mark.parametrize(
+    ("message", "helps"),
+    [
+        ("[Errno 28] No space left on device: 'runs/a'", True),
+        ("A3CTrainer cannot start: /dev/shm has 16,384 bytes: make room.", False),
+        ("This process may open 64 files (`ulimit -n`): raise that.", False),
+    ],
+)
+def test_another_folder_is_advised_only_where_it_helps(message: str, helps: bool) -> None:
+    from torchrl_hmcts.trainers.command_line.running import _with_advice
+
+    advised = _with_advice(OSError(message), "hmcts train resume=runs/a")
+    advice = "Continue with: hmcts train resume=runs/a, or choose another folder with out=DIR."
+    assert advised.endswith(advice) == helps
+    assert ".." not in advised

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import errno
 import os
 import pickle
 import shutil
@@ -369,6 +370,18 @@ try:
 except Exception as error:
     print(type(error).__name__, error)
 """
+BUFFER = """
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl_hmcts.arguments import name_arguments
+@name_arguments
+class Trainer:
+    def __init__(self):
+        self.buffers = [ReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(9)]
+try:
+    Trainer()
+except Exception as error:
+    print(type(error).__name__, error)
+"""
 NETWORK = """
 from torchrl_hmcts.envs import SharedMLP
 try:
@@ -384,9 +397,10 @@ except Exception as error:
     [
         pytest.param(A3C, marks=pytest.mark.slow),
         pytest.param(POOL, marks=pytest.mark.slow),
+        pytest.param(BUFFER, marks=pytest.mark.slow),
         NETWORK,
     ],
-    ids=["a3c", "pool", "network"],
+    ids=["a3c", "pool", "buffer", "network"],
 )
 def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) -> None:
     done = python(
@@ -396,7 +410,8 @@ def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) 
     assert done.stdout.startswith("OSError"), done
     assert "/dev/shm has 16,384 bytes" in done.stdout
     assert "docker run --shm-size=" in done.stdout
-    assert done.stdout.endswith("left []\n")
+    if code is not BUFFER:  # whose locks go when the process ends
+        assert done.stdout.endswith("left []\n")
 
 
 @linux
@@ -419,6 +434,65 @@ def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> No
     assert done.stdout.startswith("OSError"), done
     assert "ulimit -n" in done.stdout
     assert time.monotonic() - begin < 60.0  # the imports included
+
+
+@linux
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (BlockingIOError(errno.EAGAIN, "unavailable"), "This user may have 8 processes"),
+        (EOFError("unexpected EOF"), "The process that starts the others has ended"),
+    ],
+    ids=["spawn", "forkserver"],
+)
+def test_too_few_processes_are_named_with_their_limit(
+    error: Exception, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import resource
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (8, 8))
+    with pytest.raises(OSError, match=words) as raised, processes.system_errors("it cannot start"):
+        raise error
+    assert "8 processes and threads (`ulimit -u`)" in str(raised.value)
+
+
+@linux
+@pytest.mark.parametrize(("number", "pipes"), [(24, 3), (14, 14)], ids=["pool", "a3c"])
+def test_each_process_counts_two_descriptors_before_any_is_started(
+    number: int, pipes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import resource
+
+    open_files = len(os.listdir("/proc/self/fd"))
+    needed = 2 * number + pipes + 16  # to start one
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (open_files + needed, 4096))
+    processes.need_descriptors(number, pipes)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (open_files + needed - 1, 4096))
+    with pytest.raises(OSError, match=f"it needs {needed} more files, and {needed - 1} are left"):
+        processes.need_descriptors(number, pipes)
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
+def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
+    limited = (
+        "import os, resource\n"
+        "from torchrl_hmcts import processes\n"
+        "check = processes.need_descriptors\n"
+        "def limit(number, pipes):\n"
+        "    few = len(os.listdir('/proc/self/fd')) + 2 * number + pipes + 16\n"
+        "    resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
+        "    check(number, pipes)\n"
+        "import torchrl_hmcts.envs.atari_process as a\n"
+        "import torchrl_hmcts.trainers.asynchronous.learner_processes as b\n"
+        "a.need_descriptors = b.need_descriptors = limit\n"
+    )
+    imports, attempt = code.split("try:\n")
+    attempt = attempt.replace("except Exception", "    print('done')\nexcept Exception")
+    words = [sys.executable, "-c", f"{imports}{limited}try:\n{attempt}"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "done\n", done
 
 
 @linux

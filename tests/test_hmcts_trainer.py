@@ -118,6 +118,18 @@ def weights(trainer: HMCTSTrainer) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in trainer.loss_module.parameters()])
 
 
+def test_a_run_that_is_resumed_after_its_training_has_ended_trains_no_further(
+    tmp_path: Path,
+) -> None:
+    settings: dict[str, Any] = {"rounds": 10_000, "total_frames": 60, "save_dir": tmp_path}
+    whole = make_trainer(**settings)
+    whole.train()
+    again = make_trainer(**settings).load(tmp_path)
+    again.train()
+    assert again.collected_frames == whole.collected_frames >= 60
+    assert torch.equal(weights(again), weights(whole))
+
+
 def recorded_dataset(size: int = 40) -> TensorDict:
     trainer = make_trainer(rounds=size, num_init_samples=size)
     trainer.train()

@@ -274,3 +274,21 @@ def test_a_generator_that_is_missing_is_named() -> None:
 
 if __name__ == "__main__":
     resume_in_this_process(Path(sys.argv[1]))
+
+
+def test_a_checkpoint_holds_nothing_of_the_memory_that_the_buffer_has_not_filled(
+    tmp_path: Path,
+) -> None:
+    trainer = make_trainer(32, save_dir=tmp_path)  # of 128 rows
+
+    def leave_something(batch: Any) -> None:  # as another object does
+        for tensor in trainer.replay_buffer.storage._storage[32:].values(True, True):
+            tensor.copy_(torch.ones_like(tensor))
+
+    trainer.register_op("pre_steps_log", leave_something)
+    trainer.train()
+    stored, again = (
+        t.replay_buffer.storage._storage for t in (trainer, make_trainer(32).load(tmp_path))
+    )
+    assert (again[:32] == stored[:32]).all()
+    assert not any(tensor.any() for tensor in again[32:].values(True, True))

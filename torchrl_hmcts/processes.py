@@ -25,6 +25,8 @@ _SOCKET_NAME = len("/listener-12345678")
 _SOCKET_FOLDERS = ("", "/tmp", "/var/tmp", "/dev/shm")
 _LONGEST_LOOK_AWAY = 2.0  # seconds
 _PR_SET_PDEATHSIG = 1
+_PAGES_OF_LOCKS = 65536  # bytes
+_TO_START = 16  # files: the ends of pipes of a process that starts, two servers, what it reads
 
 
 def start_context(method: str) -> Any:
@@ -127,18 +129,45 @@ def system_errors(what: str) -> Iterator[None]:
         ) from error
 
 
-def need_descriptors(number: int) -> None:
-    """Raise at once if this process may not open so many more files.
+def no_room_for_locks(owner: str, error: Exception) -> OSError | None:
+    """Return an error that names /dev/shm, if it was too full for a lock or a counter.
 
     Args:
-        number: of files, pipes included.
+        owner: what could not be built.
+        error: the system's, which names no file: no file has been opened.
+
+    Returns:
+        The error to raise instead; None if /dev/shm has room, or the error is another.
+
+    Example:
+        >>> from torchrl_hmcts.processes import no_room_for_locks
+        >>> no_room_for_locks("the example", OSError(2, "No such file")) is None
+        True
+    """
+    if not isinstance(error, OSError) or error.errno != errno.ENOSPC or error.filename is not None:
+        return None
+    with contextlib.suppress(OSError):
+        if shutil.disk_usage("/dev/shm").free < _PAGES_OF_LOCKS and "/dev/shm" not in str(error):
+            what = f"{owner} cannot have the shared memory of its locks: {error.strerror}. "
+            return OSError(errno.ENOSPC, what + _advice(errno.ENOSPC))
+    return None
+
+
+def need_descriptors(processes: int, pipes: int) -> None:
+    """Raise at once if this process may not open the files that it takes to start others.
+
+    Multiprocessing keeps two ends of pipes for each process that it has started.
+
+    Args:
+        processes: number to start.
+        pipes: ends of pipes that this process keeps besides.
 
     Raises:
         OSError: with ``errno.EMFILE``; :func:`system_errors` says the fix.
 
     Example:
         >>> from torchrl_hmcts.processes import need_descriptors
-        >>> need_descriptors(3)
+        >>> need_descriptors(2, pipes=3)
     """
     try:
         import resource
@@ -147,6 +176,7 @@ def need_descriptors(number: int) -> None:
         left = limit - len(os.listdir("/proc/self/fd"))
     except (ImportError, OSError):  # not Linux
         return
+    number = 2 * processes + pipes + _TO_START
     if left < number:
         why = f"it needs {number} more files, and {left} are left"
         raise OSError(errno.EMFILE, why)
@@ -177,8 +207,19 @@ def _advice(number: int) -> str:
             soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
             text = f"This process may open {soft} files (`ulimit -n`, at most {hard})"
         return f"{text}: raise that, e.g. `ulimit -n 4096`, or use fewer processes."
-    if number == errno.EAGAIN:
-        return "Raise the number of processes that this user may have (`ulimit -u`), or use fewer."
+    if number in (errno.EAGAIN, errno.ECHILD):
+        limit: int | str = "a limited number of"
+        with contextlib.suppress(ImportError, AttributeError):
+            import resource
+
+            soft = resource.getrlimit(resource.RLIMIT_NPROC)[0]
+            limit = "any number of" if soft == resource.RLIM_INFINITY else soft
+        ended = "The process that starts the others has ended, with the error printed above. "
+        return (
+            f"{ended if number == errno.ECHILD else ''}This user may have {limit} processes and "
+            "threads (`ulimit -u`): raise that, give the container more memory, or use fewer "
+            "processes."
+        )
     folder = os.environ.get("TMPDIR") or tempfile.tempdir or "not set"
     return (
         f"Look at the temporary folder (TMPDIR: {folder}), the memory and the limits "

@@ -375,7 +375,7 @@ class DurableRotation(CheckpointRotation):
         return (
             f"the checkpoint of step {step} could not be written to {str(self.directory)!r} "
             f"({error.strerror or error}; {free} free). Kept: {', '.join(kept) or 'none'}. Make "
-            "room, or choose another save_dir, and continue with trainer.load(save_dir)"
+            "room there, load the newest and continue; or choose another folder for checkpoints"
         )
 
 

@@ -224,6 +224,19 @@ class HistoryState:
             self.trainer._log_dict[key] = values.tolist()
 
 
+class _BufferAdapter(PlainStateAdapter):
+    """Writes a replay buffer; rows without an entry are zeros, not what the memory held before."""
+
+    def save(
+        self, component: Any, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]
+    ) -> Any:
+        storage = component.storage
+        rows = getattr(storage, "_storage", None)
+        if isinstance(rows, torch.Tensor | TensorDictBase) and storage.ndim == 1:
+            rows[len(storage) :].zero_()
+        return super().save(component, path, args=args, kwargs=kwargs)
+
+
 class ResumableTrainer(Trainer):
     """A TorchRL ``Trainer`` that resumes exactly, and stops before it learns from NaN.
 
@@ -304,7 +317,7 @@ class ResumableTrainer(Trainer):
         checkpoint, buffer = (trainer_kwargs.get(k) for k in ("checkpoint", "replay_buffer"))
         if checkpoint is not None and buffer is not None and "replay_buffer" not in checkpoint:
             # A buffer's own dump() writes a pickle beside the tensors; its state dict needs none.
-            checkpoint.register("replay_buffer", buffer, adapter=PlainStateAdapter())
+            checkpoint.register("replay_buffer", buffer, adapter=_BufferAdapter())
         super().__init__(**trainer_kwargs)
         self._save_at = math.inf  # time at which a checkpoint is due
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
@@ -380,7 +393,11 @@ class ResumableTrainer(Trainer):
         folder = getattr(self.checkpoint_rotation, "directory", None)
         with folder_locked(folder) if folder else nullcontext(), patient():
             try:
-                super().train()
+                if self.collected_frames < self.total_frames:
+                    super().train()
+                else:  # a run that was stopped once its training had ended
+                    self._shutdown_hook()
+                    self.collector.shutdown()
             except KeyboardInterrupt:
                 with unbroken():
                     self._shutdown_hook()

@@ -11,38 +11,59 @@ def kills(data: dict[str, Any]) -> str:
     rows = []
     for name, run in data.get("runs", {"DIAYN": data}).items():
         same = run.get("same_figures", run.get("same_bits_as_the_unbroken_run"))
-        lost = [run.get(key, 0) for key in ("not_continued", "went_back", "checkpoints_lost")]
+        lost = ("not_continued", "went_back", "damaged", "checkpoints_lost", "damaged_checkpoints")
         by = [run.get(f"by_{how}") for how in ("SIGKILL", "SIGTERM", "child")]
         by = by if by[0] is not None else [run["kills"], 0, 0]  # forks are killed
-        rows.append(
-            [
-                name,
-                run["kills"],
-                *by,
-                sum(lost),
-                {None: "not promised", True: "yes", False: "no"}[same],
-            ]
-        )
+        promised = {None: "not promised", True: "yes", False: "no"}[same]
+        rows.append([name, run["kills"], *by, sum(run.get(key, 0) for key in lost), promised])
     head = ["run", "times ended", "SIGKILL", "SIGTERM", "a process of it", "lost", "same bits"]
-    return table(head, [*rows, ["all", data["kills"], "", "", "", data.get("lost", 0), ""]])
+    sums = [sum(row[i] for row in rows) for i in range(1, 6)]
+    return table(head, [*rows, ["all", *sums, ""]])
+
+
+_TRIED = {
+    "import": "importing",
+    "plan": "planning",
+    "demo": "the demo",
+    "a3c": "A3C",
+    "pool": "an Atari pool",
+}
 
 
 def environments(data: dict[str, Any]) -> str:
-    actions = ["import", "plan", "demo", "a3c", "pool"]
-    rows, notes = [], []
-    for what, row in data["situations"].items():
-        if "skipped" in row:
-            rows.append([what, f"not tried: {row['skipped']}", "", "", "", ""])
-            continue
-        cells = []
-        for action in actions:
-            tried = row.get(action, {})
-            result = tried.get("result", "")
-            cells.append("error" if result.startswith("status") else result)
-            if "says" in tried:
-                notes.append(f"- {what}, {action}: `{tried['says'][:300].replace('`', ' ')}`")
-        rows.append([what, *cells])
-    return table(["machine", *actions], rows) + "\n" + "\n".join(notes) + "\n"
+    rows = [
+        [what, f"not tried: it {row['skipped']}" if "skipped" in row else _what_happens(row)]
+        for what, row in data["situations"].items()
+    ]
+    return table(["machine", "what happens"], rows)
+
+
+def _what_happens(row: dict[str, dict[str, Any]]) -> str:
+    """Sentences about what was tried on a machine; what said the same shares one."""
+    works = [_TRIED[action] for action, tried in row.items() if tried["result"] == "works"]
+    text = [f"{_listed(works)} {'works' if len(works) == 1 else 'work'}."] if works else []
+    said: dict[tuple[str, bool], list[str]] = {}
+    for action, tried in row.items():
+        if "says" in tried:
+            key = (
+                tried["says"][:450].replace("`", "'").replace("|", "/"),
+                tried["result"] == "works",
+            )
+            said.setdefault(key, []).append(_TRIED[action])
+        if tried["result"] == "hangs":
+            text.append(f"{_listed([_TRIED[action]])} hangs.")
+        if "processes_left" in tried or "shared_memory_left" in tried:
+            text.append(f"{_listed([_TRIED[action]])} leaves processes or shared memory.")
+    for (words, fine), actions in said.items():
+        one = len(actions) == 1
+        verb = ("says" if one else "say") if fine else ("ends with" if one else "end with")
+        text.append(f"{_listed(actions)} {verb}: `{words}`")
+    return " ".join(text)
+
+
+def _listed(names: list[str]) -> str:
+    text = ", ".join(names[:-1]) + " and " * (len(names) > 1) + names[-1]
+    return text[0].upper() + text[1:]
 
 
 def fuzz(data: dict[str, Any]) -> str:

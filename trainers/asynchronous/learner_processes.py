@@ -77,7 +77,7 @@ class LearnerProcesses:
             self._start(payload, shared, start_frames)
 
     def _start(self, payload: bytes, shared: SharedMemory, start_frames: int) -> None:
-        need_descriptors(2 * self.number + 10)
+        need_descriptors(self.number, pipes=self.number)
         for i in range(self.number):
             errors, send = self.context.Pipe(duplex=False)
             # Not daemons: those may not have processes of their own, as a ParallelEnv has.

@@ -61,9 +61,9 @@ def run_experiment(
     except FileNotFoundError as error:
         if error.errno is None:  # there is no checkpoint to go on from
             return fail(name, error)
-        return fail(name, f"{error}. Choose another folder with out=DIR.")
+        return fail(name, _with_advice(error, resume))
     except OSError as error:  # e.g. a folder that cannot be written
-        return fail(name, f"{error}. Choose another folder with out=DIR.")
+        return fail(name, _with_advice(error, resume))
     except (ExperimentError, FloatingPointError, ImportError) as error:
         return fail(name, error)
     except KeyboardInterrupt as error:
@@ -117,3 +117,12 @@ def missing(error: ModuleNotFoundError) -> int:
         file=sys.stderr,
     )
     return 1
+
+
+def _with_advice(error: OSError, resume: str = "") -> str:
+    """Another folder helps where a file could not be written, not where the system lacks more."""
+    text = str(error).rstrip(".")
+    if any(word in text for word in ("/dev/shm", "ulimit", "TMPDIR")):
+        return f"{text}."
+    how = f"Continue with: {resume}, or choose" if resume else "Choose"
+    return f"{text}. {how} another folder with out=DIR."
