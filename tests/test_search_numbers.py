@@ -265,8 +265,8 @@ def test_a_tensor_that_numpy_cannot_read_is_named(
         answer = Transition(*map(torch.from_numpy, walk(state.numpy(), option.numpy())))
         return answer._replace(reward=change(answer.reward))
 
+    root = Root(*map(torch.from_numpy, root_of()))
     with pytest.raises(ValueError, match=f"returned reward as {got}; it must be float32"):
-        root = Root(*map(torch.from_numpy, root_of()))
         tree_search(root, transition, 20, tree_policy=tree_policy)
 
 
