@@ -223,6 +223,25 @@ def test_each_part_of_the_loss_is_the_closed_form_of_its_error() -> None:
     assert out["terminated_accuracy"].item() == 1.0
 
 
+@pytest.mark.parametrize("name", ["reward", "duration"])
+def test_only_the_state_of_a_terminal_step_may_be_empty(name: str) -> None:
+    data = make_data()
+    data["next", "duration"] = data["next", "duration"].float()
+    data["next", "position"][0] = torch.nan  # step 0 is a terminal one
+    assert all(OptionModelLoss(make_net())(data)[part].isfinite() for part in PARTS)
+    data["next", name][0] = torch.nan
+    assert OptionModelLoss(make_net())(data)[f"loss_{name}"].isnan()
+
+
+def test_the_reward_of_a_terminal_step_counts_in_the_normalisation() -> None:
+    data = make_data(4)  # steps 0 and 3 are terminal
+    data["next", "position"][[0, 3]] = torch.nan
+    data["next", "reward"] = torch.tensor([[1.0], [0.0], [0.0], [1.0]])
+    model = make_table().fit_normalization(data)
+    assert model.output_mean[2] == 0.5
+    assert model.output_scale[2].item() == pytest.approx(math.sqrt(1 / 3))
+
+
 def test_a_mask_decides_which_members_learn_from_a_transition() -> None:
     model, td = make_net(2), make_data(4)
     td["bootstrap_mask"] = torch.tensor([[1.0, 0.0]]).expand(4, 2)

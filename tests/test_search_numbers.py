@@ -250,6 +250,32 @@ def test_an_answer_that_turns_bad_is_named(
     assert len(calls) == 3
 
 
+@pytest.mark.parametrize(
+    ("change", "got"),
+    [
+        (lambda x: x.bfloat16(), r"bfloat16 \[1\]"),
+        (lambda x: torch._neg_view(-x), r"float32 \[1\] \(not contiguous\)"),
+    ],
+)
+@pytest.mark.parametrize("tree_policy", [PUCT(), least_visited])
+def test_a_tensor_that_numpy_cannot_read_is_named(
+    change: Callable[[torch.Tensor], torch.Tensor], got: str, tree_policy: Any
+) -> None:
+    def transition(state: torch.Tensor, option: torch.Tensor) -> Transition:
+        answer = Transition(*map(torch.from_numpy, walk(state.numpy(), option.numpy())))
+        return answer._replace(reward=change(answer.reward))
+
+    root = Root(*map(torch.from_numpy, root_of()))
+    with pytest.raises(ValueError, match=f"returned reward as {got}; it must be float32"):
+        tree_search(root, transition, 20, tree_policy=tree_policy)
+
+
+@pytest.mark.parametrize("embedding", [np.array([None]), torch.zeros(1, 3, dtype=torch.bfloat16)])
+def test_states_that_numpy_cannot_keep_are_refused(embedding: Any) -> None:
+    with pytest.raises(TypeError, match=r"embedding must be rows of numbers .* got (object|.*16)"):
+        tree_search(root_of()._replace(embedding=embedding), walk, 20)
+
+
 class ReusesItsTensors(ChainEnv):
     """Writes every step's outcome into the same tensors, and into the options it was given."""
 

@@ -257,15 +257,16 @@ class OptionModel(TensorDictModuleBase):
         meaning of the networks' outputs changes with it.
         """
         values = self.targets(tensordict, normalized=False).flatten(0, -2)
-        empty = (values[:, -1] > 0.5) & ~values.isfinite().all(-1)  # a terminal state may be
-        values = values[~empty, :-1]
-        if len(values) < 2:
+        deltas, rest = values[:, : self.num_deltas], values[:, self.num_deltas : -1]
+        empty = (values[:, -1] > 0.5) & ~deltas.isfinite().all(-1)  # a terminal state may be
+        deltas = deltas[~empty]
+        if len(deltas) < 2:
             raise ValueError(
-                f"fit_normalization needs at least 2 transitions; got {len(values)}. Record some "
+                f"fit_normalization needs at least 2 transitions; got {len(deltas)}. Record some "
                 f"with a TorchRL collector over the macro env."
             )
-        scale = values.std(0)
-        self.output_mean.copy_(values.mean(0))
+        scale = torch.cat([part.std(0) for part in (deltas, rest)])
+        self.output_mean.copy_(torch.cat([part.mean(0) for part in (deltas, rest)]))
         self.output_scale.copy_(torch.where(scale > 1e-6, scale, 1.0))
         return self
 

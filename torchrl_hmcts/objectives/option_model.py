@@ -182,7 +182,9 @@ class OptionModelLoss(PriorityWeights, LossModule):
             terminated_key=keys.terminated,
         ).expand_as(outputs)
         # Nothing is asked of a terminal state, so it may hold anything: nothing is learned of it.
+        # The reward and the duration of the step into it count like all others.
         empty = (target[..., -1:] > 0.5) & ~target.isfinite()
+        empty[..., size:] = False
         target = torch.where(empty, outputs.detach(), target)
         mask = tensordict.get(keys.bootstrap_mask, None)
         share = None if mask is None else mask.movedim(-1, 0).to(outputs.dtype)  # [K, *B]

@@ -328,15 +328,20 @@ class _Loop:
                     f"The transition function returned {name} as {type(array).__name__}; return "
                     f"what the embedding is, a {'tensor' if self.is_tensor else 'NumPy array'}."
                 )
-            got = _numpy(array)
-            if got.shape != shape or got.dtype != dtype or not got.flags.c_contiguous:
-                order = "" if got.flags.c_contiguous else " (not contiguous)"
+            got = str(array.dtype).removeprefix("torch.")  # NumPy has no bfloat16
+            if isinstance(array, Tensor):
+                contiguous = array.is_contiguous() and not array.is_neg()
+            else:
+                contiguous = array.flags.c_contiguous
+            if tuple(array.shape) != shape or got != str(dtype) or not contiguous:
+                order = "" if contiguous else " (not contiguous)"
                 raise ValueError(
-                    f"The transition function returned {name} as {got.dtype} {list(got.shape)}"
+                    f"The transition function returned {name} as {got} {list(array.shape)}"
                     f"{order}; it must be {dtype} {list(shape)} and contiguous."
                 )
             if name != "embedding":
-                _check_range(f"The transition function returned the {name} {{number}}", name, got)
+                found = f"The transition function returned the {name} {{number}}"
+                _check_range(found, name, _numpy(array))
 
 
 def _check_range(found: str, name: str, array: np.ndarray) -> None:
@@ -353,7 +358,10 @@ def _bytes(array: np.ndarray) -> np.ndarray:
 
 
 def _numpy(array: Array) -> np.ndarray:
-    return array.detach().cpu().numpy() if isinstance(array, Tensor) else np.asarray(array)
+    if not isinstance(array, Tensor):
+        return np.asarray(array)
+    array = array.detach().cpu().resolve_neg()
+    return (array.float() if array.dtype is torch.bfloat16 else array).numpy()
 
 
 def _check_root(root: Root) -> tuple[np.ndarray, np.ndarray]:
@@ -370,6 +378,11 @@ def _check_root(root: Root) -> tuple[np.ndarray, np.ndarray]:
                 f"The roots' {name} must have one row for each of the {len(prior)} rows of the "
                 f"prior; got shape {list(array.shape)}."
             )
+    if root.embedding.dtype in (torch.bfloat16, np.dtype(object)):
+        raise TypeError(
+            f"The roots' embedding must be rows of numbers that NumPy has; got "
+            f"{root.embedding.dtype}. Pass float32, or indices into a list of your own."
+        )
     for name, array in (("prior", prior), ("value", value)):
         _check_range(f"The roots' {name} holds {{number}}, which is no {name}", name, array)
     return prior, value

@@ -6,6 +6,7 @@ Letters: *B batch of the tensordict, n its elements that still run, T ``max_step
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from numbers import Integral
 from typing import Literal
 
 import numpy as np
@@ -135,7 +136,7 @@ class OptionTransform(Transform):
                 f"OptionTransform needs a worker that it can call on a tensordict; got {worker!r}."
             )
         for name, value in (("num_options", num_options), ("max_steps", max_steps)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
                 raise ValueError(f"OptionTransform needs {name} to be an int >= 1; got {value!r}.")
         if not 0.0 < gamma <= 1.0:
             raise ValueError(
@@ -153,8 +154,8 @@ class OptionTransform(Transform):
         # Not sub-modules: an env must not put its owner's worker into eval mode or onto its device.
         self.__dict__["worker"] = worker
         self.__dict__["termination"] = termination
-        self.num_options = num_options
-        self.max_steps = max_steps
+        self.num_options = int(num_options)
+        self.max_steps = int(max_steps)
         self.gamma = float(gamma)
         self.one_hot = one_hot
         self.worker_memory = worker_memory
