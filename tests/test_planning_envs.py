@@ -609,7 +609,7 @@ class HiddenClock(Shy):
 def test_a_simulator_that_does_not_say_that_it_is_one_is_one_by_declaration(
     batch_size: tuple[int, ...],
 ) -> None:
-    with pytest.raises(ValueError, match=r"say so by StatelessSimulator\(env\)"):
+    with pytest.raises(ValueError, match=r"declare it by StatelessSimulator\(env\)"):
         MCTSPlanner(Shy(length=5))
     env = TransformedEnv(StatelessSimulator(Shy(length=8, batch_size=batch_size)), follow())
     check_macro_env(env)
