@@ -134,7 +134,7 @@ def main() -> None:
         rows[f"`_step` of the {name} alone"] = best(
             lambda b=base, t=td: per_step(lambda: b._step(t))
         )
-        for max_steps, counter in ((8, False), (1, False), (8, True)):
+        for max_steps, counter in ((20, False), (8, False), (1, False), (8, True)):
             env = macro_env(make(), max_steps, counter)
             below = " over a StepCounter" if counter else ""
             rows[f"{name} in a planner, options of {max_steps}{below}"] = best(
