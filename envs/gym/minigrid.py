@@ -87,7 +87,7 @@ class MiniGridSnapshot(AttributeSnapshot):
             clock["_elapsed_steps"] = steps
         self._load_attributes(whole[first + second :])
         changes = io.BytesIO(whole[first : first + second])
-        changed, objects = RowUnpickler(changes, self._fixed).load()
+        changed, objects = RowUnpickler(changes, self._fixed, self._packages).load()
         grid = self.env.unwrapped.grid.grid  # type: ignore[attr-defined]
         grid[:] = self._cells
         for i, number in changed:

@@ -180,10 +180,13 @@ class AttributeSnapshot(Snapshot):
         self._fixed: list[Any] = list(self._layers)  # referred to by their index, never stored
         self._index = {id(item): i for i, item in enumerate(self._fixed)}
         self._cap = cap
+        modules = {kind.__module__ for layer in self._layers for kind in type(layer).__mro__}
+        self._packages = frozenset(name.partition(".")[0] for name in modules) - _LIBRARIES
         self._kinds: dict[tuple[int, str, type], int] = {}
         self._clocks = [vars(layer) for layer in self._layers if type(layer) is TimeLimit]
         self._unchanged: bytes | None = None  # attributes of the env, if it took no step since
         content = self._pickled(learning=True)
+        self._unpickled(content)  # a class that is not read is named now, not in a search
         self.width = _room_for(len(content), cap, env)
 
     def read(self) -> np.ndarray:
@@ -238,9 +241,7 @@ class AttributeSnapshot(Snapshot):
 
     def _load_attributes(self, content: bytes) -> None:
         """Sets the attributes of all layers."""
-        stream = io.BytesIO(content)
-        values, generators, with_others = RowUnpickler(stream, self._fixed).load()
-        others = RowUnpickler(stream, self._fixed).load() if with_others else [{}] * len(values)
+        values, others, generators = self._unpickled(content)
         parts = zip(self._layers, values, others, generators, strict=True)
         for number, (layer, plain, other, generator) in enumerate(parts):
             now = vars(layer)
@@ -251,6 +252,16 @@ class AttributeSnapshot(Snapshot):
             now.update(plain)
             now.update((name, value) for name, value in other.items() if value is not _KEPT)
             _set_generator(layer, generator)
+
+    def _unpickled(self, content: bytes) -> tuple[list[Any], list[Any], list[Any]]:
+        """Plain attributes, all others and the generator's state of each layer."""
+        stream = io.BytesIO(content)
+
+        def read() -> Any:
+            return RowUnpickler(stream, self._fixed, self._packages).load()
+
+        values, generators, with_others = read()
+        return values, read() if with_others else [{}] * len(values), generators
 
     def _kind(self, layer: int, name: str, value: Any) -> int:
         """Whether an attribute is no state, a plain value, or anything else."""
@@ -364,6 +375,9 @@ _SAFE = frozenset(
         ("builtins", "object"),
         ("builtins", "slice"),
         ("random", "Random"),
+        *(("pathlib", name) for name in ("PosixPath", "PurePosixPath", "WindowsPath")),
+        ("fractions", "Fraction"),
+        ("decimal", "Decimal"),
     }
 )
 
@@ -374,21 +388,22 @@ _LIBRARIES = frozenset({"builtins", "types", "numpy", "os", "subprocess", "funct
 class RowUnpickler(pickle.Unpickler):
     """Reads a row: plain data, NumPy's, and classes of the packages that the env is made of."""
 
-    def __init__(self, content: io.BytesIO, fixed: list[Any]) -> None:
+    def __init__(self, content: io.BytesIO, fixed: list[Any], packages: frozenset[str]) -> None:
         super().__init__(content)
         self._fixed = fixed
+        self._packages = packages
 
     def find_class(self, module: str, name: str) -> Any:
         package = module.partition(".")[0]
         numbers = package == "numpy" and name in _NUMPY
-        own = {type(item).__module__.partition(".")[0] for item in self._fixed} - _LIBRARIES
-        if not (numbers or (module, name) in _SAFE or package in own):
+        if not (numbers or (module, name) in _SAFE or package in self._packages):
             raise SnapshotError(
-                f"The row holds {module}.{name}, which is no class of this env. It was not written "
-                "by a snapshot of such an env."
+                f"The row holds {module}.{name}, which is no class of this env. Either it was not "
+                "written by a snapshot of such an env, or the env keeps objects of other packages: "
+                "then pass snapshot=(read, restore) of your own, or snapshot=ReplaySnapshot."
             )
         found = super().find_class(module, name)
-        if package in own and not isinstance(found, type):
+        if package in self._packages and not isinstance(found, type):
             raise SnapshotError(f"The row calls {module}.{name}, which is no class.")
         return found
 
