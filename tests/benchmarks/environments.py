@@ -255,6 +255,8 @@ def attempt(situation: Situation, action: str) -> dict[str, Any]:
         if process.returncode or lines:
             found["says"] = _last(said) if process.returncode else lines[0]
             found["says"] = found["says"].replace(folder, "PLACE").replace(str(ROOT), "ROOT")
+            own = f"{tempfile.gettempdir()}/torchrl_hmcts-{os.getuid()}"
+            found["says"] = found["says"].replace(own, "TEMPORARY/torchrl_hmcts-UID")
         if left:
             found["processes_left"] = len(left)
         if (place / "left").exists() and (more := int((place / "left").read_text() or 0)):
