@@ -311,15 +311,10 @@ class MCTSPlanner(TensorDictModuleBase):
             exhausted=self.exhausted,
             waves_in_flight=self.waves_in_flight,
         )
-        names: tuple[str, ...] = (
-            "backup",
-            "novelty",
-            "transpositions",
-            "chance",
-            "expand",
-            "leaves_per_wave",
+        names = (
+            *("tree_policy", "backup", "novelty", "transpositions", "chance", "expand"),
+            *("leaves_per_wave", "waves_in_flight", "exhausted"),
         )
-        names += ("tree_policy", "exhausted", "waves_in_flight")
         return {name: getattr(self, name) for name in names}
 
     def _capacity(self, num_roots: int) -> int:
