@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from torchrl_hmcts.arguments import name_all_arguments
-from torchrl_hmcts.envs.atari_goals import (
+from torchrl_hmcts.envs.atari.goals import (
     ByteGoal,
     FollowGoals,
     JoinedWorkers,
     OccasionalAction,
 )
-from torchrl_hmcts.envs.atari_pool import AtariOptionPool
-from torchrl_hmcts.envs.atari_ram import AtariRAMEnv
-from torchrl_hmcts.envs.atari_workers import OptionWorker, RepeatActions, SharedMLP
-from torchrl_hmcts.envs.deepmind_lab import DeepMindLabEnv
-from torchrl_hmcts.envs.gridworld import GridworldMazeEnv
+from torchrl_hmcts.envs.atari.pool import AtariOptionPool
+from torchrl_hmcts.envs.atari.ram import AtariRAMEnv
+from torchrl_hmcts.envs.atari.workers import OptionWorker, RepeatActions, SharedMLP
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv
 from torchrl_hmcts.envs.gym.snapshots import (
     AttributeSnapshot,
@@ -22,12 +20,14 @@ from torchrl_hmcts.envs.gym.snapshots import (
     SnapshotError,
 )
 from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
-from torchrl_hmcts.envs.lab_actions import LAB_ACTIONS
-from torchrl_hmcts.envs.lab_first_person import draw_first_person
-from torchrl_hmcts.envs.lab_maze import LabMazeEnv
-from torchrl_hmcts.envs.lab_mazes import lab_maze
-from torchrl_hmcts.envs.lab_recordings import replay_recording
-from torchrl_hmcts.envs.mazes import (
+from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS
+from torchrl_hmcts.envs.lab.deepmind_lab import DeepMindLabEnv
+from torchrl_hmcts.envs.lab.first_person import draw_first_person
+from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
+from torchrl_hmcts.envs.lab.mazes import lab_maze
+from torchrl_hmcts.envs.lab.recordings import replay_recording
+from torchrl_hmcts.envs.mazes.gridworld import GridworldMazeEnv
+from torchrl_hmcts.envs.mazes.layouts import (
     check_mazes,
     free_tiles,
     generate_mazes,
@@ -38,9 +38,9 @@ from torchrl_hmcts.envs.mazes import (
     shortest_path_lengths,
     wall_centers,
 )
-from torchrl_hmcts.envs.rendering import draw_maze
+from torchrl_hmcts.envs.mazes.rendering import draw_maze
+from torchrl_hmcts.envs.mazes.waterworld import WaterworldMazeEnv
 from torchrl_hmcts.envs.stateless import StatelessSimulator
-from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
 
 __all__ = [
     "AtariOptionPool",

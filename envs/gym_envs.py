@@ -12,9 +12,9 @@ from tensordict import TensorDictBase
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.envs.gridworld import GridworldMazeEnv
-from torchrl_hmcts.envs.lab_maze import LabMazeEnv
-from torchrl_hmcts.envs.waterworld import WaterworldMazeEnv
+from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
+from torchrl_hmcts.envs.mazes.gridworld import GridworldMazeEnv
+from torchrl_hmcts.envs.mazes.waterworld import WaterworldMazeEnv
 
 ENV_IDS = (
     "torchrl_hmcts/WaterworldMaze-v0",

@@ -32,7 +32,7 @@ from torchrl.record import CSVLogger
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, LearnerError, SharedRMSprop
-from torchrl_hmcts.trainers.asynchronous.actor_learner import ActorLearner, SharedMemory
+from torchrl_hmcts.trainers.a3c.actor_learner import ActorLearner, SharedMemory
 
 LENGTH, B, T = 5, 4, 5
 SEGMENT = B * T

@@ -28,18 +28,18 @@ from torchrl_hmcts.trainers import (  # noqa: E402
     GoalFinder,
     GoalSearch,
 )
-from torchrl_hmcts.trainers.atari.trials import RememberedTrials, Trial  # noqa: E402
-from torchrl_hmcts.trainers.checkpoints import DurableRotation, plain_checkpoint  # noqa: E402
-from torchrl_hmcts.trainers.experiments.atari import (  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari.run import (  # noqa: E402
     AtariRun,
     draw,
     evaluate_atari,
     load_run,
     run_atari,
 )
-from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari.trials import RememberedTrials, Trial  # noqa: E402
 from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif  # noqa: E402
 from torchrl_hmcts.trainers.figures.pictures import Pictures  # noqa: E402
+from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint  # noqa: E402
 
 TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)], fire=1)
 
@@ -330,7 +330,9 @@ def test_a_run_stopped_while_it_looks_for_options_plays_no_trial_twice(
 def test_a_run_of_an_older_version_continues_and_what_was_half_written_is_removed(
     tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.atari.draw", lambda run, pictures: None)
+    monkeypatch.setattr(
+        "torchrl_hmcts.trainers.experiments.atari.run.draw", lambda run, pictures: None
+    )
     config = AtariConfig(
         frames=1_000, max_episode_frames=400, source="repeat", option_steps=10, ratio=1.0,
         rollout_options=0, num_processes=0, replant_every=5, seed=4, out=str(tmp_path),
@@ -394,7 +396,9 @@ def test_trials_of_other_settings_or_a_damaged_file_are_played_again(tmp_path, c
 
 @pytest.mark.parametrize("guide", ["none", "prior"])
 def test_a_run_is_evaluated_with_what_it_found_and_learned(tmp_path, monkeypatch, guide) -> None:
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.atari.draw", lambda run, pictures: None)
+    monkeypatch.setattr(
+        "torchrl_hmcts.trainers.experiments.atari.run.draw", lambda run, pictures: None
+    )
     config = AtariConfig(
         frames=1_000, max_episode_frames=400, source="repeat", option_steps=10, ratio=1.0,
         rollout_options=0, num_processes=0, replant_every=5, seed=4, out=str(tmp_path), guide=guide,

@@ -28,7 +28,7 @@ from torchrl_hmcts.envs import (  # noqa: E402
     RepeatActions,
     SharedMLP,
 )
-from torchrl_hmcts.envs.atari_process import NUM_SLOTS  # noqa: E402
+from torchrl_hmcts.envs.atari.process import NUM_SLOTS  # noqa: E402
 from torchrl_hmcts.modules import SkillMLP  # noqa: E402
 from torchrl_hmcts.planners import (  # noqa: E402
     PUCT,

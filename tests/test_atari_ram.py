@@ -15,7 +15,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
 from torchrl_hmcts.envs import AtariRAMEnv  # noqa: E402
-from torchrl_hmcts.envs.atari_emulator import AtariEmulator, find_game  # noqa: E402
+from torchrl_hmcts.envs.atari.emulator import AtariEmulator, find_game  # noqa: E402
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget  # noqa: E402
 from torchrl_hmcts.transforms import OptionTransform  # noqa: E402
 

@@ -37,8 +37,8 @@ from torchrl_hmcts.trainers import (  # noqa: E402
     SearchGuide,
     load_options,
 )
-from torchrl_hmcts.trainers.atari.options import plain_worker  # noqa: E402
-from torchrl_hmcts.trainers.atari.trained_sources import option_transitions  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari.options import plain_worker  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari.trained_sources import option_transitions  # noqa: E402
 
 TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)])
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from torchrl_hmcts.envs import maze_from_text, maze_pool
-from torchrl_hmcts.envs.chipmunk import ChipmunkMazes, WallSegment, wall_segments
+from torchrl_hmcts.envs.mazes.chipmunk import ChipmunkMazes, WallSegment, wall_segments
 
 RADIUS, DAMPING, TIME_STEP = 0.25, 0.2, 0.05
 MAZES = maze_pool("test")[:40].numpy()

@@ -7,9 +7,9 @@ from dataclasses import fields
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment, find_experiment
 from torchrl_hmcts.trainers.experiments.registry import field_docs
+from torchrl_hmcts.trainers.runs.config import DemoConfig
 
 ALL = [*EXPERIMENTS.values()]
 
@@ -70,7 +70,9 @@ def test_ctrl_c_ends_with_the_command_that_continues(tmp_path, capsys, monkeypat
     def interrupted(config) -> dict:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.waterworld.run_waterworld", interrupted)
+    monkeypatch.setattr(
+        "torchrl_hmcts.trainers.experiments.waterworld.run.run_waterworld", interrupted
+    )
     assert main(["train", "experiment=waterworld_a3c", "out=runs/my own"]) == 130
     assert "Continue with: hmcts train 'resume=runs/my own'" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.experiments.run_folder import read_run
+from torchrl_hmcts.trainers.runs.folder import read_run
 
 TRAIN = ["train", "experiment=waterworld_a3c", "toy=true", "seed=3"]
 
@@ -100,7 +100,7 @@ def test_on_a_full_disk_an_evaluation_is_printed(run: Path, tmp_path, monkeypatc
         raise OSError(errno.ENOSPC, "No space left on device")
 
     copy = Path(shutil.copytree(run, tmp_path / "copy"))
-    monkeypatch.setattr("torchrl_hmcts.trainers.files.os.replace", full)
+    monkeypatch.setattr("torchrl_hmcts.trainers.saving.files.os.replace", full)
     assert main(["evaluate", f"run={copy}"]) == 0
     said = capsys.readouterr()
     assert json.loads(said.out)["test"]
@@ -117,7 +117,7 @@ def test_resume_goes_on_with_the_saved_config(tmp_path, monkeypatch) -> None:
         seen.append(config)
         return {}
 
-    path = "torchrl_hmcts.trainers.experiments.labmaze.run_labmaze"
+    path = "torchrl_hmcts.trainers.experiments.lab.run.run_labmaze"
     monkeypatch.setattr(path, remembered)
     out = tmp_path / "run"
     assert main(["train", "experiment=labmaze", "seed=7", "train_frames=8000", f"out={out}"]) == 0
@@ -153,7 +153,7 @@ def test_a_run_that_is_stopped_is_recorded_so(tmp_path, monkeypatch, capsys) -> 
     def interrupted(config) -> dict:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.labmaze.run_labmaze", interrupted)
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.lab.run.run_labmaze", interrupted)
     assert main(["train", "experiment=labmaze", f"out={tmp_path}"]) == 130
     assert json.loads((tmp_path / "run.json").read_text())["status"] == "stopped"
 
@@ -163,7 +163,7 @@ def test_log_level_warning_is_silent_on_standard_output(tmp_path, monkeypatch, c
         print("talking")
         return {}
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.labmaze.run_labmaze", talks)
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.lab.run.run_labmaze", talks)
     words = ["train", "experiment=labmaze", f"out={tmp_path}"]
     assert main(words) == 0
     assert "talking" in capsys.readouterr().out
@@ -186,8 +186,8 @@ def test_help_says_what_a_verb_needs_and_where_results_go(capsys, verb) -> None:
 @pytest.mark.parametrize("logger", ["tensorboard", "wandb"])
 def test_values_go_to_other_loggers_as_well(tmp_path, logger) -> None:
     pytest.importorskip(logger)
-    from torchrl_hmcts.trainers.config import DemoConfig
-    from torchrl_hmcts.trainers.experiments.loggers import make_logger
+    from torchrl_hmcts.trainers.runs.config import DemoConfig
+    from torchrl_hmcts.trainers.runs.loggers import make_logger
 
     made = make_logger(DemoConfig(out=str(tmp_path), logger=logger))
     made.log_scalar("entropy", 1.25, step=64)

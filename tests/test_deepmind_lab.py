@@ -14,7 +14,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import DeepMindLabEnv, LabMazeEnv
-from torchrl_hmcts.envs.lab_read_outs import READ_OUTS
+from torchrl_hmcts.envs.lab.read_outs import READ_OUTS
 
 FORWARD, NOTHING = 0, 8
 NINE: dict[str, Any] = {"level": "nine", "rows": 9, "columns": 9, "maze_seeds": [1, 2], "seed": 0}

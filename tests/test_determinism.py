@@ -36,8 +36,8 @@ from torchrl_hmcts.planners import (
     SearchBudget,
 )
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-from torchrl_hmcts.trainers.waterworld.worker import make_training_env
 from torchrl_hmcts.transforms import OptionTransform
 
 
@@ -123,8 +123,8 @@ needs_atari = pytest.mark.skipif(not HAS_ATARI, reason="the games come with ale-
 
 def make_atari_run(frames: int, **settings: Any) -> Any:
     """Skills learned on the RAM, and a search over them; without processes of its own."""
-    from torchrl_hmcts.trainers.experiments.atari import AtariRun
-    from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
+    from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
+    from torchrl_hmcts.trainers.experiments.atari.run import AtariRun
 
     tiny = {"source": "diayn", "num_skills": 2, "skill_base_steps": 320, "option_steps": 10}
     tiny.update(ratio=3.0, max_episode_frames=600, replant_every=5, num_processes=0, seed=4)

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_hmcts.trainers.config import parse_overrides
 from torchrl_hmcts.trainers.experiments.registry import DEMO, find_experiment
+from torchrl_hmcts.trainers.runs.config import parse_overrides
 
 DOCS = Path(__file__).parents[1] / "docs"
 GENERATED = {"auto_tutorials", "auto_reference", "auto_results", "_build"}

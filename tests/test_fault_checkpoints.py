@@ -25,15 +25,15 @@ from torchrl.envs import Compose, TransformedEnv
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers import checkpoints
-from torchrl_hmcts.trainers.checkpoints import (
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     check_settings,
     find_damage,
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.files import write_json, write_text
+from torchrl_hmcts.trainers.saving.files import write_json, write_text
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 FULL = OSError(errno.ENOSPC, "No space left on device")

@@ -34,15 +34,15 @@ from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer, ExpertIterationTrainer, HMCTSTrainer
-from torchrl_hmcts.trainers.checkpoints import (
+from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.runs.folder import load_config, read_run, start_record
+from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     PlainStateAdapter,
     check_settings,
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.config import DemoConfig
-from torchrl_hmcts.trainers.experiments.run_folder import load_config, read_run, start_record
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 REFUSED = (CheckpointError, ValueError)  # of checkpoints, and of JSON
@@ -64,7 +64,7 @@ def diayn(folder: Path) -> Kind:
 
 
 def hmcts(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.waterworld.worker import make_training_env
+    from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
 
     loss = DIAYNTrainer.make_loss(make_training_env(), num_skills=4, hidden=(8,), seed=0)
     planner = partial(
@@ -126,7 +126,7 @@ def _of_trainer(make: Callable[[], Any]) -> Kind:
 
 
 def demo(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.demo import train_worker
+    from torchrl_hmcts.trainers.experiments.demo import train_worker
     from torchrl_hmcts.trainers.experiments.evaluations import load_networks
 
     config = DemoConfig(train_base_steps=128, out=str(folder))
@@ -141,8 +141,8 @@ def demo(folder: Path) -> Kind:
 
 def labmaze(folder: Path) -> Kind:
     from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-    from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-    from torchrl_hmcts.trainers.lab.training import train_worker
+    from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+    from torchrl_hmcts.trainers.experiments.lab.training import train_worker
 
     config = LabMazeConfig(
         algorithm="diayn", train_frames=256, expansions=2, curve_mazes=1, curve_points=1
@@ -157,8 +157,8 @@ def labmaze(folder: Path) -> Kind:
 
 
 def _atari_run(folder: Path) -> Any:
-    from torchrl_hmcts.trainers.experiments.atari import AtariRun
-    from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
+    from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
+    from torchrl_hmcts.trainers.experiments.atari.run import AtariRun
 
     pytest.importorskip("ale_py")
     config = AtariConfig(
@@ -194,7 +194,7 @@ def checkpoint_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_run(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari import load_run
+    from torchrl_hmcts.trainers.experiments.atari.run import load_run
 
     rotation = DurableRotation(folder / "checkpoints")
     state = _atari_run(folder)
@@ -203,7 +203,7 @@ def atari_run(folder: Path) -> Kind:
 
 
 def atari_run_of_older_versions(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari import load_run
+    from torchrl_hmcts.trainers.experiments.atari.run import load_run
 
     path = folder / "checkpoints" / "run.pt"
     path.parent.mkdir(parents=True)
@@ -212,7 +212,7 @@ def atari_run_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_trials(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.atari.trials import RememberedTrials, Trial
+    from torchrl_hmcts.trainers.experiments.atari.trials import RememberedTrials, Trial
 
     folder.mkdir(parents=True)
     path = folder / "trials.json"
@@ -238,7 +238,7 @@ def run_record(folder: Path) -> Kind:
 
 
 def sweep_journal(folder: Path) -> Kind:
-    journal = pytest.importorskip("torchrl_hmcts.trainers.experiments.journal")
+    journal = pytest.importorskip("torchrl_hmcts.trainers.runs.journal")
     folder.mkdir(parents=True)
     path = folder / "journal.log"
     for i in range(20):

@@ -87,7 +87,7 @@ def kill_again_and_again(
 ) -> dict[str, Any]:
     import torch
 
-    from torchrl_hmcts.trainers.checkpoints import find_damage, newest_checkpoint
+    from torchrl_hmcts.trainers.saving.checkpoints import find_damage, newest_checkpoint
 
     torch.set_num_threads(1)
     rng, begin = random.Random(seed), time.process_time()

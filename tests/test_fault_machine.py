@@ -31,7 +31,7 @@ from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, LearnerError
-from torchrl_hmcts.trainers.asynchronous import learner_processes
+from torchrl_hmcts.trainers.a3c import learner_processes
 from torchrl_hmcts.transforms import OptionTransform
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="uses Linux's /proc and limits")
@@ -484,8 +484,8 @@ def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
         "    few = len(os.listdir('/proc/self/fd')) + 2 * number + pipes + 16\n"
         "    resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
         "    check(number, pipes)\n"
-        "import torchrl_hmcts.envs.atari_process as a\n"
-        "import torchrl_hmcts.trainers.asynchronous.learner_processes as b\n"
+        "import torchrl_hmcts.envs.atari.process as a\n"
+        "import torchrl_hmcts.trainers.a3c.learner_processes as b\n"
         "a.need_descriptors = b.need_descriptors = limit\n"
     )
     imports, attempt = code.split("try:\n")

@@ -17,10 +17,10 @@ import pytest
 from torchrl.record.loggers import CSVLogger, Logger
 
 from torchrl_hmcts.trainers import cli, files
-from torchrl_hmcts.trainers.experiments.loggers import ScalarLoggers
 from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.report import finish
-from torchrl_hmcts.trainers.files import left_out, replacing, write_text
+from torchrl_hmcts.trainers.runs.loggers import ScalarLoggers
+from torchrl_hmcts.trainers.saving.files import left_out, replacing, write_text
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 FRAMES = [np.full((4, 4, 3), shade, np.uint8) for shade in (0, 99, 200)]

@@ -32,15 +32,15 @@ from torchrl_hmcts.envs import (
 )
 from torchrl_hmcts.modules import SkillActor
 from torchrl_hmcts.planners import Root, Transition, tree_search
-from torchrl_hmcts.trainers.checkpoints import (
+from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.waterworld.config import WaterworldGoalsConfig
+from torchrl_hmcts.trainers.runs.config import DemoConfig, parse_overrides
+from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     find_damage,
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.config import DemoConfig, parse_overrides
-from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.waterworld_config import WaterworldGoalsConfig
 
 CASES: Counter[str] = Counter()
 MANY = int(os.environ.get("TORCHRL_HMCTS_FUZZ_TIMES", "1"))

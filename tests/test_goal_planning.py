@@ -22,8 +22,20 @@ from torchrl_hmcts.envs import (
     maze_pool,
     shortest_path_lengths,
 )
-from torchrl_hmcts.envs.rendering import DOT_COLOR, PLAYER_COLOR, TARGET_COLOR
-from torchrl_hmcts.trainers.demo import make_starts
+from torchrl_hmcts.envs.mazes.rendering import DOT_COLOR, PLAYER_COLOR, TARGET_COLOR
+from torchrl_hmcts.trainers.experiments.demo import make_starts
+from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import (
+    GoalEpisodes,
+    GoalTrack,
+    run_goal_episodes,
+)
+from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
+    TilePlanner,
+    make_goal_env,
+    make_tile_planner,
+    tile_moves,
+)
+from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
 from torchrl_hmcts.trainers.figures.goal_figures import (
     draw_goals,
     plot_goals,
@@ -31,19 +43,7 @@ from torchrl_hmcts.trainers.figures.goal_figures import (
     plot_tile_search,
     write_goal_gif,
 )
-from torchrl_hmcts.trainers.resume import GeneratorStates, RunningEpisodes
-from torchrl_hmcts.trainers.waterworld.goal_episodes import (
-    GoalEpisodes,
-    GoalTrack,
-    run_goal_episodes,
-)
-from torchrl_hmcts.trainers.waterworld.goal_planning import (
-    TilePlanner,
-    make_goal_env,
-    make_tile_planner,
-    tile_moves,
-)
-from torchrl_hmcts.trainers.waterworld.scripted_expert import ScriptedExpert
+from torchrl_hmcts.trainers.saving.resume import GeneratorStates, RunningEpisodes
 
 MAZE, PLAYER, TARGET = maze_from_text("P.#\n#..\n..T")
 PLANNERS = pytest.mark.parametrize("make", [TilePlanner, make_tile_planner])

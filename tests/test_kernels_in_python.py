@@ -16,8 +16,8 @@ import torch
 
 from torchrl_hmcts import planners
 from torchrl_hmcts.envs import LabMazeEnv, SharedMLP
-from torchrl_hmcts.envs.lab_first_person import draw_first_person
-from torchrl_hmcts.envs.wall_growing import _compiled_grow_walls, _grow_walls
+from torchrl_hmcts.envs.lab.first_person import draw_first_person
+from torchrl_hmcts.envs.mazes.wall_growing import _compiled_grow_walls, _grow_walls
 from torchrl_hmcts.planners import (
     PUCT,
     UCT,
@@ -346,7 +346,7 @@ def walk(frames: int) -> Arrays:
 
 def test_players_of_the_lab_move_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled = walk(90)
-    plain = in_python("torchrl_hmcts.envs.lab_kernels")
+    plain = in_python("torchrl_hmcts.envs.lab.kernels")
     for module, names in (
         ("lab_maze", ("advance", "read_out")),
         ("lab_states", ("overlaps_wall",)),
@@ -358,7 +358,7 @@ def test_players_of_the_lab_move_the_same(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_the_view_of_a_player_is_the_same() -> None:
-    plain = in_python("torchrl_hmcts.envs.lab_first_person")
+    plain = in_python("torchrl_hmcts.envs.lab.first_person")
     env = LabMazeEnv([LEVEL])
     state = env.make_state(0, (350.0, 250.0), heading=0.4)
     size = {"width": 40, "height": 30}
@@ -378,7 +378,7 @@ def test_the_same_walls_grow() -> None:
 
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_a_network_takes_the_same_actions(deterministic: bool) -> None:
-    plain = in_python("torchrl_hmcts.envs.atari_workers")
+    plain = in_python("torchrl_hmcts.envs.atari.workers")
     rng = np.random.default_rng(0)
     worker, other = (
         kind(2, 4, hidden=(5, 6), deterministic=deterministic)

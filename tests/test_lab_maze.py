@@ -21,7 +21,7 @@ from torchrl.envs import ParallelEnv, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import LAB_ACTIONS, LabMazeEnv
-from torchrl_hmcts.envs.lab_read_outs import READ_OUTS
+from torchrl_hmcts.envs.lab.read_outs import READ_OUTS
 
 FORWARD, BACK, LEFT, RIGHT, LOOK_LEFT, LOOK_RIGHT, _, _, NOTHING = range(9)
 STATE_KEYS = ["maze_index", "position", "velocity", "turned", "level"]

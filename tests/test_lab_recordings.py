@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from torchrl_hmcts.envs import lab_maze, replay_recording
-from torchrl_hmcts.envs.lab_mazes import _distances
-from torchrl_hmcts.envs.lab_random import MersenneTwister64
+from torchrl_hmcts.envs.lab.mazes import _distances
+from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
 
 DATA = Path(__file__).parent / "data" / "lab_recordings.json.gz"
 RECORDINGS = {s["name"]: s for s in json.loads(gzip.decompress(DATA.read_bytes()))["sequences"]}

@@ -20,19 +20,19 @@ from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import find_experiment
 from torchrl_hmcts.trainers.experiments.evaluations import evaluate_labmaze
-from torchrl_hmcts.trainers.experiments.labmaze import run_labmaze
-from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.lab import training
-from torchrl_hmcts.trainers.lab.evaluation import (
+from torchrl_hmcts.trainers.experiments.lab import training
+from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     _with_second_search,
     frames_curve,
     solve_mazes,
     solve_with_wrong_model,
     wrong_models,
 )
-from torchrl_hmcts.trainers.lab.script import ShortestPathScript
-from torchrl_hmcts.trainers.lab.training import train_worker
-from torchrl_hmcts.trainers.lab.worker import (
+from torchrl_hmcts.trainers.experiments.lab.run import run_labmaze
+from torchrl_hmcts.trainers.experiments.lab.script import ShortestPathScript
+from torchrl_hmcts.trainers.experiments.lab.training import train_worker
+from torchrl_hmcts.trainers.experiments.lab.worker import (
     TRAINING_MAZES,
     held_out_seeds,
     make_lab_env,

@@ -11,11 +11,15 @@ from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.experiments.waterworld_config import (
+from torchrl_hmcts.trainers.experiments.waterworld.agents import (
+    MazeNetwork,
+    make_maze_networks,
+    play_mazes,
+)
+from torchrl_hmcts.trainers.experiments.waterworld.config import (
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
-from torchrl_hmcts.trainers.waterworld.agents import MazeNetwork, make_maze_networks, play_mazes
 
 
 @pytest.fixture

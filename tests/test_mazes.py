@@ -23,8 +23,8 @@ from torchrl_hmcts.envs import (
     shortest_path_lengths,
     wall_centers,
 )
-from torchrl_hmcts.envs.pool_cache import pool_cache_path, pool_digest, read_pool, write_pool
-from torchrl_hmcts.envs.wall_growing import draw_mazes
+from torchrl_hmcts.envs.mazes.pool_cache import pool_cache_path, pool_digest, read_pool, write_pool
+from torchrl_hmcts.envs.mazes.wall_growing import draw_mazes
 
 # The pool behind every published figure. If this changes, the figures have to be made again.
 GOLDEN_SHA256 = "cba98569ef76344ee619bbfc73b69ce3f545cf2dfba06fde46cb7d988c19d63c"

@@ -17,8 +17,8 @@ from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text, maze_pool
 from torchrl_hmcts.modules import OptionMemory, OptionModel, OptionModelEnv
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.waterworld.maze_window import MazeWindow
-from torchrl_hmcts.trainers.waterworld.option_model import (
+from torchrl_hmcts.trainers.experiments.waterworld.maze_window import MazeWindow
+from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
     OptionModelConfig,
     error_by_horizon,
     make_model_env,
@@ -27,7 +27,7 @@ from torchrl_hmcts.trainers.waterworld.option_model import (
     relabel_targets,
     train_option_model,
 )
-from torchrl_hmcts.trainers.waterworld.real_episodes import EpisodesInEachMaze, act
+from torchrl_hmcts.trainers.experiments.waterworld.real_episodes import EpisodesInEachMaze, act
 from torchrl_hmcts.transforms import OptionTransform
 
 LENGTH = 7

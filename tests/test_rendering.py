@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrl_hmcts.envs import GridworldMazeEnv, draw_maze, maze_from_text
-from torchrl_hmcts.envs.rendering import (
+from torchrl_hmcts.envs.mazes.rendering import (
     DOT_COLOR,
     FREE_COLOR,
     PLAYER_COLOR,

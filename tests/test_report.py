@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.experiments.run_folder import (
+from torchrl_hmcts.trainers.figures.comparison_page import group_runs
+from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
+from torchrl_hmcts.trainers.figures.page_parts import picture, plain
+from torchrl_hmcts.trainers.figures.report import write_page, write_run_page
+from torchrl_hmcts.trainers.runs.folder import (
     RunFolder,
     add_evaluation,
     load_config,
     read_curves,
     read_run,
 )
-from torchrl_hmcts.trainers.figures.comparison_page import group_runs
-from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
-from torchrl_hmcts.trainers.figures.page_parts import picture, plain
-from torchrl_hmcts.trainers.figures.report import write_page, write_run_page
 
 EVIL = '<script>alert("x")</script>'
 

@@ -12,15 +12,15 @@ import pytest
 import torch
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.config import DemoConfig
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-from torchrl_hmcts.trainers.experiments.run import open_run
-from torchrl_hmcts.trainers.experiments.run_folder import end_record, read_run
-from torchrl_hmcts.trainers.experiments.worker_file import find_worker, save_worker
+from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
 from torchrl_hmcts.trainers.figures.report import write_run_page
-from torchrl_hmcts.trainers.files import read_json, write_json
-from torchrl_hmcts.trainers.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.runs.folder import end_record, read_run
+from torchrl_hmcts.trainers.runs.run import open_run
+from torchrl_hmcts.trainers.runs.worker_file import find_worker, save_worker
+from torchrl_hmcts.trainers.saving.files import read_json, write_json
 
 
 def finish(out: Path, metrics: dict[str, Any], **captions: str) -> str:
@@ -109,7 +109,7 @@ def test_the_worker_of_a_run_is_one_file_named_with_its_step(tmp_path: Path) -> 
 
 
 def test_a_run_that_has_not_finished_shows_its_newest_checkpoint(tmp_path: Path) -> None:
-    from torchrl_hmcts.trainers.checkpoints import DurableRotation, plain_checkpoint
+    from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
 
     with open_run(DemoConfig(out=str(tmp_path))) as run:
         save_worker(run.path, make_loss(0), 64)  # of an earlier end; the run is being extended

@@ -20,16 +20,16 @@ import numpy as np
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.config import DemoConfig, RunConfig, home, parse_overrides
-from torchrl_hmcts.trainers.experiments.atari_config import AtariConfig
-from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.run import FolderRefused, open_run
-from torchrl_hmcts.trainers.experiments.run_folder import read_run
-from torchrl_hmcts.trainers.experiments.waterworld_config import WaterworldGoalsConfig
-from torchrl_hmcts.trainers.locking import FolderInUse, folder_locked, is_locked
+from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
+from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.waterworld.config import WaterworldGoalsConfig
+from torchrl_hmcts.trainers.runs.config import DemoConfig, RunConfig, home, parse_overrides
+from torchrl_hmcts.trainers.runs.folder import read_run
+from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
+from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
 
 CONFIGS = (DemoConfig, LabMazeConfig, WaterworldGoalsConfig, AtariConfig)
-DEMO = "torchrl_hmcts.trainers.demo.run_demo"
+DEMO = "torchrl_hmcts.trainers.experiments.demo.run_demo"
 
 
 @pytest.fixture(autouse=True)
@@ -351,8 +351,8 @@ def other_process(opened: str, until: str) -> Any:
     """A process that opens a run and is killed at the end of the context."""
     code = (
         "import time\n"
-        "from torchrl_hmcts.trainers.config import DemoConfig\n"
-        "from torchrl_hmcts.trainers.experiments.run import open_run\n"
+        "from torchrl_hmcts.trainers.runs.config import DemoConfig\n"
+        "from torchrl_hmcts.trainers.runs.run import open_run\n"
         f"with {opened}: time.sleep(100)"
     )
 

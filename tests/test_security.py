@@ -25,11 +25,11 @@ else:
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted(
     path
-    for folder in ("torchrl_hmcts", "envs", "trainers", "tests/benchmarks")
+    for folder in ("torchrl_hmcts", "envs", "trainers", "benchmarks")
     for path in (ROOT / folder).rglob("*.py")
 )
 # Bytes that a process of ours sends to another through a pipe; no file and no socket is read.
-PIPES = {"trainers/asynchronous/actor_learner.py"}
+PIPES = {"trainers/a3c/actor_learner.py"}
 SAFE_ONLY_WITH = {  # the argument that makes a call safe, and its value
     "torch.load": ("weights_only", True),
     "np.load": ("allow_pickle", False),

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_hmcts.envs import GridworldMazeEnv, LabMazeEnv, WaterworldMazeEnv, lab_maze
-from torchrl_hmcts.envs.mazes import generate_mazes
+from torchrl_hmcts.envs.mazes.layouts import generate_mazes
 
 SEEDS = [np.int64(3), np.int32(3), np.uint64(3), np.uint8(3), np.array(3), torch.tensor(3)]
 

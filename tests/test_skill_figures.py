@@ -14,13 +14,13 @@ from torchrl_hmcts.envs import maze_from_text
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
+from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
 from torchrl_hmcts.trainers.figures.skill_figures import (
     search_coverage,
     skill_figures,
     smallest_angle,
 )
 from torchrl_hmcts.trainers.figures.solving_curves import band, plot_solving_curves
-from torchrl_hmcts.trainers.waterworld.worker import make_option_env
 
 PUSH = TensorDictModule(lambda skill: skill, ["skill"], ["action"])  # skill z: thrust z
 

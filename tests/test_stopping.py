@@ -26,9 +26,9 @@ from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, resume, stopping
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.run_folder import read_run
-from torchrl_hmcts.trainers.locking import FolderInUse, folder_locked
-from torchrl_hmcts.trainers.stopping import Stopped
+from torchrl_hmcts.trainers.runs.folder import read_run
+from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
+from torchrl_hmcts.trainers.saving.stopping import Stopped
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
@@ -102,7 +102,7 @@ def test_a_training_stops_after_its_batch_and_continues_as_if_it_had_not(
 def test_a_second_signal_does_not_break_the_writing_of_a_checkpoint(
     tmp_path: Path, make: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch, capfd: Any
 ) -> None:
-    from torchrl_hmcts.trainers.checkpoints import DurableRotation
+    from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation
 
     save = DurableRotation.save
 
@@ -114,7 +114,7 @@ def test_a_second_signal_does_not_break_the_writing_of_a_checkpoint(
 
     monkeypatch.setattr(DurableRotation, "save", slowly)
     monkeypatch.setattr(resume, "FIRST_SAVE_SECONDS", 0.0)  # the first signal comes as it saves
-    monkeypatch.setattr("torchrl_hmcts.trainers.a3c.FIRST_SAVE_SECONDS", 0.0)
+    monkeypatch.setattr("torchrl_hmcts.trainers.a3c.trainer.FIRST_SAVE_SECONDS", 0.0)
     trainer = make(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         trainer.train()
@@ -211,7 +211,9 @@ def test_handlers_of_the_program_stay_and_an_ignored_signal_stays_ignored() -> N
 def test_a_stopped_run_is_recorded_and_says_how_to_continue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, signum: int, status: int
 ) -> None:
-    monkeypatch.setattr("torchrl_hmcts.trainers.demo.run_demo", lambda config: send(signum))
+    monkeypatch.setattr(
+        "torchrl_hmcts.trainers.experiments.demo.run_demo", lambda config: send(signum)
+    )
     assert main(["demo", f"out={tmp_path}/run"]) == status
     assert read_run(tmp_path / "run").status == "stopped"
     assert f"Continue with: hmcts train resume={tmp_path}/run" in capsys.readouterr().err
@@ -225,7 +227,7 @@ def test_a_process_that_the_same_signal_ended_makes_no_failed_run(
             send()
             raise RuntimeError("a process was killed by SIGINT")
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.demo.run_demo", killed)
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.demo.run_demo", killed)
     assert main(["demo", f"out={tmp_path}/run"]) == 130
     assert read_run(tmp_path / "run").status == "stopped"
 

@@ -12,11 +12,11 @@ import pytest
 from sqlalchemy.pool import NullPool
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.config import DemoConfig, RunConfig
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, Experiment
-from torchrl_hmcts.trainers.experiments.run_folder import start_record
-from torchrl_hmcts.trainers.experiments.sweep_space import Choice, Range, parse_space
-from torchrl_hmcts.trainers.locking import folder_locked
+from torchrl_hmcts.trainers.runs.config import DemoConfig, RunConfig
+from torchrl_hmcts.trainers.runs.folder import start_record
+from torchrl_hmcts.trainers.runs.sweep_space import Choice, Range, parse_space
+from torchrl_hmcts.trainers.saving.locking import folder_locked
 
 optuna = pytest.importorskip("optuna")
 
@@ -41,7 +41,7 @@ RUNS: list[ParabolaConfig] = []
 
 
 def run_parabola(config: ParabolaConfig) -> dict[str, Any]:
-    from torchrl_hmcts.trainers.experiments.loggers import make_logger
+    from torchrl_hmcts.trainers.runs.loggers import make_logger
 
     print("a trial talks")
     RUNS.append(config)

@@ -24,7 +24,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_from_text, maze_pool
-from torchrl_hmcts.envs.rendering import FREE_COLOR, PLAYER_COLOR, TARGET_COLOR, WALL_COLOR
+from torchrl_hmcts.envs.mazes.rendering import FREE_COLOR, PLAYER_COLOR, TARGET_COLOR, WALL_COLOR
 
 UP, DOWN, LEFT, RIGHT = range(4)
 STATE_KEYS = ["position", "velocity", "target", "maze_index", "step_count"]

@@ -6,50 +6,72 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchrl_hmcts.trainers.a3c import A3CTrainer
-    from torchrl_hmcts.trainers.asynchronous.learner_processes import LearnerError
-    from torchrl_hmcts.trainers.asynchronous.shared_optimizers import (
+    from torchrl_hmcts.trainers.a3c.learner_processes import LearnerError
+    from torchrl_hmcts.trainers.a3c.shared_optimizers import (
         SharedAdam,
         SharedRMSprop,
         share_optimizer,
     )
-    from torchrl_hmcts.trainers.atari.agent import (
+    from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
+    from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
+    from torchrl_hmcts.trainers.experiments.atari.agent import (
         AtariAgent,
         AtariProgress,
         AtariSearch,
     )
-    from torchrl_hmcts.trainers.atari.goals import (
+    from torchrl_hmcts.trainers.experiments.atari.goals import (
         Candidate,
         GoalFinder,
         GoalSearch,
     )
-    from torchrl_hmcts.trainers.atari.guide import SearchGuide
-    from torchrl_hmcts.trainers.atari.learned_sources import DIAYNSource, DistilledSource
-    from torchrl_hmcts.trainers.atari.options import Options, WorkerSource, load_options
-    from torchrl_hmcts.trainers.atari.sources import (
+    from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
+    from torchrl_hmcts.trainers.experiments.atari.learned_sources import (
+        DIAYNSource,
+        DistilledSource,
+    )
+    from torchrl_hmcts.trainers.experiments.atari.options import Options, WorkerSource, load_options
+    from torchrl_hmcts.trainers.experiments.atari.sources import (
         ActionSetSource,
         ActionSource,
         BestSource,
         GoalSource,
         RepeatSource,
     )
-    from torchrl_hmcts.trainers.atari.trained_sources import (
+    from torchrl_hmcts.trainers.experiments.atari.trained_sources import (
         FineTunedSource,
         OptionGoals,
         RetrainedSource,
     )
-    from torchrl_hmcts.trainers.checkpoints import DurableRotation, plain_checkpoint
-    from torchrl_hmcts.trainers.config import DemoConfig
-    from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
+    from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import (
+        GoalEpisodes,
+        GoalTrack,
+        run_goal_episodes,
+    )
+    from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
+        TilePlanner,
+        make_goal_env,
+        make_tile_planner,
+    )
+    from torchrl_hmcts.trainers.experiments.waterworld.networks import (
+        MazeNetwork,
+        shortest_distances,
+    )
+    from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
     from torchrl_hmcts.trainers.expert_iteration import (
         ExpertIterationTrainer,
         SearchCollector,
         make_guided_planner,
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-    from torchrl_hmcts.trainers.locking import FolderInUse
     from torchrl_hmcts.trainers.restarting_collector import CollectorError
-    from torchrl_hmcts.trainers.resume import GeneratorStates, ResumableTrainer, RunningEpisodes
+    from torchrl_hmcts.trainers.runs.config import DemoConfig
+    from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
+    from torchrl_hmcts.trainers.saving.locking import FolderInUse
+    from torchrl_hmcts.trainers.saving.resume import (
+        GeneratorStates,
+        ResumableTrainer,
+        RunningEpisodes,
+    )
     from torchrl_hmcts.trainers.skills.controllability import (
         Controllability,
         probe_controllability,
@@ -65,18 +87,6 @@ if TYPE_CHECKING:
         learn_termination,
         make_terminating_env,
     )
-    from torchrl_hmcts.trainers.waterworld.goal_episodes import (
-        GoalEpisodes,
-        GoalTrack,
-        run_goal_episodes,
-    )
-    from torchrl_hmcts.trainers.waterworld.goal_planning import (
-        TilePlanner,
-        make_goal_env,
-        make_tile_planner,
-    )
-    from torchrl_hmcts.trainers.waterworld.networks import MazeNetwork, shortest_distances
-    from torchrl_hmcts.trainers.waterworld.scripted_expert import ScriptedExpert
 
 __all__ = [
     "A3CTrainer",
@@ -145,68 +155,68 @@ __all__ = [
 
 # Imported when asked for: the command line answers --help without loading torch.
 _MODULES = {
-    "A3CTrainer": "a3c",
-    "ActionSetSource": "atari.sources",
-    "ActionSource": "atari.sources",
-    "AtariAgent": "atari.agent",
-    "AtariProgress": "atari.agent",
-    "AtariSearch": "atari.agent",
-    "BestSource": "atari.sources",
-    "Candidate": "atari.goals",
+    "A3CTrainer": "a3c.trainer",
+    "ActionSetSource": "experiments.atari.sources",
+    "ActionSource": "experiments.atari.sources",
+    "AtariAgent": "experiments.atari.agent",
+    "AtariProgress": "experiments.atari.agent",
+    "AtariSearch": "experiments.atari.agent",
+    "BestSource": "experiments.atari.sources",
+    "Candidate": "experiments.atari.goals",
     "CollectorError": "restarting_collector",
     "Controllability": "skills.controllability",
-    "DIAYNSource": "atari.learned_sources",
+    "DIAYNSource": "experiments.atari.learned_sources",
     "DIAYNTrainer": "diayn",
-    "DemoConfig": "config",
-    "DistilledSource": "atari.learned_sources",
-    "DurableRotation": "checkpoints",
+    "DemoConfig": "runs.config",
+    "DistilledSource": "experiments.atari.learned_sources",
+    "DurableRotation": "saving.checkpoints",
     "ExpertIterationTrainer": "expert_iteration",
-    "GeneratorStates": "resume",
-    "GoalEpisodes": "waterworld.goal_episodes",
-    "FineTunedSource": "atari.trained_sources",
-    "OptionGoals": "atari.trained_sources",
-    "RetrainedSource": "atari.trained_sources",
-    "SearchGuide": "atari.guide",
-    "GoalFinder": "atari.goals",
-    "GoalSearch": "atari.goals",
-    "GoalSource": "atari.sources",
-    "GoalTrack": "waterworld.goal_episodes",
+    "GeneratorStates": "saving.resume",
+    "GoalEpisodes": "experiments.waterworld.goal_episodes",
+    "FineTunedSource": "experiments.atari.trained_sources",
+    "OptionGoals": "experiments.atari.trained_sources",
+    "RetrainedSource": "experiments.atari.trained_sources",
+    "SearchGuide": "experiments.atari.guide",
+    "GoalFinder": "experiments.atari.goals",
+    "GoalSearch": "experiments.atari.goals",
+    "GoalSource": "experiments.atari.sources",
+    "GoalTrack": "experiments.waterworld.goal_episodes",
     "GrowSkills": "skills.growing",
     "HMCTSTrainer": "hmcts",
     "HindsightTransitions": "skills.hindsight",
-    "FolderInUse": "locking",
-    "LearnerError": "asynchronous.learner_processes",
-    "MazeNetwork": "waterworld.networks",
+    "FolderInUse": "saving.locking",
+    "LearnerError": "a3c.learner_processes",
+    "MazeNetwork": "experiments.waterworld.networks",
     "MazeView": "skills.hindsight",
-    "Options": "atari.options",
-    "RepeatSource": "atari.sources",
-    "ResumableTrainer": "resume",
-    "RunningEpisodes": "resume",
-    "ScriptedExpert": "waterworld.scripted_expert",
+    "Options": "experiments.atari.options",
+    "RepeatSource": "experiments.atari.sources",
+    "ResumableTrainer": "saving.resume",
+    "RunningEpisodes": "saving.resume",
+    "ScriptedExpert": "experiments.waterworld.scripted_expert",
     "SearchCollector": "expert_iteration",
     "SearchCoverage": "skills.growing",
-    "SharedAdam": "asynchronous.shared_optimizers",
-    "SharedRMSprop": "asynchronous.shared_optimizers",
+    "SharedAdam": "a3c.shared_optimizers",
+    "SharedRMSprop": "a3c.shared_optimizers",
     "SkillRewardHook": "skills.reward_hook",
     "StateCoverage": "skills.coverage",
     "TerminationConfig": "skills.termination",
     "TerminationResult": "skills.termination",
-    "TilePlanner": "waterworld.goal_planning",
-    "WorkerSource": "atari.options",
+    "TilePlanner": "experiments.waterworld.goal_planning",
+    "WorkerSource": "experiments.atari.options",
     "collect_option_steps": "skills.termination",
     "learn_termination": "skills.termination",
-    "load_options": "atari.options",
-    "make_goal_env": "waterworld.goal_planning",
+    "load_options": "experiments.atari.options",
+    "make_goal_env": "experiments.waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
     "make_skill_optimizer": "diayn",
     "make_terminating_env": "skills.termination",
-    "make_tile_planner": "waterworld.goal_planning",
+    "make_tile_planner": "experiments.waterworld.goal_planning",
     "num_places": "skills.growing",
-    "plain_checkpoint": "checkpoints",
+    "plain_checkpoint": "saving.checkpoints",
     "probe_controllability": "skills.controllability",
-    "run_goal_episodes": "waterworld.goal_episodes",
-    "share_optimizer": "asynchronous.shared_optimizers",
-    "shortest_distances": "waterworld.networks",
+    "run_goal_episodes": "experiments.waterworld.goal_episodes",
+    "share_optimizer": "a3c.shared_optimizers",
+    "shortest_distances": "experiments.waterworld.networks",
 }
 
 

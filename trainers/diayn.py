@@ -25,7 +25,7 @@ from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, DiscreteSkillSACLoss, SkillObjective
 from torchrl_hmcts.trainers.restarting_collector import CollectorError
-from torchrl_hmcts.trainers.resume import ResumableTrainer
+from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
 from torchrl_hmcts.trainers.skills.curves import Curves, log_curves
 from torchrl_hmcts.transforms import SkillReward
@@ -338,7 +338,7 @@ def make_skill_optimizer(
 
     Examples:
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
-        >>> from torchrl_hmcts.trainers.waterworld.worker import make_training_env
+        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
         >>> loss = DIAYNTrainer.make_loss(make_training_env(copies=1))
         >>> [(g["name"], g["lr"]) for g in make_skill_optimizer(loss).param_groups]
         [('actor', 0.002), ('critic', 0.003), ('objective', 0.01)]

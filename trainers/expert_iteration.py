@@ -27,7 +27,7 @@ from torchrl_hmcts.planners import (
     search_examples,
 )
 from torchrl_hmcts.trainers.diayn import Progress
-from torchrl_hmcts.trainers.resume import ResumableTrainer
+from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 
 _TARGETS = ("policy_target", "policy_weight", "value_target", "value_weight", "action_mask")
 
@@ -66,7 +66,7 @@ def make_guided_planner(
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
         >>> from torchrl_hmcts.trainers.expert_iteration import make_guided_planner
-        >>> from torchrl_hmcts.trainers.waterworld.networks import MazeNetwork
+        >>> from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
         >>> env = WaterworldMazeEnv(observation=False)  # plans base steps, for example
         >>> make_guided_planner(env, MazeNetwork(env.mazes)).num_options
         4

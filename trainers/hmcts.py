@@ -21,7 +21,7 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MCTSPlanner, SearchBudget
 from torchrl_hmcts.trainers.diayn import Progress, make_skill_optimizer
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
-from torchrl_hmcts.trainers.resume import ResumableTrainer
+from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.skills.dataset import UnionSampler, load_dataset
 from torchrl_hmcts.trainers.skills.rounds import PlanningRounds, RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
@@ -117,7 +117,7 @@ class HMCTSTrainer(ResumableTrainer):
         >>> from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer
         >>> from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-        >>> from torchrl_hmcts.trainers.waterworld.worker import make_training_env
+        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
         >>> loss = DIAYNTrainer.make_loss(make_training_env(), num_skills=4, seed=0)
         >>> trainer = HMCTSTrainer(
         ...     partial(WaterworldMazeEnv, observation=False), loss,

@@ -10,15 +10,15 @@ from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import split_words
-from torchrl_hmcts.trainers.config import home, parse_overrides
-from torchrl_hmcts.trainers.experiments.run_folder import (
+from torchrl_hmcts.trainers.runs.config import home, parse_overrides
+from torchrl_hmcts.trainers.runs.folder import (
     add_evaluation,
     load_config,
     read_run,
     shown_word,
 )
-from torchrl_hmcts.trainers.files import left_out
-from torchrl_hmcts.trainers.locking import is_locked
+from torchrl_hmcts.trainers.saving.files import left_out
+from torchrl_hmcts.trainers.saving.locking import is_locked
 
 
 def evaluate(words: Sequence[str]) -> int:
@@ -52,7 +52,7 @@ def evaluate(words: Sequence[str]) -> int:
     if is_locked(run.path):
         print(f"{run.path} is still running: its newest checkpoint is tested.", file=sys.stderr)
     from torchrl_hmcts.trainers.figures.report import machine, versions, write_run_page
-    from torchrl_hmcts.trainers.files import finite
+    from torchrl_hmcts.trainers.saving.files import finite
 
     try:
         with said(own.get("log_level", "info")):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import folders_of, split_words
-from torchrl_hmcts.trainers.config import home
+from torchrl_hmcts.trainers.runs.config import home
 
 _OWN = ("figure", "out", "results")
 

@@ -10,17 +10,17 @@ from collections.abc import Iterator, Sequence
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVELS, set_log_level, split_words
-from torchrl_hmcts.trainers.config import parse_overrides, read_value
 from torchrl_hmcts.trainers.experiments.registry import (
     EXPERIMENTS,
     ExperimentError,
     find_experiment,
 )
-from torchrl_hmcts.trainers.experiments.run_folder import shown_word
-from torchrl_hmcts.trainers.experiments.sweep_space import parse_space
-from torchrl_hmcts.trainers.files import left_out, write_json
-from torchrl_hmcts.trainers.locking import FolderInUse
-from torchrl_hmcts.trainers.stopping import Stopped, signals_handled
+from torchrl_hmcts.trainers.runs.config import parse_overrides, read_value
+from torchrl_hmcts.trainers.runs.folder import shown_word
+from torchrl_hmcts.trainers.runs.sweep_space import parse_space
+from torchrl_hmcts.trainers.saving.files import left_out, write_json
+from torchrl_hmcts.trainers.saving.locking import FolderInUse
+from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled
 
 _OWN = ("experiment", "trials", "objective", "storage", "prune", "out")
 _DEFAULT_TRIALS = 20
@@ -48,7 +48,7 @@ def sweep(words: Sequence[str]) -> int:
         level = own.get("log_level", "info")
         if level not in LOG_LEVELS:
             set_log_level(level)  # raises
-        from torchrl_hmcts.trainers.experiments.sweep import Sweep
+        from torchrl_hmcts.trainers.runs.sweep import Sweep
 
         plan = Sweep(experiment, config, space, objective, own.get("storage"), prune, config.seed)
         study = plan.study()  # before any trial: says what is wrong with storage or folder
@@ -83,8 +83,8 @@ def sweep(words: Sequence[str]) -> int:
 
 
 def _page(plan: object, study: object, command: str) -> str:
-    from torchrl_hmcts.trainers.experiments.sweep import Sweep, importances, trial_rows
     from torchrl_hmcts.trainers.figures.sweep_page import write_sweep_page
+    from torchrl_hmcts.trainers.runs.sweep import Sweep, importances, trial_rows
 
     assert isinstance(plan, Sweep)
     rows, shares = trial_rows(study), importances(study)  # type: ignore[arg-type]

@@ -11,15 +11,15 @@ from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import missing, refuse, run_experiment
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVELS, set_log_level, split_words
-from torchrl_hmcts.trainers.config import BOOL_WORDS, home, parse_overrides
 from torchrl_hmcts.trainers.experiments.registry import (
     DEMO,
     EXPERIMENTS,
     Experiment,
     find_experiment,
 )
-from torchrl_hmcts.trainers.experiments.run import resume_command, run_files
-from torchrl_hmcts.trainers.experiments.run_folder import load_config, read_run
+from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, home, parse_overrides
+from torchrl_hmcts.trainers.runs.folder import load_config, read_run
+from torchrl_hmcts.trainers.runs.run import resume_command, run_files
 
 
 def demo(words: Sequence[str]) -> int:

@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Sequence
 
-from torchrl_hmcts.trainers.config import home, unknown_key
+from torchrl_hmcts.trainers.runs.config import home, unknown_key
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 LOG_LEVEL_HELP = (

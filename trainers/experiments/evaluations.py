@@ -13,26 +13,26 @@ from torchrl.objectives import LossModule
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.checkpoints import plain_checkpoint
-from torchrl_hmcts.trainers.config import DemoConfig
-from torchrl_hmcts.trainers.demo import make_starts
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
-from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.waterworld import make_agent_env, make_agent_loss
-from torchrl_hmcts.trainers.experiments.waterworld_config import (
-    WaterworldA3CConfig,
-    WaterworldGoalsConfig,
-)
-from torchrl_hmcts.trainers.experiments.worker_file import find_worker
-from torchrl_hmcts.trainers.lab.evaluation import (
+from torchrl_hmcts.trainers.experiments.demo import make_starts
+from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     solve_mazes,
     solve_with_wrong_model,
     wrong_models,
 )
-from torchrl_hmcts.trainers.lab.worker import make_worker_loss
-from torchrl_hmcts.trainers.waterworld.agents import play_mazes
-from torchrl_hmcts.trainers.waterworld.worker import make_option_env, make_training_env
+from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
+from torchrl_hmcts.trainers.experiments.waterworld.agents import play_mazes
+from torchrl_hmcts.trainers.experiments.waterworld.config import (
+    WaterworldA3CConfig,
+    WaterworldGoalsConfig,
+)
+from torchrl_hmcts.trainers.experiments.waterworld.run import make_agent_env, make_agent_loss
+from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env, make_training_env
+from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.runs.worker_file import find_worker
+from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
 
 
 def load_networks(loss_module: LossModule, run: str | Path) -> Path:
@@ -116,7 +116,7 @@ def evaluate_waterworld(config: WaterworldA3CConfig) -> dict[str, Any]:
         Dissertation, figure 3.6.
     """
     if config.toy:
-        from torchrl_hmcts.trainers.experiments.waterworld import TOY
+        from torchrl_hmcts.trainers.experiments.waterworld.run import TOY
 
         config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)
@@ -147,7 +147,7 @@ def evaluate_labmaze(config: LabMazeConfig) -> dict[str, Any]:
         Dissertation, figure 4.10.
     """
     if config.toy:
-        from torchrl_hmcts.trainers.experiments.labmaze import TOY
+        from torchrl_hmcts.trainers.experiments.lab.run import TOY
 
         config = dataclasses.replace(config, **TOY)
     torch.set_num_threads(1)

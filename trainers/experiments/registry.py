@@ -93,8 +93,8 @@ EXPERIMENTS = {
         Experiment(
             "waterworld_goals",
             "chapter 3's goal-based agent: tree search over tiles sets goals, A3C reaches them",
-            ".waterworld_config:WaterworldGoalsConfig",
-            ".waterworld:run_waterworld",
+            ".waterworld.config:WaterworldGoalsConfig",
+            ".waterworld.run:run_waterworld",
             ".evaluations:evaluate_waterworld",
             objective="test.solved_share",
             progress="eval_solved_share",
@@ -102,8 +102,8 @@ EXPERIMENTS = {
         Experiment(
             "waterworld_a3c",
             "chapter 3's comparison: A3C alone on the same mazes, network and budget",
-            ".waterworld_config:WaterworldA3CConfig",
-            ".waterworld:run_waterworld",
+            ".waterworld.config:WaterworldA3CConfig",
+            ".waterworld.run:run_waterworld",
             ".evaluations:evaluate_waterworld",
             objective="test.solved_share",
             progress="eval_solved_share",
@@ -111,8 +111,8 @@ EXPERIMENTS = {
         Experiment(
             "labmaze",
             "chapter 4: tree search over skills learned by DIAYN in DeepMind Lab's random maze",
-            ".labmaze_config:LabMazeConfig",
-            ".labmaze:run_labmaze",
+            ".lab.config:LabMazeConfig",
+            ".lab.run:run_labmaze",
             ".evaluations:evaluate_labmaze",
             objective="test.solved",
             progress="test_solved",
@@ -120,9 +120,9 @@ EXPERIMENTS = {
         Experiment(
             "atari",
             "chapter 5: tree search over options on the RAM of an Atari game",
-            ".atari_config:AtariConfig",
-            ".atari:run_atari",
-            ".atari:evaluate_atari",
+            ".atari.config:AtariConfig",
+            ".atari.run:run_atari",
+            ".atari.run:evaluate_atari",
             objective="score_max",
         ),
     )
@@ -131,8 +131,8 @@ EXPERIMENTS = {
 DEMO = Experiment(
     "demo",
     "learn four skills and solve random mazes",
-    "..config:DemoConfig",
-    "..demo:run_demo",
+    "..runs.config:DemoConfig",
+    ".demo:run_demo",
     ".evaluations:evaluate_demo",
 )
 ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS}
@@ -170,7 +170,7 @@ def field_docs(config_class: type) -> dict[str, str]:
         config_class: a dataclass; fields of its base classes are included.
 
     Example:
-        >>> from torchrl_hmcts.trainers.config import DemoConfig
+        >>> from torchrl_hmcts.trainers.runs.config import DemoConfig
         >>> field_docs(DemoConfig)["gamma"]
         'Discount per base step.'
     """

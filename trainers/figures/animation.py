@@ -11,11 +11,11 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.trainers.figures.plots import option_rgb
-from torchrl_hmcts.trainers.files import left_out, replacing
+from torchrl_hmcts.trainers.saving.files import left_out, replacing
 
 if TYPE_CHECKING:
     from torchrl_hmcts.envs import WaterworldMazeEnv
-    from torchrl_hmcts.trainers.demo import Episode
+    from torchrl_hmcts.trainers.experiments.demo import Episode
 
 _VIDEO_SECONDS = 300  # after which ffmpeg is given up
 

@@ -23,13 +23,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from torchrl_hmcts.trainers.experiments.run_folder import RunCurve
 from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
 from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
 from torchrl_hmcts.trainers.figures.pictures import save_figure
-from torchrl_hmcts.trainers.files import write_text
+from torchrl_hmcts.trainers.runs.folder import RunCurve
+from torchrl_hmcts.trainers.saving.files import write_text
 
 _FEW = 30
 RUNNING = "score_of_the_running_episode"

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
-from torchrl_hmcts.trainers.demo import make_starts
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, load_config
+from torchrl_hmcts.trainers.experiments.demo import make_starts
+from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import run_goal_episodes
+from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
+from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
 from torchrl_hmcts.trainers.figures.goal_figures import plot_goals, plot_macro_env, plot_tile_search
 from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
-from torchrl_hmcts.trainers.waterworld.goal_episodes import run_goal_episodes
-from torchrl_hmcts.trainers.waterworld.goal_planning import make_goal_env
-from torchrl_hmcts.trainers.waterworld.scripted_expert import ScriptedExpert
+from torchrl_hmcts.trainers.runs.folder import RunFolder, load_config
 
 AGENTS = {"waterworld_goals": "goal-based agent", "waterworld_a3c": "A3C without goals"}
 _MAZES = 20  # of the test split, of which one with a rather long way is shown
@@ -51,7 +51,10 @@ def draw_goals(sources: Sources, path: Path, name: str) -> str:
     env = make_goal_env(maze_pool("test"), observation=bool(runs))
     if runs:
         from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-        from torchrl_hmcts.trainers.experiments.waterworld import make_agent_env, make_agent_loss
+        from torchrl_hmcts.trainers.experiments.waterworld.run import (
+            make_agent_env,
+            make_agent_loss,
+        )
 
         config = load_config(runs[0])[1]
         env = make_agent_env(config, maze_pool("test"))

@@ -13,8 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.experiments.labmaze_config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, load_config, read_curves
+from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.lab.training import curve_script_frames
+from torchrl_hmcts.trainers.experiments.lab.worker import (
+    held_out_seeds,
+    make_lab_env,
+    make_worker_loss,
+)
 from torchrl_hmcts.trainers.figures.curve_panels import common_steps
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
 from torchrl_hmcts.trainers.figures.lab_figures import (
@@ -23,8 +28,7 @@ from torchrl_hmcts.trainers.figures.lab_figures import (
     plot_skill_fan,
 )
 from torchrl_hmcts.trainers.figures.pictures import save_figure
-from torchrl_hmcts.trainers.lab.training import curve_script_frames
-from torchrl_hmcts.trainers.lab.worker import held_out_seeds, make_lab_env, make_worker_loss
+from torchrl_hmcts.trainers.runs.folder import RunFolder, load_config, read_curves
 
 _NAMES = {"diayn": "DIAYN", "hmcts": "Algorithm 3"}
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, is_run, read_run
 from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS, panel
 from torchrl_hmcts.trainers.figures.foreign_files import refuse_foreign
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
@@ -29,7 +28,8 @@ from torchrl_hmcts.trainers.figures.page_parts import (
 )
 from torchrl_hmcts.trainers.figures.report import say_damage
 from torchrl_hmcts.trainers.figures.run_page import config_table, damage_of, flatten
-from torchrl_hmcts.trainers.files import left_out, write_text
+from torchrl_hmcts.trainers.runs.folder import RunFolder, is_run, read_run
+from torchrl_hmcts.trainers.saving.files import left_out, write_text
 
 _NOT_COMPARED = ("seed", "out", "resume", "logger")  # keys in which runs of a group may differ
 _SEEDS_FOR_IQM = 4

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from torchrl_hmcts.trainers.experiments.run_folder import RunCurve
+from torchrl_hmcts.trainers.runs.folder import RunCurve
 
 GROUP_COLORS = (
     "#1d4ed8", "#d97706", "#16a34a", "#7c3aed", "#db2777", "#0891b2", "#854d0e", "#4b5563",

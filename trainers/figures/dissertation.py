@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, is_run, read_run
 from torchrl_hmcts.trainers.figures.foreign_files import refuse_foreign, stamp
-from torchrl_hmcts.trainers.files import write_text
+from torchrl_hmcts.trainers.runs.folder import RunFolder, is_run, read_run
+from torchrl_hmcts.trainers.saving.files import write_text
 
 _LAB_RUNS = "hmcts train experiment=labmaze seed={seed} out=runs/labmaze_{seed}"
 _GOAL_RUNS = "hmcts train experiment=waterworld_goals seed={seed} out=runs/goals_{seed}"

@@ -15,13 +15,13 @@ from matplotlib.patches import Rectangle
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
-from torchrl_hmcts.envs.rendering import PLAYER_COLOR, TARGET_COLOR
+from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, TARGET_COLOR
 from torchrl_hmcts.planners.drawing import option_color
+from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import GoalTrack
+from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_tile_planner
 from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.trainers.figures.plots import legend_below
-from torchrl_hmcts.trainers.waterworld.goal_episodes import GoalTrack
-from torchrl_hmcts.trainers.waterworld.goal_planning import make_tile_planner
 
 _TRAIL_COLOR = (147, 178, 245)  # the player's blue, pale
 _ACTIONS = ("up", "down", "left", "right", "none")

@@ -125,7 +125,7 @@ def plot_frames_curves(
     """Draw the mean frames of an episode and the share of mazes solved against training.
 
     Args:
-        curves: of :func:`~torchrl_hmcts.trainers.lab.evaluation.frames_curve`, one per seed; the
+        curves: of ``frames_curve``, one per seed; the
             band is from the least to the largest.
         path: PNG to write.
         title: heading of the picture.

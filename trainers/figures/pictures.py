@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchrl_hmcts.trainers.files import left_out, replacing
+from torchrl_hmcts.trainers.saving.files import left_out, replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

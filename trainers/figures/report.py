@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts import __version__
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, is_run, read_run
 from torchrl_hmcts.trainers.figures.foreign_files import refuse_foreign
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.files import left_out, write_json, write_text
+from torchrl_hmcts.trainers.runs.folder import RunFolder, is_run, read_run
+from torchrl_hmcts.trainers.saving.files import left_out, write_json, write_text
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "numpy")
 

@@ -7,7 +7,6 @@ from dataclasses import fields
 from typing import Any
 
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, field_docs
-from torchrl_hmcts.trainers.experiments.run_folder import RunFolder, shown_path
 from torchrl_hmcts.trainers.figures.curve_panels import panel
 from torchrl_hmcts.trainers.figures.page_parts import (
     Html,
@@ -20,7 +19,8 @@ from torchrl_hmcts.trainers.figures.page_parts import (
     table,
     text,
 )
-from torchrl_hmcts.trainers.files import left_out
+from torchrl_hmcts.trainers.runs.folder import RunFolder, shown_path
+from torchrl_hmcts.trainers.saving.files import left_out
 
 
 def run_page(run: RunFolder, *, embed: bool = False) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl_hmcts.trainers.figures.page_parts import Html, page, picture, section, table, text
 from torchrl_hmcts.trainers.figures.pictures import Pictures, save_figure
-from torchrl_hmcts.trainers.files import write_text
+from torchrl_hmcts.trainers.saving.files import write_text
 
 _COLOR = "#1d4ed8"
 
@@ -38,7 +38,7 @@ def plot_trials(rows: Sequence[Mapping[str, Any]], path: str | Path, *, objectiv
     """Draw the figure of every finished trial, and the best so far.
 
     Args:
-        rows: of :func:`~torchrl_hmcts.trainers.experiments.sweep.trial_rows`.
+        rows: of :func:`~torchrl_hmcts.trainers.runs.sweep.trial_rows`.
         path: PNG to write.
         objective: name of the figure; with a minus before it, less is better.
     """

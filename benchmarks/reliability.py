@@ -1,0 +1,206 @@
+"""Counts of faults survived, cases fuzzed, runs resumed and contracts kept, for docs/results.
+
+    python benchmarks/reliability.py                    (all but the slow ones)
+    python benchmarks/reliability.py kills              (60, of every experiment)
+    python benchmarks/reliability.py damage             (1,000 damaged files of each kind)
+    python benchmarks/reliability.py fuzz --slow        (100,000 cases)
+    python benchmarks/reliability.py ray                (kills processes of a Ray cluster)
+    python benchmarks/reliability.py coverage           (reads what `make coverage` measured)
+
+Each part is a file of its own: kills.json, damage.json, fuzz.json, fuzz_slow.json, tests.json,
+contracts.json, ray.json, leaks.json, coverage.json, with the command that made it; a test that
+fails is named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+GROUPS = {  # what is counted, and the tests that show it
+    "faults_injected_and_survived": [
+        "tests/test_fault_checkpoints.py",
+        "tests/test_fault_collectors.py",
+        "tests/test_a3c_trainer.py::TestProcesses::"
+        "test_a_learners_exception_ends_the_run_with_a_checkpoint_its_name_and_its_traceback",
+        "tests/test_a3c_trainer.py::TestProcesses::test_a_killed_learner_is_noticed_soon",
+        "tests/test_a3c_trainer.py::TestProcesses::test_ctrl_c_stops_all_saves_and_says_how_to_go_on",
+        "tests/test_a3c_trainer.py::TestProcesses::test_learners_end_when_their_parent_is_killed",
+        "tests/test_atari_pool.py::test_an_option_is_run_again_when_its_process_crashes",
+        "tests/test_atari_pool.py::test_processes_that_die_again_and_again_are_an_error",
+        "tests/test_atari_pool.py::test_killed_processes_do_not_change_a_search",
+    ],
+    "runs_resumed_and_compared": [  # bit for bit, but for A3C's, whose counters are compared
+        "tests/test_trainer_resume.py::"
+        "test_a_run_resumed_in_a_new_process_ends_bit_for_bit_as_one_that_never_stopped",
+        "tests/test_trainer_resume.py::test_episodes_of_a_collector_go_on_in_another",
+        "tests/test_hmcts_trainer.py::"
+        "test_a_run_resumed_in_a_new_process_is_the_unbroken_run_bit_for_bit",
+        "tests/test_expert_iteration.py::"
+        "test_a_run_that_was_stopped_and_loaded_is_the_run_that_never_stopped",
+        "tests/test_expert_iteration.py::test_a_collector_goes_on_where_another_stopped",
+        "tests/test_growing_skills.py::test_a_resumed_run_is_the_same_as_one_that_never_stopped",
+        "tests/test_a3c_trainer.py::TestCheckpoints::"
+        "test_a_resumed_run_goes_on_with_counters_state_and_curves",
+        "tests/test_atari_agent.py::"
+        "test_play_goes_on_bit_for_bit_from_where_the_tree_is_planted_anew",
+        "tests/test_atari_agent.py::test_a_run_in_pieces_is_the_run_in_one",
+        "tests/test_determinism.py::"
+        "test_an_atari_run_stopped_and_loaded_in_a_new_process_is_the_run_that_never_stopped",
+    ],
+    "runs_repeated_and_compared": [
+        "tests/test_determinism.py::test_one_thread_and_two_give_the_same_bits",
+        "tests/test_determinism.py::test_a_search_is_a_function_of_its_seed",
+        "tests/test_demo.py::test_the_same_seed_gives_the_same_figures",
+        "tests/test_a3c_trainer.py::TestInThisProcess::"
+        "test_two_runs_of_a_seed_are_the_same_bit_for_bit_and_those_of_two_seeds_are_not",
+        "tests/test_a3c_trainer.py::TestProcesses::"
+        "test_one_learner_in_a_process_does_what_it_does_in_this_one",
+    ],
+    "security": ["tests/test_security.py"],
+}
+CONTRACTS = ["transforms", "losses", "envs"]
+EVERY = "slow or not slow"
+
+
+def run_pytest(*words: str, **environment: str) -> dict[str, Any]:
+    """Runs tests; returns how many passed, failed and were skipped, and the CPU seconds."""
+    begin = os.times()
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+    )
+    end = os.times()
+    last = (done.stdout.strip().splitlines() or [""])[-1]
+    counts: dict[str, Any] = {
+        word: int(n) for n, word in re.findall(r"(\d+) (passed|failed|skipped|error)", last)
+    }
+    bad = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    if bad or not counts:
+        counts["failures"] = bad or [last]
+    seconds = end.children_user + end.children_system
+    seconds -= begin.children_user + begin.children_system
+    return {**counts, "cpu_seconds": round(seconds, 1)}
+
+
+def kills(number: int) -> dict[str, Any]:
+    command = [sys.executable, "benchmarks/kills.py", "--kills", str(number)]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def damage(number: int) -> dict[str, Any]:
+    command = [sys.executable, "tests/test_fault_damage.py", str(number)]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def fuzz(slow: bool) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "counts"
+        result = run_pytest(
+            "tests/test_fuzz_constructors.py",
+            "tests/test_fuzz_inputs.py",
+            *("-m", EVERY if slow else "not slow"),
+            *("-k", "not ten_times"),  # which is this, in a process of its own
+            TORCHRL_HMCTS_FUZZ_COUNT=str(path),
+            TORCHRL_HMCTS_FUZZ_TIMES="10" if slow else "1",
+        )
+        rows = [line.rsplit(" ", 1) for line in path.read_text().splitlines()]
+    cases = {name: int(count) for name, count in rows}
+    return {"cases": cases, "all_cases": sum(cases.values()), **result}
+
+
+def leaks() -> dict[str, Any]:
+    command = [sys.executable, "tests/test_fault_leaks.py"]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def coverage() -> dict[str, Any]:
+    """Returns the share of the lines that the tests reach, by folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "coverage.json"
+        words = ["-m", "coverage", "json", "-q", "-o", str(path)]
+        subprocess.run([sys.executable, *words], cwd=ROOT, check=True)
+        files = json.loads(path.read_text())["files"]
+    found: dict[str, dict[str, Any]] = {}
+    for name, file in files.items():
+        for group in (Path(name).parts[0], "all"):
+            row = found.setdefault(group, {"lines": 0, "reached": 0})
+            row["lines"] += file["summary"]["num_statements"]
+            row["reached"] += file["summary"]["covered_lines"]
+    for row in found.values():
+        row["share"] = round(row["reached"] / row["lines"], 4)
+    return {"folders": found}
+
+
+PARTS = ["kills", "damage", "fuzz", "tests", "contracts", "leaks", "ray", "coverage"]
+SEPARATE = ["ray", "coverage"]  # what needs more than the extra dev, or a run before
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "parts", nargs="*", help=f"of {', '.join(PARTS)}; default: all but {SEPARATE}"
+    )
+    parser.add_argument("--kills", type=int, default=60)
+    parser.add_argument("--damaged", type=int, default=1_000, help="files of each kind")
+    parser.add_argument("--slow", action="store_true", help="fuzz 100,000 cases")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "reliability")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    command = "python benchmarks/reliability.py"
+    for part in arguments.parts or [part for part in PARTS if part not in SEPARATE]:
+        begin, words, name = time.time(), part, part
+        if part == "kills":
+            words = f"kills --kills {arguments.kills}"
+            figures = kills(arguments.kills)
+        elif part == "damage":
+            words = f"damage --damaged {arguments.damaged}"
+            figures = damage(arguments.damaged)
+        elif part == "fuzz":
+            words, name = ("fuzz --slow", "fuzz_slow") if arguments.slow else ("fuzz", "fuzz")
+            figures = fuzz(arguments.slow)
+        elif part == "tests":
+            figures = {group: run_pytest(*tests) for group, tests in GROUPS.items()}
+        elif part == "contracts":
+            figures = {
+                kind: run_pytest(f"tests/test_contract_{kind}.py", "-m", EVERY)
+                for kind in CONTRACTS
+            }
+        elif part == "ray":
+            figures = run_pytest(
+                "tests/test_fault_collectors.py", "tests/test_sweep_ray.py", "-m", "slow"
+            )
+        elif part == "leaks":
+            figures = leaks()
+        elif part == "coverage":
+            figures = coverage()
+        else:
+            parser.error(f"{part!r} is none of {', '.join(PARTS)}")
+        record = {
+            "command": f"{command} {words}",
+            "python": platform.python_version(),
+            "wall_seconds": round(time.time() - begin, 1),
+            **figures,
+        }
+        (arguments.out / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n")
+        print(json.dumps(record, indent=1), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Atari games: emulators, their memory as observation, and options in processes."""

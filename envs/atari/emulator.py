@@ -1,0 +1,342 @@
+"""The Arcade Learning Environment's emulator with a state that can be set exactly.
+
+ALE 0.12 leaves two things out of a state, and both are put right here. (1) Whether the emulator
+gave the last frame up before the program had ended it: the next frame then goes on instead of
+beginning anew. Qbert does so in a few per cent of its frames. The processor's status tells it; the
+emulator is made to give up, or to end, one frame of its own before the state is restored. (2) The
+action that is held where actions are sticky: it is sent, in a frame of its own, until it is held.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+import numpy as np
+
+from torchrl_hmcts.envs.atari.states import EmulatorStates
+
+_NO_OP = 0
+
+
+class AtariEmulator:
+    """One emulator, stepped by action indices, whose state can be read and set.
+
+    Args:
+        game (str): as in Gymnasium, ``"SpaceInvaders"``; ``"space_invaders"`` and
+            ``"ALE/SpaceInvaders-v5"`` are understood.
+        frame_skip (int): frames per step, all with the same action. Default 4.
+        repeat_action_probability (float): of each frame, to repeat the action held before instead
+            of the one that was sent. Default 0.25.
+        full_action_space (bool): all 18 actions instead of those that the game has. Default False.
+        max_frames (int): frames of an episode, after which it is truncated. Default 108,000, half
+            an hour.
+        mode, difficulty (int, optional): the console's switches. Default: the game's.
+        noop_max (int): most frames of doing nothing at the beginning of an episode. Default 0.
+
+    Raises:
+        ImportError: if ale-py is not installed.
+        ValueError: if there is no such game, or an argument is out of range.
+        OSError: if the game's file is missing or damaged.
+    """
+
+    def __init__(
+        self,
+        game: str,
+        *,
+        frame_skip: int = 4,
+        repeat_action_probability: float = 0.25,
+        full_action_space: bool = False,
+        max_frames: int = 108_000,
+        mode: int | None = None,
+        difficulty: int | None = None,
+        noop_max: int = 0,
+    ) -> None:
+        ale_py = _import_ale()
+        self._config = {
+            "game": game,
+            "frame_skip": frame_skip,
+            "repeat_action_probability": repeat_action_probability,
+            "full_action_space": full_action_space,
+            "max_frames": max_frames,
+            "mode": mode,
+            "difficulty": difficulty,
+            "noop_max": noop_max,
+        }
+        self.game, rom = find_game(game)
+        for name, value, low in (
+            ("frame_skip", frame_skip, 1),
+            ("max_frames", max_frames, 1),
+            ("noop_max", noop_max, 0),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value < 2**31:
+                raise ValueError(
+                    f"{self.game}: {name} is an int >= {low} and < 2**31; got {value!r}."
+                )
+        if not 0.0 <= repeat_action_probability < 1.0:
+            raise ValueError(
+                f"{self.game}: repeat_action_probability is in [0, 1), 0.25 for sticky actions and "
+                f"0 for a deterministic emulator; got {repeat_action_probability}."
+            )
+        self.frame_skip = frame_skip
+        self.noop_max = noop_max
+        self.sticky = repeat_action_probability > 0.0
+        # ALE keeps the probability in single precision, and compares it with a double.
+        self._probability = float(np.float32(repeat_action_probability))
+        self._state_type = ale_py.ALEState
+        ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+        self.ale = ale_py.ALEInterface()
+        self.ale.setFloat("repeat_action_probability", repeat_action_probability)
+        self.ale.setInt("max_num_frames_per_episode", max_frames)
+        self.num_frames = 0
+        """Frames emulated since construction, also those that set a state."""
+        self.ale.setInt("random_seed", 0)
+        self.ale.loadROM(_rom_path(rom))
+        self._set_switches(mode, difficulty)
+        self.ale.reset_game()
+        actions = (
+            self.ale.getLegalActionSet() if full_action_space else self.ale.getMinimalActionSet()
+        )
+        self._actions = [int(action.value) for action in actions]
+        self.action_names = [str(action.name) for action in actions]
+        """Names of the actions, e.g. ``"RIGHTFIRE"``."""
+        self.num_actions = len(self._actions)
+        raw = self._serialize()
+        self.states = EmulatorStates(raw, self.game)
+        """Turns states into rows of bytes and back."""
+        self.screen_is_stale = False
+        self._sent = self._held = _NO_OP
+        self._twister: Any = np.random.MT19937(0)  # ALE's own generator, followed draw by draw
+        self._follow(EmulatorStates.rng_of(self._serialize(include_rng=True)))
+        self._first = self.states.encode(raw, _NO_OP)
+        # States from which one frame ends, or does not end, as the program wants.
+        self._endless = self._state_type(self.states.endless(raw))
+        for _ in range(60):
+            if not self.states.is_partial(raw):
+                break
+            self._frame(_NO_OP)
+            raw = self._serialize()
+        self._ending = self._state_type(raw)
+        self._partial: bool | None = self.states.is_partial(raw)  # None: not known
+
+    def __getstate__(self) -> dict[str, Any]:
+        row = self.state(include_rng=True)
+        return {"config": self._config, "row": row, "num_frames": self.num_frames}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["config"])  # type: ignore[misc]
+        self.set_state(state["row"])
+        self.num_frames = state["num_frames"]
+
+    def _set_switches(self, mode: int | None, difficulty: int | None) -> None:
+        for name, value, offered in (
+            ("mode", mode, self.ale.getAvailableModes()),
+            ("difficulty", difficulty, self.ale.getAvailableDifficulties()),
+        ):
+            if value is not None and value not in offered:
+                raise ValueError(f"{self.game}: {name} is one of {list(offered)}; got {value}.")
+        if mode is not None:
+            self.ale.setMode(mode)
+        if difficulty is not None:
+            self.ale.setDifficulty(difficulty)
+
+    # ---------------------------------------------------------------- playing
+
+    def reset(self, generator: np.random.Generator, seed: int | None = None) -> None:
+        """Begin an episode, with up to ``noop_max`` frames of doing nothing.
+
+        The state is that of a console just switched on, which later resets of ALE do not give in
+        all games.
+
+        Args:
+            generator: draws the seed, and the number of frames.
+            seed: of the emulator, 32 bits. Default: drawn.
+        """
+        while True:
+            if seed is None:
+                seed = int(generator.integers(2**31))
+            key = np.random.RandomState(seed & 0xFFFFFFFF).get_state(legacy=False)["state"]
+            rng = np.append(key["key"], np.uint32(key["pos"])).astype(np.uint32)
+            self._restore(self._first, rng if self.sticky else None)
+            if not self.noop_max:
+                return
+            for _ in range(int(generator.integers(1, self.noop_max + 1))):
+                self._frame(_NO_OP)
+            if not self.ale.game_over():
+                return
+            seed = None
+
+    def act(self, action: int) -> tuple[int, int]:
+        """Take an action, by its index, for ``frame_skip`` frames.
+
+        Returns:
+            The game's reward, and the lives that were lost.
+        """
+        if not 0 <= action < self.num_actions:
+            raise ValueError(
+                f"{self.game} has the actions 0 to {self.num_actions - 1}; got {action}."
+            )
+        ale, code = self.ale, self._actions[action]
+        lives, reward, frames = ale.lives(), 0, 0
+        for _ in range(self.frame_skip):
+            if self.sticky:
+                self._stick(code)
+            reward += ale.act(code)
+            frames += 1
+            if ale.game_over():
+                break
+        self._moved(code, frames)
+        lost = lives - ale.lives()
+        return reward, lost if lost > 0 else 0
+
+    def _frame(self, code: int) -> None:
+        if self.sticky:
+            self._stick(code)
+        self.ale.act(code)
+        self._moved(code, 1)
+
+    def _stick(self, code: int) -> None:
+        """Follow ALE's draws of a frame, one for each player."""
+        if self._twister.random_raw(2)[0] / 2.0**32 >= self._probability:
+            self._held = code
+
+    def _moved(self, code: int, frames: int) -> None:
+        self._sent = code
+        self.num_frames += frames
+        self._partial = None
+        self.screen_is_stale = False
+
+    # ---------------------------------------------------------------- state
+
+    def state(self, *, include_rng: bool = False) -> np.ndarray:
+        """Return the state, uint8 ``[states.width]``, with the generator ``[width_with_rng]``.
+
+        With the generator, the held action is the true one; without, the one that was sent last,
+        which is all that an agent can know.
+        """
+        raw = self._serialize()
+        self._partial = self.states.is_partial(raw)
+        if not include_rng:
+            return self.states.encode(raw, self._sent)
+        rng = EmulatorStates.rng_of(self._serialize(include_rng=True))
+        return self.states.encode(raw, self._held if self.sticky else self._sent, rng)
+
+    def set_state(self, row: np.ndarray, seed: int | None = None) -> None:
+        """Go on from a state.
+
+        Args:
+            row: as :meth:`state` returned it, of this or another emulator of the game.
+            seed: of ALE's generator from here on. Default: what is in the row, or else the
+                generator goes on where it stands.
+        """
+        rng = self.states.rng(row)
+        if self.sticky and seed is not None:
+            key: Any = np.random.MT19937(seed).state["state"]
+            rng = np.append(key["key"], np.uint32(key["pos"])).astype(np.uint32)
+        self._restore(row, rng)
+
+    def _restore(self, row: np.ndarray, rng: np.ndarray | None) -> None:
+        raw, held = self.states.decode(row), self.states.held(row)
+        partial = self.states.is_partial(raw)
+        # Where a frame was given up the picture is half drawn: always from its beginning.
+        if partial or self._partial is not False or (self.sticky and self._held != held):
+            self._prepare(partial, held)
+        if rng is not None:
+            raw = self.states.with_rng(raw, rng)
+            self._follow(rng)
+        self.ale.restoreState(self._state_type(raw))
+        self._sent, self._partial, self.screen_is_stale = held, partial, True
+
+    def _prepare(self, partial: bool, held: int) -> None:
+        """Bring into the wanted condition what a restored state does not say."""
+        while True:
+            self.ale.restoreState(self._endless if partial else self._ending)
+            self._frame(held)
+            if not self.sticky or self._held == held:
+                return
+
+    def _follow(self, rng: np.ndarray) -> None:
+        key = {"key": rng[:-1], "pos": int(rng[-1])}
+        self._twister.state = {"bit_generator": "MT19937", "state": key}
+
+    def _serialize(self, *, include_rng: bool = False) -> bytes:
+        return bytes(self.ale.cloneState(include_rng=include_rng).serialize())
+
+    # ---------------------------------------------------------------- looking
+
+    def read_ram(self, out: np.ndarray) -> None:
+        """Write the RAM into ``out``, uint8 ``[128]``."""
+        self.ale.getRAM(out)
+
+    @property
+    def lives(self) -> int:
+        """Lives left; 0 in games that have none."""
+        return int(self.ale.lives())
+
+    @property
+    def episode_frame(self) -> int:
+        """Frames since the beginning of the episode."""
+        return int(self.ale.getEpisodeFrameNumber())
+
+    @property
+    def terminated(self) -> bool:
+        """Whether the game is over."""
+        return bool(self.ale.game_over(with_truncation=False))
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the episode has had its ``max_frames``."""
+        return bool(self.ale.game_truncated())
+
+    def screen(self) -> np.ndarray:
+        """Return the picture on the screen, uint8 ``[210, 160, 3]``."""
+        picture: np.ndarray = self.ale.getScreenRGB()
+        return picture
+
+
+# Games for two, of which ALE ends the whole process when they are loaded for one player.
+_FOR_TWO = {"combat", "joust", "maze_craze", "warlords"}
+
+
+def find_game(game: str) -> tuple[str, str]:
+    """Return a game's name as in Gymnasium and the name of its file, or raise a ValueError."""
+    roms = _import_ale().roms.get_all_rom_ids()
+    names = {rom.title().replace("_", ""): rom for rom in roms if rom not in _FOR_TWO}
+    asked = str(game).removeprefix("ALE/").removesuffix("-v5")
+    plain = {name.lower(): name for name in names}
+    found = plain.get(asked.replace("_", "").replace(" ", "").lower())
+    if found is None and asked.replace("_", "").replace(" ", "").lower() in {
+        rom.replace("_", "") for rom in _FOR_TWO
+    }:
+        raise ValueError(
+            f"{game!r} is a game for two players only; ale-py plays it for two or more. Choose one "
+            f"of the {len(names)} games for one player, e.g. Breakout, Pong, Seaquest."
+        )
+    if found is None:
+        near = difflib.get_close_matches(asked.replace("_", "").lower(), list(plain), 3, 0.4)
+        hint = ", ".join(plain[name] for name in near) or "e.g. Breakout, Pong, Seaquest"
+        raise ValueError(f"ale-py has no game {game!r}. Nearest: {hint}; it has {len(names)}.")
+    return found, names[found]
+
+
+def _rom_path(rom: str) -> Any:
+    """Return a game's file, which ale-py has checked: of a bad one it ends the process."""
+    try:
+        return _import_ale().roms.get_rom_path(rom)
+    except OSError as error:
+        raise OSError(
+            f"ale-py's file of the game {rom} is missing or damaged ({error}). Install it again, "
+            "`pip install --force-reinstall ale-py`, or correct the folder in ALE_ROMS_DIR."
+        ) from error
+
+
+def _import_ale() -> Any:
+    try:
+        import ale_py
+        import ale_py.roms
+    except ImportError as error:
+        raise ImportError(
+            "Atari games need the package ale-py, which brings the games along: "
+            "pip install 'torchrl_hmcts[atari]' (or: pip install ale-py)."
+        ) from error
+    return ale_py

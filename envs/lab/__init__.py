@@ -1,0 +1,1 @@
+"""DeepMind Lab's random maze: our simulator, and the engine itself."""

@@ -1,0 +1,140 @@
+"""Mazes of DeepMind Lab's level ``demos/random_maze``, from the seed of an episode.
+
+Letters: R rows, C columns of the text map, border included; M mazes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from operator import index
+
+from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
+
+WALL, OPEN, APPLE, SPAWN, GOAL = "*", " ", "A", "P", "G"
+OPENING_PROBABILITY = 0.15
+"""Chance of each cell inside the border to be opened after the maze is carved."""
+SPAWN_DISTANCE = 5
+"""Cells: the player appears farther from the goal than this, apples lie nearer."""
+
+
+def lab_maze(seed: int, rows: int = 9, columns: int = 9, *, mixer_seed: int = 0) -> tuple[str, ...]:
+    """Generate the maze that DeepMind Lab makes from an episode's seed.
+
+    A depth-first maze on the cells of even row and column (counted from 1), each cell inside the
+    border then opened with probability 0.15; a goal ``G`` on a random even cell; apples ``A``
+    nearer than 5 cells to it, spawn points ``P`` farther.
+
+    Args:
+        seed: of the episode, as given to ``Lab.reset(seed=...)``, 0 to 2**31 - 1.
+        rows, columns: size with the border, odd, at least 5. Default 9 by 9, as the dissertation;
+            the level that comes with DeepMind Lab has 15 by 15.
+        mixer_seed: the engine's setting of that name. Default 0.
+
+    Returns:
+        The text map, one string per row, the top (north) row first.
+
+    Raises:
+        ValueError: if the size is even or below 5, or a seed is out of range.
+
+    Reference:
+        Beattie et al., "DeepMind Lab", 2016, arXiv 1612.03801; dissertation, section 4.3.
+
+    Example:
+        >>> for row in lab_maze(1):
+        ...     print(row)
+        *********
+        *PPP*PPP*
+        *P*P*P*P*
+        *P*P*P*P*
+        *P***** *
+        *PPPPP A*
+        *******A*
+        *AAAAGAA*
+        *********
+    """
+    for name, size in (("rows", rows), ("columns", columns)):
+        if size < 5 or size % 2 == 0:
+            raise ValueError(f"lab_maze needs an odd number of {name}, at least 5; got {size}.")
+    # Those of NumPy overflow, and are another type.
+    seed, mixer_seed, rows, columns = map(index, (seed, mixer_seed, rows, columns))
+    for name, value in (("seed", seed), ("mixer_seed", mixer_seed)):
+        if not 0 <= value < 2**32:
+            raise ValueError(f"lab_maze needs a {name} from 0 to 2**32 - 1; got {value}.")
+    mixer = mixer_seed << 32
+    level_seed = MersenneTwister64(seed ^ mixer).uniform_int(1, 2**31 - 1)
+    random = MersenneTwister64(level_seed ^ mixer)
+    is_open = _carve(random, rows, columns)
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            if random.uniform_real() < OPENING_PROBABILITY:
+                is_open[row][column] = True
+    goal = _even_cell(random, rows, columns)
+    distance = _distances(is_open, goal)
+    return tuple(
+        "".join(
+            _letter(is_open[row][column], distance[row][column], (row, column) == goal)
+            for column in range(columns)
+        )
+        for row in range(rows)
+    )
+
+
+def _letter(is_open: bool, distance: int, is_goal: bool) -> str:
+    if is_goal:
+        return GOAL
+    if not is_open:
+        return WALL
+    if distance < 0 or distance == SPAWN_DISTANCE:
+        return OPEN
+    return SPAWN if distance > SPAWN_DISTANCE else APPLE
+
+
+def _even_cell(random: MersenneTwister64, rows: int, columns: int) -> tuple[int, int]:
+    """Draw a cell of even row and column, counted from 1."""
+    row = 2 * random.uniform_int(1, rows // 2)
+    return row - 1, 2 * random.uniform_int(1, columns // 2) - 1
+
+
+def _carve(random: MersenneTwister64, rows: int, columns: int) -> list[list[bool]]:
+    """Carve a depth-first maze; every cell of odd index from 0 is reached."""
+    is_open = [[False] * columns for _ in range(rows)]
+    path = [_even_cell(random, rows, columns)]
+    is_open[path[0][0]][path[0][1]] = True
+    while path:
+        row, column = path[-1]
+        unvisited = [
+            (r, c)
+            for r, c in ((row - 2, column), (row, column - 2), (row + 2, column), (row, column + 2))
+            if 0 < r < rows - 1 and 0 < c < columns - 1 and not is_open[r][c]
+        ]
+        if not unvisited:
+            path.pop()
+            continue
+        r, c = unvisited[random.uniform_int(1, len(unvisited)) - 1]
+        is_open[(row + r) // 2][(column + c) // 2] = is_open[r][c] = True
+        path.append((r, c))
+    return is_open
+
+
+def _distances(is_open: Sequence[Sequence[bool]], start: tuple[int, int]) -> list[list[int]]:
+    """Steps between neighbouring open cells from a cell, -1 where there is no way."""
+    distance = [[-1] * len(row) for row in is_open]
+    distance[start[0]][start[1]] = 0
+    queue = deque([start])
+    while queue:
+        row, column = queue.popleft()
+        for r, c in _neighbours(row, column):
+            if (
+                0 <= r < len(is_open)
+                and 0 <= c < len(is_open[0])
+                and is_open[r][c]
+                and distance[r][c] < 0
+            ):
+                distance[r][c] = distance[row][column] + 1
+                queue.append((r, c))
+    return distance
+
+
+def _neighbours(row: int, column: int) -> Iterator[tuple[int, int]]:
+    yield from ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1))

@@ -1,0 +1,1 @@
+"""Random mazes: layouts, Waterworld, a gridworld, pictures."""

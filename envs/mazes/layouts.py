@@ -1,0 +1,410 @@
+"""Random tile mazes: generation, the fixed pool, text form and shortest paths.
+
+Letters: M mazes, H rows, W columns, K walls and F free tiles per maze, L tiles on a path. A maze is
+a bool tensor ``[H, W]``, True where a tile is a wall, row 0 at the top; everything outside the grid
+is solid. Tile ``(row, col)`` covers ``x in [col, col + 1)`` and ``y in [row, row + 1)`` (x to the
+right, y downwards, both in tiles), so its centre is ``(col + 0.5, row + 0.5)``.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from functools import lru_cache
+from operator import index
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_hmcts.envs.mazes.pool_cache import pool_cache_path, read_pool, write_pool
+from torchrl_hmcts.envs.mazes.wall_growing import draw_mazes
+
+POOL_SIZE = 2342
+POOL_TRAIN_SIZE = 2000
+# Changing any of these changes the pool: every published figure rests on it.
+_POOL_SEED = 0
+_POOL_SHA256 = "cba98569ef76344ee619bbfc73b69ce3f545cf2dfba06fde46cb7d988c19d63c"
+
+_DRAWS_PER_CALL = 4096
+
+
+def _free_area_is_connected(mazes: Tensor) -> Tensor:
+    """Whether the free tiles of each maze hang together, bool [M]; False without a free tile."""
+    free = ~mazes
+    # Start from the first free tile of each maze, where the count of free tiles becomes 1.
+    reached = free & (free.flatten(1).cumsum(-1).view(free.shape) == 1)
+    while True:
+        grown = reached.clone()
+        grown[:, 1:] |= reached[:, :-1]
+        grown[:, :-1] |= reached[:, 1:]
+        grown[:, :, 1:] |= reached[:, :, :-1]
+        grown[:, :, :-1] |= reached[:, :, 1:]
+        grown &= free
+        if torch.equal(grown, reached):
+            return (reached == free).flatten(1).all(-1) & free.flatten(1).any(-1)
+        reached = grown
+
+
+def generate_mazes(
+    num_mazes: int,
+    *,
+    height: int = 9,
+    width: int = 9,
+    num_walls: int | None = 31,
+    complexity: float = 0.75,
+    density: float = 0.75,
+    seed: int = 0,
+    connected: bool = True,
+) -> Tensor:
+    """Generate distinct random mazes with N. P. Rougier's wall-growing algorithm.
+
+    On a ``(height + 2) x (width + 2)`` grid with a solid border, ``int(density * s)`` walls are
+    grown, ``s`` being the number of 2x2 blocks of the grid: each starts at a random point with even
+    coordinates and makes ``int(complexity * 5 * (rows + columns))`` attempts to step to a random
+    even neighbour two tiles away, filling it and the tile between when it is still empty. The
+    border is then stripped, draws with another wall count are dropped, then repeated ones and, with
+    ``connected``, those whose free tiles fall apart. (Grown walls never close a ring, so on odd
+    sizes every draw is connected.)
+
+    Args:
+        num_mazes (int): number of mazes M, at least 1.
+        height (int): rows H, at least 3. Default 9. An even size is cut out of the next odd one.
+        width (int): columns W, at least 3. Default 9.
+        num_walls (int, optional): exact number of wall tiles; ``None`` keeps any number. Default
+            31, the most frequent number at 9x9 (46 % of draws), so that an observation listing the
+            walls has one size.
+        complexity (float): attempts per wall, in units of 5 (rows + columns). Default 0.75.
+        density (float): number of walls, in units of one per 2x2 block. Default 0.75.
+        seed (int): the result is a function of the arguments and this seed, on every platform.
+        connected (bool): keep only mazes whose free tiles are connected. Default True.
+
+    Returns:
+        bool Tensor ``[num_mazes, height, width]``, True = wall, in the order drawn.
+
+    Raises:
+        ValueError: if an argument is out of range.
+        RuntimeError: if so many are not found in 100 draws per maze asked for (at least 100,000).
+
+    Reference:
+        Wikipedia, "Maze generation algorithm" (Python example by N. P. Rougier, 2010), reference
+        [31] of the dissertation; section 3.1.1 for 9x9 tiles and 31 walls.
+
+    Example:
+        >>> mazes = generate_mazes(3, seed=7)
+        >>> mazes.shape, mazes.flatten(1).sum(-1)
+        (torch.Size([3, 9, 9]), tensor([31, 31, 31]))
+        >>> generate_mazes(2, height=5, width=13, num_walls=None).shape
+        torch.Size([2, 5, 13])
+    """
+    if num_mazes < 1:
+        raise ValueError(f"num_mazes must be at least 1, got {num_mazes}.")
+    if height < 3 or width < 3:
+        raise ValueError(
+            f"A maze needs at least 3 rows and 3 columns for a wall to grow, got height={height}, "
+            f"width={width}."
+        )
+    for name, value in (("complexity", complexity), ("density", density)):
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"{name} must be a finite number >= 0, got {value}. Use e.g. 0.75.")
+    if num_walls is not None and not 0 <= num_walls <= height * width - 2:
+        raise ValueError(
+            f"num_walls={num_walls} leaves no room for a player and a target among the "
+            f"{height * width} tiles of a {height}x{width} maze: use 0 to {height * width - 2}, or "
+            f"None for any number."
+        )
+    max_draws = max(100_000, 100 * num_mazes)
+    rng_state = np.array([index(seed) % 2**64], dtype=np.uint64)
+    kept: dict[bytes, Tensor] = {}
+    wall_histogram = torch.zeros(height * width + 1, dtype=torch.int64)
+    for _ in range(0, max_draws, _DRAWS_PER_CALL):
+        mazes = draw_mazes(_DRAWS_PER_CALL, height, width, complexity, density, rng_state)
+        counts = mazes.flatten(1).sum(-1)
+        wall_histogram += counts.bincount(minlength=height * width + 1)
+        keep = counts <= height * width - 2 if num_walls is None else counts == num_walls
+        mazes = mazes[keep]
+        if connected:
+            mazes = mazes[_free_area_is_connected(mazes)]
+        for maze in mazes:
+            kept.setdefault(maze.numpy().tobytes(), maze)
+            if len(kept) == num_mazes:
+                return torch.stack(list(kept.values()))
+    seen = wall_histogram.nonzero().flatten().tolist()
+    raise RuntimeError(
+        f"Found only {len(kept)} distinct{' connected' * connected} {height}x{width} mazes with "
+        f"{'any number of' if num_walls is None else num_walls} walls in {max_draws:,} draws, "
+        f"{num_mazes} were asked for. Draws with complexity={complexity}, density={density} had "
+        f"{seen[0]} to {seen[-1]} walls, most often {int(wall_histogram.argmax())}: ask for such a "
+        f"number, for fewer mazes, or change complexity and density."
+    )
+
+
+def maze_pool(split: Literal["train", "test", "all"] = "all") -> Tensor:
+    """Return the fixed pool of 2,342 distinct connected 9x9 mazes with 31 walls, or a split of it.
+
+    The pool is generated once, in a few seconds, and kept in a user cache folder:
+    ``TORCHRL_HMCTS_CACHE`` if set, else ``torchrl_hmcts`` in ``XDG_CACHE_HOME`` or ``~/.cache``. A
+    missing or damaged file is made anew; a folder that cannot be written costs only the repeated
+    generation.
+
+    Args:
+        split (str): ``"train"`` (the first 2,000), ``"test"`` (the other 342) or ``"all"``. Default
+            ``"all"``.
+
+    Returns:
+        bool Tensor ``[2000 | 342 | 2342, 9, 9]``, True = wall; a copy that may be changed freely.
+
+    Raises:
+        ValueError: if ``split`` is another word.
+
+    Reference:
+        Dissertation, section 3.1.1 (the pool); the split is this project's.
+
+    Example:
+        >>> maze_pool("train").shape, maze_pool("test").shape
+        (torch.Size([2000, 9, 9]), torch.Size([342, 9, 9]))
+    """
+    if split not in ("train", "test", "all"):
+        raise ValueError(f'split must be "train", "test" or "all", got {split!r}.')
+    pool = _pool()
+    if split == "train":
+        pool = pool[:POOL_TRAIN_SIZE]
+    elif split == "test":
+        pool = pool[POOL_TRAIN_SIZE:]
+    return pool.clone()
+
+
+@lru_cache(maxsize=1)
+def _pool() -> Tensor:
+    path = pool_cache_path(_POOL_SHA256)
+    cached = None if path is None else read_pool(path, (POOL_SIZE, 9, 9), _POOL_SHA256)
+    if cached is not None:
+        return torch.from_numpy(cached)
+    pool = generate_mazes(POOL_SIZE, seed=_POOL_SEED)
+    if path is not None:
+        write_pool(path, pool.numpy())
+    return pool
+
+
+def check_mazes(mazes: Tensor) -> None:
+    """Raise unless ``mazes`` can serve an environment: equal wall counts, connected free tiles.
+
+    Args:
+        mazes (Tensor): candidate, should be bool ``[M, H, W]`` with M >= 1.
+
+    Raises:
+        ValueError: if it is not a bool tensor of three dimensions, or a maze has another number of
+            walls than the first, fewer than two free tiles, or free tiles that are not connected.
+
+    Example:
+        >>> check_mazes(maze_pool("test"))
+    """
+    is_tensor = isinstance(mazes, Tensor)
+    if not is_tensor or mazes.dtype != torch.bool or mazes.ndim != 3 or not mazes.numel():
+        got = f"{mazes.dtype} {list(mazes.shape)}" if is_tensor else f"a {type(mazes).__name__}"
+        raise ValueError(
+            f"mazes must be a bool tensor [num_mazes, height, width], True = wall; got {got}. For "
+            f"a single maze use maze[None], for another dtype mazes.bool()."
+        )
+    counts = mazes.flatten(1).sum(-1)
+    if (counts != counts[0]).any():
+        bad = int((counts != counts[0]).nonzero()[0])
+        raise ValueError(
+            f"All mazes must have the same number of walls, so that the observation has one size; "
+            f"maze 0 has {int(counts[0])}, maze {bad} has {int(counts[bad])}. Use "
+            f"generate_mazes(num_walls=...)."
+        )
+    num_free = mazes[0].numel() - int(counts[0])
+    if num_free < 2:
+        raise ValueError(
+            f"A maze needs at least 2 free tiles, for the player and the target; got {num_free} in "
+            f"each. Use fewer walls, e.g. generate_mazes(num_walls=31)."
+        )
+    connected = _free_area_is_connected(mazes)
+    if not connected.all():
+        bad = int((~connected).nonzero()[0])
+        raise ValueError(
+            f"The free tiles of maze {bad} are not connected, so a target may have no path to it:\n"
+            f"{maze_to_text(mazes[bad])}\nOpen a wall, or use generate_mazes(connected=True)."
+        )
+
+
+def maze_from_text(text: str) -> tuple[Tensor, tuple[int, int] | None, tuple[int, int] | None]:
+    """Read a maze drawn with ``#`` wall, ``.`` or space free, ``P`` player, ``T`` target.
+
+    Args:
+        text (str): one line per row, all of the same length; blank first and last lines and common
+            indentation are not removed, except for one leading and trailing newline.
+
+    Returns:
+        the maze (bool Tensor ``[H, W]``) and the (row, col) tiles of player and target, or None.
+
+    Raises:
+        ValueError: if the rows differ in length, or a character or a second P or T is met.
+
+    Example:
+        >>> maze, player, target = maze_from_text("P#.\\n..T")
+        >>> maze.int().tolist(), player, target
+        ([[0, 1, 0], [0, 0, 0]], (0, 0), (1, 2))
+    """
+    lines = text.removeprefix("\n").removesuffix("\n").split("\n")
+    if not lines[0] or len({len(line) for line in lines}) != 1:
+        raise ValueError(
+            f"The rows of a maze must have one length >= 1, got {[len(x) for x in lines]}. "
+            f"Pad the short rows with '.' (free) or '#' (wall)."
+        )
+    found: dict[str, tuple[int, int]] = {}
+    for row, line in enumerate(lines):
+        for col, char in enumerate(line):
+            if char not in "#. PT":
+                raise ValueError(
+                    f"Unknown character {char!r} at row {row}, column {col} of a maze. Use '#' "
+                    f"wall, '.' or ' ' free, 'P' player, 'T' target."
+                )
+            if char in "PT" and found.setdefault(char, (row, col)) != (row, col):
+                raise ValueError(
+                    f"A maze has at most one {char!r}, found at {found[char]} and {(row, col)}. "
+                    f"Remove one."
+                )
+    maze = torch.tensor([[char == "#" for char in line] for line in lines])
+    return maze, found.get("P"), found.get("T")
+
+
+def maze_to_text(
+    maze: Tensor, player: Sequence[int] | None = None, target: Sequence[int] | None = None
+) -> str:
+    """Draw a maze as text, the inverse of :func:`maze_from_text`.
+
+    Args:
+        maze (Tensor): bool ``[H, W]``.
+        player (sequence of int, optional): (row, col) tile drawn as ``P`` (over the target).
+        target (sequence of int, optional): (row, col) tile drawn as ``T``.
+
+    Returns:
+        str, one line per row.
+
+    Example:
+        >>> print(maze_to_text(torch.tensor([[False, True], [False, False]]), (0, 0), (1, 1)))
+        P#
+        .T
+    """
+    rows = [["#" if wall else "." for wall in row] for row in maze.tolist()]
+    for tile, char in ((target, "T"), (player, "P")):
+        if tile is not None:
+            rows[int(tile[0])][int(tile[1])] = char
+    return "\n".join("".join(row) for row in rows)
+
+
+def wall_centers(mazes: Tensor) -> Tensor:
+    """Return the centres of the wall tiles, (x, y) in tiles, in row-major order.
+
+    Args:
+        mazes (Tensor): bool ``[*B, H, W]`` with the same number K of walls in each.
+
+    Returns:
+        float32 Tensor ``[*B, K, 2]``.
+
+    Example:
+        >>> wall_centers(torch.tensor([[False, True], [True, False]])).tolist()
+        [[1.5, 0.5], [0.5, 1.5]]
+    """
+    rows_cols = mazes.nonzero()[:, -2:].reshape(*mazes.shape[:-2], -1, 2)
+    return rows_cols.flip(-1).to(torch.float32) + 0.5
+
+
+def free_tiles(mazes: Tensor) -> Tensor:
+    """Return the indices ``row * W + col`` of the free tiles, in row-major order.
+
+    Args:
+        mazes (Tensor): bool ``[*B, H, W]`` with the same number F of free tiles in each.
+
+    Returns:
+        int64 Tensor ``[*B, F]``.
+
+    Example:
+        >>> free_tiles(torch.tensor([[False, True], [True, False]])).tolist()
+        [0, 3]
+    """
+    return (~mazes).flatten(-2).nonzero()[:, -1].reshape(*mazes.shape[:-2], -1)
+
+
+def shortest_path_lengths(maze: Tensor, target: Sequence[int]) -> Tensor:
+    """Return the number of tile-to-tile moves from every tile to the target (breadth first).
+
+    Args:
+        maze (Tensor): bool ``[H, W]``.
+        target (sequence of int): (row, col) of a free tile.
+
+    Returns:
+        int64 Tensor ``[H, W]``; -1 on walls and on tiles that cannot reach the target.
+
+    Raises:
+        ValueError: if the target is a wall or outside the maze.
+
+    Example:
+        >>> shortest_path_lengths(torch.tensor([[False, True], [False, False]]), (0, 0)).tolist()
+        [[0, -1], [1, 2]]
+    """
+    _check_free_tile(maze, target, "target")
+    height, width = maze.shape
+    free = (~maze).tolist()
+    lengths = [[-1] * width for _ in range(height)]
+    queue = deque([(int(target[0]), int(target[1]))])
+    lengths[queue[0][0]][queue[0][1]] = 0
+    while queue:
+        row, col = queue.popleft()
+        for r, c in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)):
+            if 0 <= r < height and 0 <= c < width and free[r][c] and lengths[r][c] < 0:
+                lengths[r][c] = lengths[row][col] + 1
+                queue.append((r, c))
+    return torch.tensor(lengths)
+
+
+def shortest_path(maze: Tensor, start: Sequence[int], target: Sequence[int]) -> Tensor:
+    """Return the tiles of a shortest path, both ends included; ties go up, down, left, right.
+
+    Args:
+        maze (Tensor): bool ``[H, W]``.
+        start (sequence of int): (row, col) of a free tile.
+        target (sequence of int): (row, col) of a free tile.
+
+    Returns:
+        int64 Tensor ``[L, 2]`` of (row, col); L - 1 moves.
+
+    Raises:
+        ValueError: if an end is a wall or outside the maze, or no path joins them.
+
+    Example:
+        >>> maze, player, target = maze_from_text("P#T\\n...")
+        >>> shortest_path(maze, player, target).tolist()
+        [[0, 0], [1, 0], [1, 1], [1, 2], [0, 2]]
+    """
+    _check_free_tile(maze, start, "start")
+    lengths = shortest_path_lengths(maze, target).tolist()
+    row, col = int(start[0]), int(start[1])
+    if lengths[row][col] < 0:
+        raise ValueError(
+            f"No path joins start {tuple(start)} and target {tuple(target)} in the maze\n"
+            f"{maze_to_text(maze, start, target)}\nOpen a wall, or choose ends in one free area."
+        )
+    path = [(row, col)]
+    while lengths[row][col]:
+        row, col = next(
+            (r, c)
+            for r, c in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1))
+            if 0 <= r < len(lengths)
+            and 0 <= c < len(lengths[0])
+            and lengths[r][c] == lengths[row][col] - 1
+        )
+        path.append((row, col))
+    return torch.tensor(path)
+
+
+def _check_free_tile(maze: Tensor, tile: Sequence[int], name: str) -> None:
+    row, col = int(tile[0]), int(tile[1])
+    if not (0 <= row < maze.shape[0] and 0 <= col < maze.shape[1]) or maze[row, col]:
+        raise ValueError(
+            f"The {name} tile (row, col) = ({row}, {col}) is a wall or outside the "
+            f"{maze.shape[0]}x{maze.shape[1]} maze. Choose a free tile, e.g. from free_tiles(maze)."
+        )

@@ -1,0 +1,436 @@
+"""Waterworld random maze: thrust a disc with momentum through a random maze to a target.
+
+Letters: *B batch of the tensordict, M mazes, H rows, W columns, K walls per maze.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from operator import index
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_hmcts.envs.mazes.chipmunk import ChipmunkMazes
+from torchrl_hmcts.envs.mazes.layouts import check_mazes, free_tiles, maze_pool, wall_centers
+from torchrl_hmcts.envs.mazes.rendering import draw_maze
+
+_DIRECTIONS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))  # (x, y) of up, down, left, right
+_STATE_KEYS = ("position", "velocity", "target", "maze_index", "step_count")
+_OVERLAP_TOLERANCE = 1e-3  # tiles; a disc in contact is up to 2e-5 inside the wall
+
+
+class WaterworldMazeEnv(EnvBase):
+    r"""Steer a disc through a random maze by thrust in four directions until it meets its target.
+
+    The physics is Chipmunk's (pymunk), with collisions that are inelastic and frictionless: the
+    speed into a wall is lost, the speed along it is kept. Without contact, with thrust
+    :math:`a` and the share :math:`d` of its velocity that the disc keeps per second,
+
+    .. math:: x' = x + v\,\Delta t, \qquad v' = v\,d^{\Delta t} + a\,\Delta t.
+
+    Reward 1 (and ``terminated``) when the disc touches the target, else 0; ``truncated`` at
+    ``max_steps``. Stateless and batched: the state is in the tensordict, any batch shape is stepped
+    at once, and ``reset(td, set_state=True)`` continues from the state in ``td``; a step depends on
+    nothing else.
+
+    Actions: 0 up (towards row 0), 1 down, 2 left, 3 right. State: ``"position"``, ``"velocity"``,
+    ``"target"`` (float32 ``[*B, 2]``, (x, y) in tiles and tiles per second, y downwards),
+    ``"maze_index"`` (int64 ``[*B]``), ``"step_count"`` (int64 ``[*B, 1]``). Read-out:
+    ``"observation"`` (float32 ``[*B, 4 + 2 K]``: player, target, then the centres of the K walls in
+    row-major order; 66 numbers for 31 walls).
+
+    Args:
+        mazes (Tensor, optional): bool ``[M, H, W]``, True = wall, equal numbers of walls. Default:
+            the training split of :func:`~torchrl_hmcts.envs.maze_pool`.
+        max_steps (int): steps after which an episode is truncated. Default 1,000, 50 seconds: about
+            five times what a good player needs.
+        observation (bool): write ``"observation"``; simulators whose worker does not read it save
+            time. Default True.
+        batch_size (sequence of int): copies that ``reset()`` without a tensordict makes, and the
+            batch size of the specs. Any other batch shape can be stepped too. Default none.
+        seed (int, optional): of the env's own generator; drawn from torch's global one by default.
+        device (torch.device, optional): of all tensors; the physics runs on the CPU. Default: CPU.
+
+    Raises:
+        ValueError: if the mazes are not usable (see :func:`~torchrl_hmcts.envs.check_mazes`) or
+            ``max_steps`` is below 1.
+
+    Reference:
+        Dissertation, section 3.1.1 and figure 3.1. It gives no physical constants: they are this
+        project's, as is the reward.
+
+    Example:
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
+        >>> maze, _, _ = maze_from_text("..#\n...")
+        >>> env = WaterworldMazeEnv(maze[None])
+        >>> td = env.make_state(0, position=(0.5, 1.5), target=(2.5, 1.5))
+        >>> steps = 0
+        >>> while not td["done"].item():
+        ...     td = env.step(td.set("action", torch.tensor(3)))["next"]  # thrust to the right
+        ...     steps += 1
+        >>> td["reward"].item(), steps
+        (1.0, 24)
+    """
+
+    TIME_STEP = 0.05
+    """Seconds per base step."""
+    THRUST = 4.0
+    """Acceleration of the disc by its thrust, tiles per second squared."""
+    DAMPING = math.exp(-2.0)
+    """Share of its velocity that the disc keeps in one second without thrust."""
+    PLAYER_RADIUS = 0.25
+    """Radius of the disc, tiles."""
+    TARGET_RADIUS = 0.25
+    """Radius of the target, tiles; the episode ends when the two touch."""
+    MAX_SPEED = 3.0
+    """Largest speed along an axis that a state may have, tiles per second; thrust reaches 2.1. Even
+    along a diagonal it moves the disc by less than its radius per step, so none passes a wall."""
+
+    batch_locked = False
+    _supports_set_state = True
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(
+        self,
+        mazes: Tensor | None = None,
+        *,
+        max_steps: int = 1000,
+        observation: bool = True,
+        batch_size: Sequence[int] = (),
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        mazes = maze_pool("train") if mazes is None else mazes
+        check_mazes(mazes)
+        if max_steps < 1:
+            raise ValueError(
+                f"max_steps must be at least 1, got {max_steps}. Use 10**9 for almost no limit."
+            )
+        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        self.num_mazes, self.height, self.width = mazes.shape
+        self.num_walls = int(mazes[0].sum())
+        self.max_steps = max_steps
+        self._writes_observation = observation
+        # Plain attributes, not buffers: EnvBase makes the lookup of a buffer slower than the step.
+        self.mazes = mazes.to(self.device).clone()  # [M, H, W]
+        self._wall_centers = wall_centers(self.mazes).flatten(1)  # [M, 2K]
+        self._free_tiles = free_tiles(self.mazes)  # [M, F]
+        self._acceleration = np.array(_DIRECTIONS, np.float32) * np.float32(self.THRUST)  # [A, 2]
+        self._touch = self.PLAYER_RADIUS + self.TARGET_RADIUS
+        self._physics = ChipmunkMazes(
+            mazes.cpu().numpy(),
+            radius=self.PLAYER_RADIUS,
+            damping=self.DAMPING,
+            time_step=self.TIME_STEP,
+        )
+        self._set_specs()
+        self.set_seed(
+            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
+        )
+
+    def _set_specs(self) -> None:
+        device, batch_size = self.device, self.batch_size
+        size = torch.tensor([self.width, self.height], dtype=torch.float32, device=device)
+        zero = torch.zeros_like(size)
+        half = torch.full_like(size, 0.5)
+
+        def state() -> dict[str, Any]:
+            speed = torch.full_like(size, self.MAX_SPEED)
+            return {
+                "position": Bounded(zero, size, device=device),
+                "velocity": Bounded(-speed, speed, device=device),
+                "target": Bounded(zero, size, device=device),
+                "maze_index": Categorical(self.num_mazes, shape=(), device=device),
+                "step_count": Bounded(
+                    0, self.max_steps, shape=(1,), dtype=torch.int64, device=device
+                ),
+            }
+
+        read_outs: dict[str, Any] = {}
+        if self._writes_observation:
+            read_outs["observation"] = Bounded(
+                torch.cat((zero, zero, half.repeat(self.num_walls))),
+                torch.cat((size, size, (size - 0.5).repeat(self.num_walls))),
+                device=device,
+            )
+        done = {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        reward = Unbounded(shape=(1,), dtype=torch.float32, device=device)
+        self.state_spec = Composite(state(), device=device).expand(batch_size)
+        self.observation_spec = Composite({**state(), **read_outs}, device=device).expand(
+            batch_size
+        )
+        self.action_spec = Categorical(len(_DIRECTIONS), shape=(), device=device).expand(batch_size)
+        self.reward_spec = reward.expand(*batch_size, 1)
+        self.done_spec = Composite(done, device=device).expand(batch_size)
+
+    def to(self, device: torch.device | str) -> WaterworldMazeEnv:
+        """Move the env, its mazes and its tables to a device, in place."""
+        super().to(device)
+        for name in ("mazes", "_wall_centers", "_free_tiles"):
+            setattr(self, name, getattr(self, name).to(device))
+        return self
+
+    def _set_seed(self, seed: int | None) -> None:
+        # On the CPU whatever the device: a seed gives the same episodes everywhere.
+        self._generator = torch.Generator()
+        if seed is None:
+            self._generator.seed()
+        else:
+            self._generator.manual_seed(index(seed))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # Small arrays: numpy does in one microsecond what torch does in three.
+        target, maze = tensordict.get("target"), tensordict.get("maze_index")
+        shape, device = target.shape, target.device
+        new_position, new_velocity = self._physics.step(
+            maze.numpy(force=True).reshape(-1),
+            tensordict.get("position").numpy(force=True).reshape(-1, 2),
+            tensordict.get("velocity").numpy(force=True).reshape(-1, 2),
+            self._acceleration[tensordict.get("action").numpy(force=True).reshape(-1)],
+        )
+        offset = new_position - target.numpy(force=True).reshape(-1, 2)
+        offset *= offset
+        terminated = (offset[:, 0] + offset[:, 1] < self._touch**2).reshape(*shape[:-1], 1)
+        step_count = tensordict.get("step_count").numpy(force=True) + 1
+        truncated = step_count >= self.max_steps
+        arrays = {
+            "reward": terminated.astype(np.float32),
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        position, velocity, steps, *rest = (
+            torch.from_numpy(array).to(device)
+            for array in (
+                new_position.reshape(shape),
+                new_velocity.reshape(shape),
+                step_count,
+                *arrays.values(),
+            )
+        )
+        entries = dict(zip(arrays, rest, strict=True))
+        return self._write_state(
+            position, velocity, target, maze, steps, tensordict.batch_size, **entries
+        )
+
+    def _write_state(
+        self,
+        position: Tensor,  # [*B, 2]
+        velocity: Tensor,  # [*B, 2]
+        target: Tensor,  # [*B, 2]
+        maze: Tensor,  # [*B]
+        step_count: Tensor,  # [*B, 1]
+        batch_size: torch.Size,
+        **entries: Tensor,
+    ) -> TensorDict:
+        entries.update(
+            position=position,
+            velocity=velocity,
+            target=target,
+            maze_index=maze,
+            step_count=step_count,
+        )
+        if self._writes_observation:
+            walls = torch.embedding(self._wall_centers, maze)
+            entries["observation"] = torch.cat((position, target, walls), -1)
+        # The checks of TensorDict's constructor would cost as much as the arithmetic.
+        return TensorDict._new_unsafe(entries, batch_size, device=self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if kwargs.get("set_state"):
+            return self._reset_to_state(tensordict)
+        shape = self.batch_size if tensordict is None else tensordict.batch_size
+        num_free = self._free_tiles.shape[1]
+
+        def draw(high: int) -> Tensor:
+            return torch.randint(high, shape, generator=self._generator).to(self.device)
+
+        maze, player, target = draw(self.num_mazes), draw(num_free), draw(num_free - 1)
+        target += target >= player  # uniform over the free tiles other than the player's
+        offset = maze * num_free
+        position = self._tile_center(self._free_tiles.take(offset + player))
+        return self._write_state(
+            position,
+            torch.zeros_like(position),
+            self._tile_center(self._free_tiles.take(offset + target)),
+            maze,
+            torch.zeros((*shape, 1), dtype=torch.int64, device=self.device),
+            shape,
+        )
+
+    def _tile_center(self, tile: Tensor) -> Tensor:
+        column_row = torch.stack((tile % self.width, tile // self.width), -1)
+        return column_row + 0.5
+
+    def _reset_to_state(self, tensordict: TensorDictBase | None) -> TensorDict:
+        missing = [k for k in _STATE_KEYS if tensordict is None or k not in tensordict.keys()]
+        if tensordict is None or missing:
+            raise ValueError(
+                f"reset(td, set_state=True) needs the whole state in td; missing: {missing}. Build "
+                f"it with env.make_state(maze_index, position, target)."
+            )
+        shape = tensordict.batch_size
+        position, velocity, target, maze, steps = (tensordict.get(key) for key in _STATE_KEYS)
+        self._check_state(position, velocity, target, maze, steps, shape)
+        return self._write_state(position, velocity, target, maze, steps, shape)
+
+    def _check_state(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        target: Tensor,
+        maze: Tensor,
+        step_count: Tensor,
+        batch_size: torch.Size,
+    ) -> None:
+        for key, value, dtype, shape in (
+            ("maze_index", maze, torch.int64, batch_size),
+            ("step_count", step_count, torch.int64, (*batch_size, 1)),
+            ("position", position, torch.float32, (*batch_size, 2)),
+            ("velocity", velocity, torch.float32, (*batch_size, 2)),
+            ("target", target, torch.float32, (*batch_size, 2)),
+        ):
+            if value.dtype != dtype or value.shape != torch.Size(shape):
+                raise ValueError(
+                    f'"{key}" must be {dtype} {list(shape)}; got {value.dtype} '
+                    f"{list(value.shape)}. env.make_state(...) builds a state of the right form."
+                )
+            if not torch.isfinite(value).all():
+                raise ValueError(
+                    f'"{key}" = {value[~torch.isfinite(value)][0].item()} is not finite. A state '
+                    f"with NaN or infinity cannot be simulated; find the step that wrote it."
+                )
+        for key, value, low, high in (
+            ("maze_index", maze, 0, self.num_mazes - 1),
+            ("step_count", step_count, 0, self.max_steps),
+            ("velocity", velocity, -self.MAX_SPEED, self.MAX_SPEED),
+        ):
+            bad = (value < low) | (value > high)
+            if bad.any():
+                raise ValueError(
+                    f'"{key}" = {value[bad][0].item()} is out of range: {low} to {high} are '
+                    f"allowed."
+                )
+        size = torch.tensor([self.width, self.height], device=position.device)
+        for key, point in (("position", position), ("target", target)):
+            if ((point < 0) | (point >= size)).any():
+                raise ValueError(
+                    f'"{key}" = {point.tolist()} is not inside the maze of {self.width} x '
+                    f"{self.height} tiles."
+                )
+            tile = point.long()
+            in_wall = self.mazes[maze, tile[..., 1], tile[..., 0]]
+            if in_wall.any():
+                raise ValueError(
+                    f'"{key}" (x, y) = {point[in_wall][0].tolist()} is inside a wall of maze '
+                    f"{int(maze[in_wall][0])}. Choose a free tile, e.g. from "
+                    f"free_tiles(env.mazes[{int(maze[in_wall][0])}])."
+                )
+        # A disc whose centre is close to a face may be pushed out of it on the other side.
+        gap = self._distance_to_walls(position, maze)
+        bad = gap < self.PLAYER_RADIUS - _OVERLAP_TOLERANCE
+        if bad.any():
+            raise ValueError(
+                f'"position" (x, y) = {position[bad][0].tolist()} is {gap[bad][0].item():.3g} '
+                f"tiles from a wall of maze {int(maze[bad][0])}, which the disc of radius "
+                f"{self.PLAYER_RADIUS} overlaps. Keep it {self.PLAYER_RADIUS} tiles away, e.g. "
+                f"at a tile's centre."
+            )
+
+    def _distance_to_walls(self, position: Tensor, maze: Tensor) -> Tensor:
+        """Distance of points inside the maze to the nearest of the tiles around, if solid, [*B]."""
+        solid = torch.nn.functional.pad(self.mazes, (1, 1, 1, 1), value=True)  # [M, H + 2, W + 2]
+        around = torch.cartesian_prod(*2 * [torch.arange(-1, 2, device=position.device)])  # [9, 2]
+        point = position.unsqueeze(-2)
+        tile = point.long() + around  # [*B, 9, 2] (x, y) of the low corner
+        gap = torch.maximum(tile - point, point - tile - 1).clamp_min(0).norm(dim=-1)
+        is_solid = solid[maze.unsqueeze(-1), tile[..., 1] + 1, tile[..., 0] + 1]
+        return gap.masked_fill(~is_solid, torch.inf).amin(-1)
+
+    def make_state(
+        self,
+        maze_index: Any,
+        position: Any,
+        target: Any,
+        *,
+        velocity: Any = (0.0, 0.0),
+        step_count: Any = 0,
+    ) -> TensorDict:
+        """Build a state, to step from or to pass to ``reset(td, set_state=True)``.
+
+        Args:
+            maze_index (int or Tensor): int64 ``[*B]``, index into ``env.mazes``.
+            position (sequence or Tensor): float ``[*B, 2]``, (x, y) of the disc, tiles.
+            target (sequence or Tensor): float ``[*B, 2]``, (x, y) of the target, tiles.
+            velocity (sequence or Tensor): float ``[*B, 2]``, tiles per second. Default at rest.
+            step_count (int or Tensor): base steps already taken, ``[*B]``. Default 0.
+
+        Returns:
+            TensorDict ``[*B]`` as ``env.reset()`` gives it; the arguments are broadcast to ``*B``.
+
+        Raises:
+            ValueError: if a value is not finite, out of range or inside a wall, or the disc
+                overlaps one.
+
+        Example:
+            >>> env = WaterworldMazeEnv(torch.zeros(1, 3, 3, dtype=torch.bool))
+            >>> env.make_state(0, position=[[0.5, 0.5], [1.2, 2.5]], target=(1.5, 1.5)).batch_size
+            torch.Size([2])
+        """
+        device = self.device
+        maze, steps = (torch.as_tensor(x, device=device) for x in (maze_index, step_count))
+        points = [
+            torch.as_tensor(x, dtype=torch.float32, device=device)
+            for x in (position, velocity, target)
+        ]
+        for name, point in zip(("position", "velocity", "target"), points, strict=True):
+            if not point.ndim or point.shape[-1] != 2:
+                raise ValueError(f"{name} must be (x, y) pairs [*B, 2]; got {list(point.shape)}.")
+        shape = torch.broadcast_shapes(maze.shape, steps.shape, *(p.shape[:-1] for p in points))
+        maze, steps = (x.to(torch.int64).expand(shape).clone() for x in (maze, steps))
+        at, moving, goal = (point.expand(*shape, 2).clone() for point in points)
+        steps = steps.unsqueeze(-1)
+        self._check_state(at, moving, goal, maze, steps, shape)
+        state = self._write_state(at, moving, goal, maze, steps, shape)
+        return state.update({k: torch.zeros_like(steps, dtype=torch.bool) for k in self.done_keys})
+
+    def render(self, tensordict: TensorDictBase, **options: Any) -> Any:
+        """Draw one state.
+
+        Args:
+            tensordict (TensorDictBase): state without batch dimensions, as from ``reset`` or
+                ``step(...)["next"]``.
+            **options: keywords of :func:`~torchrl_hmcts.envs.draw_maze` (``paths``, ``dots``,
+                ``tile_pixels``).
+
+        Returns:
+            uint8 numpy array ``[h, w, 3]``.
+
+        Raises:
+            ValueError: if the tensordict has batch dimensions.
+
+        Example:
+            >>> env = WaterworldMazeEnv(seed=0)
+            >>> env.render(env.reset()).shape
+            (304, 304, 3)
+        """
+        if tensordict.batch_size:
+            raise ValueError(
+                f"render draws one state, got a batch {list(tensordict.batch_size)}. Index it, "
+                f"e.g. env.render(td[0])."
+            )
+        return draw_maze(
+            self.mazes[tensordict["maze_index"]].cpu(),
+            player=tensordict["position"].tolist(),
+            player_radius=self.PLAYER_RADIUS,
+            target=tensordict["target"].tolist(),
+            target_radius=self.TARGET_RADIUS,
+            **options,
+        )

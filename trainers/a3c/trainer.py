@@ -1,0 +1,517 @@
+"""Asynchronous advantage actor-critic: processes that learn together without waiting."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torch.optim import Optimizer
+from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
+from torchrl.record.loggers import Logger
+
+from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.processes import share
+from torchrl_hmcts.trainers.a3c.actor_learner import (
+    ActorLearner,
+    LearnerSettings,
+    SharedMemory,
+    actor_of,
+    board_columns,
+    trained_parameters,
+)
+from torchrl_hmcts.trainers.a3c.learner_log import LearnerLog
+from torchrl_hmcts.trainers.a3c.learner_processes import LearnerProcesses
+from torchrl_hmcts.trainers.a3c.shared_optimizers import (
+    SharedAdam,
+    SharedRMSprop,
+    share_optimizer,
+)
+from torchrl_hmcts.trainers.saving.checkpoints import (
+    DurableRotation,
+    check_settings,
+    newest_checkpoint,
+    plain_checkpoint,
+)
+from torchrl_hmcts.trainers.saving.locking import folder_locked
+from torchrl_hmcts.trainers.saving.resume import FIRST_SAVE_SECONDS, SAVE_SECONDS, HistoryState
+from torchrl_hmcts.trainers.saving.stopping import patient, raise_if_asked, unbroken
+
+MakeOptimizer = Callable[[list[nn.Parameter]], Optimizer]
+
+_SCHEDULES: dict[str, Callable[[float], float]] = {
+    "linear": lambda progress: 1.0 - progress,
+    "constant": lambda progress: 1.0,
+}
+_OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {"rmsprop": SharedRMSprop, "adam": SharedAdam}
+_POLL_SECONDS = 0.2
+
+
+@name_arguments
+class A3CTrainer:
+    r"""Actor-learners in processes of their own, with one set of parameters in shared memory.
+
+    Each learner repeats, until the counter T of all frames reaches ``total_frames``: copy the
+    shared parameters; act for ``segment_steps`` steps in its own environments; differentiate the
+    loss of this segment; clip; change the shared parameters and the shared state of the optimiser,
+    without any lock. This process logs, evaluates, saves and watches meanwhile. T may pass
+    ``total_frames`` by a segment of each learner.
+
+    Logged every ``log_interval`` frames, to ``history`` and the ``logger``, as means since the last
+    time:
+
+    ======================  =======================================================  ============
+    name                    value                                                    unit
+    ======================  =======================================================  ============
+    ``frames``              T, steps of all environments so far                      frames
+    ``seconds``             time in ``train()`` so far, evaluations included         s
+    ``frames_per_second``   of all learners                                          1/s
+    ``episodes``            finished so far
+    ``episode_return``      sum of rewards of a finished episode, nan without one    reward
+    ``episode_length``      its length, nan without one                              frames
+    ``updates``             so far
+    ``grad_norm``           norm of the gradient before clipping
+    ``lr``                  learning rate of the first group, at T
+    ``learner_i_frames``    frames of learner i in this run                          frames
+    ``loss_objective``,     entries of the loss, per update (entropy in nats)
+    ``loss_critic``, ...
+    ``eval_frames``,        T and what ``evaluate`` returned
+    ``eval_x``
+    ======================  =======================================================  ============
+
+    A learner's exception, its death by a signal, ``step_seconds`` without a step (a process that
+    is stopped, an env that hangs) or a gradient that is not finite ends the run: the others stop, a
+    checkpoint is written, and :class:`LearnerError` names the learner and carries its traceback. If
+    T has been reached, a learner that does not answer is ended after 10 s, and the run ends well.
+    Ctrl-C or SIGTERM stops all, writes a checkpoint, prints the command that continues the run, and
+    raises ``KeyboardInterrupt``; a second one does not interrupt that. If this process is killed,
+    the learners notice and end.
+
+    A run goes on from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
+    T, the learning rate's schedule and the curves are as they were. Not exact, and not meant to be:
+    running episodes begin anew, with other random numbers, and checkpoints are read while learners
+    write, so that single weights may be an update older than others. How learners interleave
+    differs from run to run; with one learner a run is a function of its seed.
+
+    The networks live in the CPU's memory. Buffers of theirs that change in training (e.g. of batch
+    normalisation) would stay each learner's own; use layers without.
+
+    Args:
+        make_env (callable): ``make_env() -> EnvBase`` of any batch shape, ``[]`` or ``[*B]`` for
+            copies that each learner plays at once. Called in each learner; a lambda will do.
+        loss_module (LossModule): :class:`~torchrl_hmcts.objectives.A3CLoss`, or any other with an
+            ``actor_network`` that trains on segments ``[*B, T]``, as TorchRL's ``A2CLoss`` does.
+            Its parameters are moved to shared memory and trained in place.
+        total_frames (int): :math:`T_{max}`, steps of all environments of all learners. On a macro
+            env these are macro-steps.
+        segment_steps (int): :math:`t_{max}`, steps of each environment between two updates.
+            Default 20.
+        num_learners (int): processes. Default 2. With 0 one learner runs in this process, as
+            ``num_workers=0`` of a ``DataLoader``: to debug, and for tests.
+        optimizer (str, callable or Optimizer): ``"rmsprop"`` (default; :class:`SharedRMSprop`),
+            ``"adam"`` (:class:`SharedAdam`), ``optimizer(parameters) -> Optimizer``, or an
+            optimiser over the loss's parameters; see :func:`share_optimizer` for the kinds.
+        lr (float): learning rate at the start, of a named optimiser. Default 7e-4.
+        lr_schedule (str or callable): ``"linear"`` (default): it falls to 0 at ``total_frames``, as
+            in the paper; ``"constant"``; or factor of the share of frames done, 0 to 1.
+        clip_norm (float, optional): bound of the gradient's norm. Default 0.5; ``None``: none.
+        configure_learner (callable, optional): ``configure_learner(loss_module, i)``, called in
+            learner i with its own copy, for exploration that differs between learners, e.g.
+            ``lambda loss, i: loss.entropy_coeff.fill_((0.01, 0.003)[i])``.
+        evaluate (callable, optional): ``evaluate(policy) -> dict`` of floats, with a copy of the
+            policy as it is now, without gradients. Called in this process while the learners go on.
+        eval_interval (int, optional): frames between evaluations, besides the one at the end.
+            Default: a tenth of ``total_frames``.
+        stop_when (callable, optional): ``stop_when(metrics) -> bool``, called with what
+            ``evaluate`` returned; true ends the run with the parameters that were evaluated.
+        logger (Logger, optional): of TorchRL; gets every value at its T.
+        log_interval (int): frames. Default 10,000.
+        save_dir (path, optional): folder of the checkpoints, which hold no pickle. Default: none.
+        save_interval (int, optional): frames between checkpoints, besides the one after 5 seconds
+            of training, one a minute at least and the one at the end. Default: a tenth of
+            ``total_frames``.
+        keep_last (int): checkpoints kept. Default 2.
+        overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
+            once this run has written one. Default False: ``train()`` refuses such a folder.
+        progress (callable, optional): called with ``total=total_frames`` it returns a progress bar,
+            e.g. ``tqdm.tqdm``. Default: quiet.
+        seed (int): learner i is seeded by (seed, i, T at its start). Default 0.
+        start_method (str): ``"spawn"`` (default) starts each learner as a new interpreter, which
+            takes some seconds; ``"forkserver"`` imports once for all, and keeps that process for
+            the next run; ``"fork"`` is immediate, but unsafe once this process has threads.
+        step_seconds (float): longest time for one step of a learner's env, seconds; a learner that
+            neither steps nor uses the processor for so long does not answer. Default 60.
+
+    Raises:
+        ValueError: if a number is out of range, or the loss does not reduce to one number.
+        TypeError: if the loss has no actor, or the optimiser cannot be shared.
+        OSError: if there is too little shared memory or too few file descriptors.
+
+    Reference:
+        Mnih et al., "Asynchronous methods for deep reinforcement learning", 2016, arXiv 1602.01783;
+        Recht et al., "Hogwild!", 2011, arXiv 1106.5730; Bartley, dissertation, 2023, Algorithm 2.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.modules import ProbabilisticActor, ValueOperator
+        >>> from torchrl_hmcts.objectives import A3CLoss
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.trainers import A3CTrainer
+        >>> from torch.nn import Embedding
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(Embedding(4, 2), ["state"], ["logits"]), in_keys=["logits"],
+        ...     distribution_class=torch.distributions.Categorical)
+        >>> loss = A3CLoss(actor, ValueOperator(Embedding(4, 1), in_keys=["state"]))
+        >>> trainer = A3CTrainer(
+        ...     lambda: ChainEnv(length=4, batch_size=[8]), loss, total_frames=800,
+        ...     segment_steps=5, num_learners=0, lr=0.05, optimizer="adam", log_interval=400)
+        >>> history = trainer.train()
+        >>> history["frames"]
+        [400.0, 800.0]
+    """
+
+    def __init__(
+        self,
+        make_env: Callable[[], EnvBase],
+        loss_module: LossModule,
+        *,
+        total_frames: int,
+        segment_steps: int = 20,
+        num_learners: int = 2,
+        optimizer: str | MakeOptimizer | Optimizer = "rmsprop",
+        lr: float = 7e-4,
+        lr_schedule: str | Callable[[float], float] = "linear",
+        clip_norm: float | None = 0.5,
+        configure_learner: Callable[[LossModule, int], None] | None = None,
+        evaluate: Callable[[TensorDictModuleBase], Mapping[str, float]] | None = None,
+        eval_interval: int | None = None,
+        stop_when: Callable[[Mapping[str, float]], bool] | None = None,
+        logger: Logger | None = None,
+        log_interval: int = 10_000,
+        save_dir: str | Path | None = None,
+        save_interval: int | None = None,
+        keep_last: int = 2,
+        overwrite: bool = False,
+        progress: Callable[..., Any] | None = None,
+        seed: int = 0,
+        start_method: str = "spawn",
+        step_seconds: float = 60.0,
+    ) -> None:
+        eval_interval = max(1, total_frames // 10) if eval_interval is None else eval_interval
+        save_interval = max(1, total_frames // 10) if save_interval is None else save_interval
+        for name, value, least in (
+            ("total_frames", total_frames, 1),
+            ("segment_steps", segment_steps, 1),
+            ("num_learners", num_learners, 0),
+            ("eval_interval", eval_interval, 1),
+            ("log_interval", log_interval, 1),
+            ("save_interval", save_interval, 1),
+            ("seed", seed, 0),
+        ):
+            if value < least:
+                raise ValueError(f"A3CTrainer needs {name} >= {least}; got {value}.")
+        if not step_seconds > 0.0:
+            raise ValueError(f"A3CTrainer needs step_seconds > 0; got {step_seconds}.")
+        if clip_norm is not None and not clip_norm > 0.0:
+            raise ValueError(
+                f"A3CTrainer needs clip_norm > 0, or None to leave gradients as they are; got "
+                f"{clip_norm}."
+            )
+        if start_method not in multiprocessing.get_all_start_methods():
+            raise ValueError(
+                f"start_method={start_method!r} is none of this system's "
+                f"{multiprocessing.get_all_start_methods()}."
+            )
+        if not hasattr(loss_module, "actor_network"):
+            raise TypeError(
+                f"A3CTrainer acts with the loss's actor_network; {type(loss_module).__name__} has "
+                "none. Use A3CLoss, or another actor-critic loss."
+            )
+        if getattr(loss_module, "reduction", "mean") == "none":
+            raise ValueError(
+                "A3CTrainer needs a loss that is one number; this one has reduction='none'. Use "
+                "'mean' or 'sum'."
+            )
+        if stop_when is not None and evaluate is None:
+            raise ValueError("stop_when looks at what evaluate returns; pass evaluate too.")
+        self.loss_module = loss_module
+        self.settings = LearnerSettings(
+            make_env=make_env,
+            loss_module=loss_module,
+            segment_steps=segment_steps,
+            total_frames=total_frames,
+            lr_schedule=_named("lr_schedule", lr_schedule, _SCHEDULES),
+            clip_norm=clip_norm,
+            seed=seed,
+            configure_learner=configure_learner,
+        )
+        parameters = trained_parameters(loss_module)
+        if isinstance(optimizer, Optimizer):
+            self.optimizer = optimizer
+        elif isinstance(optimizer, str):
+            self.optimizer = _named("optimizer", optimizer, _OPTIMIZERS)(parameters, lr=lr)
+        else:
+            self.optimizer = optimizer(parameters)
+        self._check_parameters(parameters)
+        share_optimizer(self.optimizer)
+        for group in self.optimizer.param_groups:
+            group.setdefault("initial_lr", group["lr"])
+        columns = board_columns(loss_module)
+        board = torch.zeros(max(1, num_learners), len(columns), dtype=torch.float64)
+        stop = torch.zeros(1, dtype=torch.uint8)
+        steps = torch.zeros(len(board), dtype=torch.int64)
+        share([board, stop, steps], "A3CTrainer")
+        self.shared = SharedMemory(parameters, self.optimizer, board, stop, steps)
+        self.learners = LearnerProcesses(num_learners, start_method, step_seconds)
+        self.evaluate, self.stop_when = evaluate, stop_when
+        self.log, self.progress = LearnerLog(board, columns, logger), progress
+        self.run_settings = {"trainer": "A3CTrainer", "loss_module": type(loss_module).__name__}
+        self.rotation = None
+        if save_dir is not None:
+            self.rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
+            self.rotation.settings = self.run_settings
+        self._save_at = float("inf")  # time at which a checkpoint is due
+        self.intervals = {"log": log_interval, "eval": eval_interval, "save": save_interval}
+        self._checkpoint = plain_checkpoint(
+            loss_module=loss_module,
+            optimizer=_OptimizerState(self.optimizer),
+            counters=self.log,
+            history=HistoryState(self.log),  # type: ignore[arg-type]
+        )
+
+    def _check_parameters(self, parameters: list[nn.Parameter]) -> None:
+        known = {id(p) for p in parameters}
+        held = [p for group in self.optimizer.param_groups for p in group["params"]]
+        foreign = sum(id(p) not in known for p in held)
+        if foreign:
+            raise ValueError(
+                f"{foreign} of the optimiser's {len(held)} parameters are not the loss's. Build it "
+                "over loss_module.parameters()."
+            )
+
+    @property
+    def frames(self) -> int:
+        """T: frames of all learners so far, those before a checkpoint included."""
+        return self.log.frames
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in ``train()`` so far, that before a checkpoint included."""
+        return self.log.seconds
+
+    @property
+    def history(self) -> dict[str, list[float]]:
+        """All values logged so far, by name."""
+        return self.log.history
+
+    def policy(self) -> TensorDictModuleBase:
+        """Returns a copy of the policy as it is now, which further training does not change."""
+        return actor_of(self._copy_loss()).requires_grad_(False)
+
+    def _copy_loss(self) -> LossModule:
+        return cloudpickle.loads(cloudpickle.dumps(self.loss_module))
+
+    def train(self) -> dict[str, list[float]]:
+        """Trains until T reaches ``total_frames`` or ``stop_when`` is true.
+
+        Returns:
+            dict: the ``history``.
+
+        Raises:
+            LearnerError: if a learner ended before its time; a checkpoint has been written.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
+            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
+                unless ``overwrite`` is true.
+            FolderInUse: if another run writes to ``save_dir``.
+        """
+        if self.rotation is not None:
+            self.rotation.begin()
+        with folder_locked(self.rotation.directory) if self.rotation else nullcontext(), patient():
+            return self._train()
+
+    def _train(self) -> dict[str, list[float]]:
+        self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
+        self.log.start()
+        self._next = {name: self._after(name) for name in self.intervals}
+        self._accepted: LossModule | None = None  # what stop_when was content with
+        self._bar = self.progress(total=self.settings.total_frames) if self.progress else None
+        try:
+            if self.frames < self.settings.total_frames:
+                (self._watch if self.learners.number else self._run_here)()
+            self.learners.stop(self.shared)
+            if self._accepted is not None:
+                self.loss_module.load_state_dict(self._accepted.state_dict())
+            self._report(at_end=True)
+        except BaseException as error:
+            with unbroken():
+                self.learners.stop(self.shared)
+                self._end_badly(error)
+            if not isinstance(error, KeyboardInterrupt):
+                raise_if_asked()  # the signal came to the learners as well, and ended them first
+            raise
+        finally:
+            self.learners.stop(self.shared)
+            self.log.stop()
+            if self._bar is not None:
+                self._bar.close()
+        return self.history
+
+    def save(self) -> Path:
+        """Writes a checkpoint into ``save_dir``, atomically; returns its path."""
+        if self.rotation is None:
+            raise ValueError("There is nowhere to save to. Pass save_dir when building A3CTrainer.")
+        self.rotation.begin()
+        with unbroken():
+            saved = self.rotation.save(self._checkpoint, step=self.frames)
+        self._save_at = time.monotonic() + SAVE_SECONDS
+        return saved
+
+    def load(self, path: str | Path) -> A3CTrainer:
+        """Continues from a checkpoint; call it before ``train()``.
+
+        The optimiser's settings are the checkpoint's, the learning rate at the start included; the
+        schedule and all else are this trainer's.
+
+        Args:
+            path (path): a checkpoint, or a folder of checkpoints (``save_dir``), of which the
+                newest is taken.
+
+        Returns:
+            A3CTrainer: itself.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+            CheckpointError: if it is damaged, of a newer version or another loss, or does not fit,
+                e.g. other networks or optimiser.
+        """
+        found = newest_checkpoint(path)
+        check_settings(found, self.run_settings)
+        self._checkpoint.load(found)
+        if self.rotation is not None:
+            self.rotation.continue_from(found)
+        return self
+
+    # Running learners
+
+    def _run_here(self) -> None:
+        settings = cloudpickle.loads(cloudpickle.dumps(self.settings))
+        with torch.random.fork_rng(devices=[]):
+            learner = ActorLearner(settings, self.shared, 0, self.frames)
+            try:
+                while not learner.done:
+                    learner.update()
+                    if self._report():
+                        break
+                    raise_if_asked()
+            finally:
+                learner.env.close()
+
+    def _watch(self) -> None:
+        start = self.frames
+        self.learners.start(cloudpickle.dumps(self.settings), self.shared, start)
+        while not self.learners.wait(_POLL_SECONDS, self.frames >= self.settings.total_frames):
+            raise_if_asked()
+            if self.frames == start:  # they are still importing
+                self.log.restart_clock()
+            elif self._report():
+                return
+
+    def _end_badly(self, error: BaseException) -> None:
+        """Saves what there is, and says where."""
+        if self.rotation is None:
+            return
+        try:
+            self.save()
+        except OSError as failure:  # what ended the run is the error to raise
+            print(f"\n{type(error).__name__}; and {failure}.", file=sys.stderr)
+            return
+        again = f"Go on with trainer.load({str(self.rotation.directory)!r}).train()."
+        how = "Stopped" if isinstance(error, KeyboardInterrupt) else type(error).__name__
+        print(f"\n{how}; saved at {self.frames} frames. {again}", file=sys.stderr)
+
+    # Reporting
+
+    def _after(self, name: str) -> int:
+        """The next multiple of an interval."""
+        return (self.frames // self.intervals[name] + 1) * self.intervals[name]
+
+    def _due(self, name: str, at_end: bool) -> bool:
+        if not at_end and self.frames < self._next[name]:
+            return False
+        self._next[name] = self._after(name)
+        return True
+
+    def _report(self, at_end: bool = False) -> bool:
+        """Logs, evaluates and saves what is due; returns whether the run is to end."""
+        end = False
+        if self._bar is not None:
+            self._bar.update(self.frames - self._bar.n)
+        if self._due("log", at_end and self.frames > self.log.logged_frames):
+            progress = min(1.0, self.frames / self.settings.total_frames)
+            lr = self.optimizer.param_groups[0]["initial_lr"]
+            values = self.log.log(self.settings.lr_schedule(progress) * lr)
+            if self._bar is not None:
+                self._bar.set_postfix({"return": f"{values['episode_return']:.3g}"})
+        again = self._accepted is None and not (at_end and self._evaluated())
+        if self.evaluate is not None and again and self._due("eval", at_end):
+            end = self._evaluate()
+        overdue = time.monotonic() >= self._save_at
+        if self.rotation is not None and (self._due("save", at_end) or overdue):
+            self.save()
+        return end
+
+    def _evaluated(self) -> bool:
+        done = self.history.get("eval_frames") or [-1.0]
+        return done[-1] == self.frames
+
+    def _evaluate(self) -> bool:
+        assert self.evaluate is not None
+        frames, loss_module = self.frames, self._copy_loss()
+        with torch.no_grad():
+            metrics = dict(self.evaluate(actor_of(loss_module).requires_grad_(False)))
+        named = {f"eval_{name}": value for name, value in metrics.items()}
+        self.log.record({"eval_frames": frames, **named}, frames)
+        if self.stop_when is not None and self.stop_when(metrics):
+            self._accepted = loss_module
+        return self._accepted is not None
+
+
+class _OptimizerState:
+    """An optimiser's state and settings, which stay in shared memory when they are loaded."""
+
+    def __init__(self, optimizer: Optimizer) -> None:
+        self.optimizer = optimizer
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.optimizer.state_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        saved, own = (
+            sorted({key for entry in state["state"].values() for key in entry})
+            for state in (state_dict, self.optimizer.state_dict())
+        )
+        if saved != own:
+            raise ValueError(
+                f"the checkpoint's optimiser has the state {saved}, this one, "
+                f"{type(self.optimizer).__name__}, has {own}. Go on with the same optimiser."
+            )
+        self.optimizer.load_state_dict(dict(state_dict))
+        share_optimizer(self.optimizer)  # loading has put new tensors in place of the shared ones
+
+
+def _named(name: str, value: Any, known: Mapping[str, Any]) -> Any:
+    """Returns what a name stands for; anything callable stands for itself."""
+    if callable(value):
+        return value
+    if value not in known:
+        raise ValueError(f"{name}={value!r} is none of {sorted(known)}, and not callable.")
+    return known[value]

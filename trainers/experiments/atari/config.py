@@ -1,0 +1,152 @@
+"""Configuration of the ``atari`` experiment."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+
+from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.trainers.experiments.registry import ExperimentError
+from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
+
+GUIDES = ("none", "prior", "prior_value")
+PROTOCOLS = ("deterministic", "sticky")
+SOURCES = (
+    "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
+    "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable", "diayn_retrained",
+)  # fmt: skip
+
+
+@name_arguments
+@dataclass
+class AtariConfig(RunConfig):
+    """What ``hmcts train experiment=atari`` does.
+
+    A base step is 4 frames of the game. All emulated frames count: real, simulated, and those spent
+    on finding options.
+
+    Example:
+        >>> AtariConfig(game="Pong").protocol
+        'deterministic'
+    """
+
+    game: str = "Breakout"
+    """The game; needs the extra atari, which brings the games along."""
+    out: str = "runs/atari"
+    """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
+    protocol: str = "deterministic"
+    """"deterministic" (comparable with the source and the planning papers) or "sticky" (actions
+    stick with probability 0.25, and the planner is given no random generator)."""
+    source: str = "best"
+    """Where options come from: "best" ("action_sets", "actions" or "goals", whichever a planner's
+    trials score best with), "goals" (found by a probe and trials), "goals_network" (the
+    same, carried out by one network that learned them), "goals_fine_tuned" (that network, trained
+    further by SAC on its goals and the game), "goals_retrained" (the same on what searches
+    simulated, Algorithm 3), "repeat" (one for each action), "actions"
+    (some of these, chosen by trials), "action_sets" (all of these, those that fire or those that do
+    not, chosen by trials), "diayn" (the source's worker), "diayn_displacement",
+    "diayn_controllable" (with other discriminators), "diayn_retrained" (Algorithm 3)."""
+    frames: int = 40_000_000
+    """Emulated frames in all, the source's 10 million base steps; the last episode is finished."""
+    max_episode_frames: int = 108_000
+    """Real frames after which an episode ends, the community's half an hour."""
+    options_from: str = ""
+    """Folder of another run of the game, whose options and their length are taken over; what it
+    spent on finding them counts."""
+    option_steps: int = 0
+    """Base steps of an option (the source's N_worker_samples); 0: chosen by trials."""
+    tune_trials: int = 4
+    """Lengths of options that are tried where `option_steps=0`, of 5, 10, 20, 30."""
+    tune_with: str = "grid"
+    """"grid" tries the lengths one by one; "optuna" draws lengths and PUCT's c (needs optuna)."""
+    num_skills: int = 3
+    """Skills of a DIAYN worker (the source's N_policies)."""
+    skill_base_steps: int = 40_000
+    """Base steps of a DIAYN worker's training."""
+    ratio: float = 25.0
+    """Simulated base steps per real one, after which a search selects no new leaves."""
+    rollout_options: int = 5
+    """Options of the rollouts that stay in the tree."""
+    tree_policy: str = "puct"
+    """"puct" (max backup, values scaled to [0, 1]) or "uct" (mean backup), e.g. to compare with."""
+    guide: str = "none"
+    """Whether a network learns from the searches and guides those after them: "none", "prior" or
+    "prior_value"."""
+    c: float = 2.0
+    """Weight of exploration; for UCT in units of the greatest reward seen."""
+    gamma: float = 0.99
+    """Discount per base step."""
+    width_novelty: bool = False
+    """Prune states without a RAM byte value that is new to the tree (width-1 search)."""
+    leaves_per_wave: int = 4
+    """Leaves of the tree that are simulated together."""
+    waves_in_flight: int = 1
+    """Waves of leaves that are simulated at a time; with processes, 2 keep them busy."""
+    num_processes: int = -1
+    """Processes that emulate; 0: in the command's own; -1: one for each core."""
+    trial_steps: int = 1_000
+    """Real base steps of a trial in which options are compared."""
+    trial_ratio: float = 10.0
+    """Simulated base steps per real one in such a trial."""
+    replant_every: int = 100
+    """Decisions between checkpoints, at which the tree is planted anew so that a resumed run goes
+    on exactly."""
+    toy: bool = False
+    """A run of seconds, to see that everything works."""
+
+    FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
+    PATHS = ("out", "options_from")
+
+    @property
+    def KEPT(self) -> tuple[str, ...]:  # type: ignore[override]  # noqa: N802
+        """Keys that a run keeps when it is resumed: all but those that may change on the way."""
+        return tuple(field.name for field in fields(self) if field.name not in self.FREE)
+
+    def check_inputs(self) -> None:
+        """Check what the run needs from outside, before anything is written.
+
+        Raises:
+            ModuleNotFoundError: if the emulator or optuna is needed and not installed.
+            ExperimentError: if there is no such game, or no run of it in ``options_from``.
+        """
+        super().check_inputs()
+        need_package("ale_py")
+        if self.tune_with == "optuna":
+            need_package("optuna")
+        from torchrl_hmcts.envs.atari.emulator import find_game
+
+        try:
+            find_game(self.game)
+        except ValueError as error:
+            raise ExperimentError(str(error)) from None
+        if self.options_from and not os.path.isdir(os.path.join(self.options_from, "checkpoints")):
+            raise ExperimentError(
+                f"options_from={self.options_from} is no run of this experiment: it has no folder "
+                "checkpoints. Name a folder that hmcts train experiment=atari wrote."
+            )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value, choices in (
+            ("protocol", self.protocol, PROTOCOLS),
+            ("source", self.source, SOURCES),
+            ("tune_with", self.tune_with, ("grid", "optuna")),
+            ("tree_policy", self.tree_policy, ("puct", "uct")),
+            ("guide", self.guide, GUIDES),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
+        for name in (
+            "frames", "max_episode_frames", "tune_trials", "num_skills", "skill_base_steps",
+            "leaves_per_wave", "waves_in_flight", "trial_steps", "replant_every",
+        ):  # fmt: skip
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        for name, low in (("option_steps", 0), ("rollout_options", 0), ("num_processes", -1)):
+            if getattr(self, name) < low:
+                raise ValueError(f"{name} must be at least {low}; got {getattr(self, name)}.")
+        for name in ("ratio", "c", "trial_ratio"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")
+        if not 0.0 < self.gamma <= 1.0:
+            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")

@@ -1,0 +1,1 @@
+"""Runs: their folder, configuration, curves, worker files and sweeps."""

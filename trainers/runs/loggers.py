@@ -1,0 +1,172 @@
+"""Where the values of a training go while it runs: CSV files always, others on request."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+from torchrl.record.loggers import CSVLogger, Logger
+
+from torchrl_hmcts.trainers.runs.config import check_logger
+from torchrl_hmcts.trainers.saving.files import left_out
+
+Observer = Callable[[str, float, int], None]
+_OBSERVERS: ContextVar[tuple[Observer, ...]] = ContextVar("observers", default=())
+
+
+class ScalarLoggers(Logger):
+    """Hands every value to several loggers, and to those who observe the run.
+
+    A logger that fails, e.g. on a full disk, is left out from there on, and a line says so.
+
+    Args:
+        loggers: of TorchRL; an entry that one of them does not support is left out there.
+        observers: called with name, value and step.
+
+    Example:
+        >>> seen = []
+        >>> logger = ScalarLoggers([], [lambda name, value, step: seen.append((name, value, step))])
+        >>> logger.log_scalar("entropy", 1.25, step=64)
+        >>> seen
+        [('entropy', 1.25, 64)]
+    """
+
+    def __init__(self, loggers: Sequence[Logger], observers: Sequence[Observer] = ()) -> None:
+        self.loggers, self.observers = list(loggers), list(observers)
+        super().__init__(exp_name="log", log_dir=None)
+
+    def _create_experiment(self) -> None:
+        return None
+
+    def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
+        """Log a value; what is not finite is left out.
+
+        Args:
+            name: of the value.
+            value: a number.
+            step: at which it was taken.
+        """
+        value = float(value)
+        if not math.isfinite(value):
+            return
+        self._each(lambda logger: logger.log_scalar(name, value, step=step))
+        for observer in self.observers:
+            observer(name, value, -1 if step is None else step)
+
+    def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
+        """Log a video where that is possible."""
+        self._each(lambda logger: logger.log_video(name, video, step=step, **kwargs))
+
+    def log_hparams(self, cfg: Mapping[str, Any]) -> None:
+        """Log the configuration."""
+        self._each(lambda logger: logger.log_hparams(dict(cfg)))
+
+    def log_histogram(self, name: str, data: Sequence[float], **kwargs: Any) -> None:
+        """Log a histogram where that is possible."""
+
+        def log(logger: Logger) -> None:
+            with contextlib.suppress(NotImplementedError):
+                logger.log_histogram(name, data, **kwargs)
+
+        self._each(log)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing: a run that goes on appends to its files."""
+        return {}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Take nothing."""
+
+    def close(self) -> None:
+        """Write what is still to be written, and close the files."""
+        self._each(_close)
+
+    def _each(self, act: Callable[[Logger], None]) -> None:
+        """Do something with every logger; one that fails, e.g. on a full disk, gets no more."""
+        kept = []
+        for logger in self.loggers:
+            with left_out(f"what {type(logger).__name__} still had to log"):
+                act(logger)
+                kept.append(logger)
+        for logger in self.loggers:
+            if logger not in kept:
+                with contextlib.suppress(Exception):  # what it could not write, it cannot now
+                    _close(logger)
+        self.loggers = kept
+
+    def __repr__(self) -> str:
+        return f"ScalarLoggers({self.loggers})"
+
+
+def _close(logger: Logger) -> None:
+    experiment = logger.experiment
+    for file in getattr(experiment, "files", {}).values():
+        file.close()
+    for name in ("finish", "close"):  # of Weights & Biases; of TensorBoard
+        end = getattr(experiment, name, None)
+        if callable(end):
+            end()
+            break
+
+
+def make_logger(config: Any) -> ScalarLoggers:
+    """Build the loggers of an experiment; files of an older run in the folder are removed.
+
+    Args:
+        config: of the experiment; ``out`` says where, ``logger`` which (CSV always),
+            ``resume`` whether what is there is continued. Weights & Biases writes to
+            ``out/wandb`` and sends nothing, unless the variable ``WANDB_MODE`` is ``online``.
+
+    Raises:
+        ValueError: if ``logger`` is none of the names.
+        ModuleNotFoundError: if its package is not installed.
+    """
+    check_logger(config.logger)
+    out = Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    if not getattr(config, "resume", False):
+        for old in ("log", "tensorboard"):
+            shutil.rmtree(out / old, ignore_errors=True)
+    loggers: list[Logger] = [CSVLogger(exp_name="log", log_dir=str(out))]
+    if config.logger == "tensorboard":
+        importlib.import_module("tensorboard")
+        from torchrl.record.loggers import TensorboardLogger
+
+        loggers.append(TensorboardLogger(exp_name="tensorboard", log_dir=str(out)))
+    elif config.logger == "wandb":
+        importlib.import_module("wandb")
+        from torchrl.record.loggers import WandbLogger
+
+        offline = os.environ.get("WANDB_MODE", "offline") != "online"
+        loggers.append(WandbLogger(exp_name=out.name, offline=offline, save_dir=str(out)))
+    made = ScalarLoggers(loggers, _OBSERVERS.get())
+    made.log_hparams({**asdict(config), "out": out.name})
+    return made
+
+
+@contextlib.contextmanager
+def observed(observer: Observer) -> Iterator[None]:
+    """Tell an observer every value that experiments log in the context.
+
+    Args:
+        observer: called with name, value and step; what it raises ends the run.
+
+    Example:
+        >>> with observed(lambda name, value, step: None):
+        ...     len(_OBSERVERS.get())
+        1
+    """
+    token = _OBSERVERS.set((*_OBSERVERS.get(), observer))
+    try:
+        yield
+    finally:
+        _OBSERVERS.reset(token)

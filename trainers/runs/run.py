@@ -1,0 +1,365 @@
+"""A run and its folder: claimed before anything is written, locked, recorded, never overwritten.
+
+Every command that writes a run opens it here: :func:`open_run`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shlex
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, ExperimentError
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.runs.config import BOOL_WORDS
+from torchrl_hmcts.trainers.runs.folder import (
+    RunFolder,
+    end_record,
+    read_run,
+    start_record,
+)
+from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
+from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled, stop_asked
+
+_RECORDS = ("run.json", "metrics.json", "evaluation.json", "page.json", "curves.csv", "index.html")
+_FOLDERS = ("checkpoints", "worker", "log", "tensorboard", "wandb")
+_PICTURES = (
+    *("episode.gif", "episode.mp4", "goals.png", "learning.png", "losses.png", "mazes.png"),
+    *("scores.png", "search.png", "skills.png", "solving.png", "view.png"),
+)
+_SWEEP = ("sweep.json", "journal.log", "importances.png", "trials.png")
+_IN_CHECKPOINTS = ("checkpoint-*", "worker-*", "run.pt*", "trials.json", ".*writing-*", ".lock")
+
+
+class FolderRefused(ExperimentError):
+    """A folder holds what a run would replace; the message says what, and what to type."""
+
+
+@dataclass
+class Run:
+    """A run that has its folder to itself.
+
+    Args:
+        config: of the experiment, with the folder in ``out``.
+        experiment: its name.
+        resumes: whether there is a checkpoint to continue from, and it was asked for.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.runs.config import DemoConfig
+        >>> Run(DemoConfig(out="runs/my run"), "demo").resume_command
+        "hmcts train 'resume=runs/my run'"
+    """
+
+    config: Any
+    experiment: str
+    resumes: bool = False
+
+    @property
+    def path(self) -> Path:
+        """The folder."""
+        return Path(self.config.out)
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of its checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def resume_command(self) -> str:
+        """The command that continues the run exactly."""
+        return resume_command(self.config.out)
+
+    @contextlib.contextmanager
+    def finish(self, metrics: Mapping[str, Any], *, title: str) -> Iterator[Pictures]:
+        """Write ``metrics.json``, note that the run is finished, then pictures and the page.
+
+        What cannot be drawn or written is left out, with a line on stderr.
+
+        Args:
+            metrics: its figures.
+            title: heading of the page.
+
+        Yields:
+            The pictures to draw.
+        """
+        from torchrl_hmcts.trainers.figures.report import finish
+
+        with finish(self.path, title, metrics) as pictures:
+            end_record(self.path, "finished")
+            yield pictures
+
+
+_current: ContextVar[Run | None] = ContextVar("run", default=None)
+
+
+@contextlib.contextmanager
+def open_run(
+    config: Any, *, experiment: str = "", command: Sequence[str] = (), fresh: bool = False
+) -> Iterator[Run]:
+    """Claim a folder for a run, and note in its ``run.json`` how what is done there ends.
+
+    Whatever can be refused is refused before anything is written: packages and inputs that are
+    missing, a folder in use, one that holds a run (unless ``config`` says ``resume`` or
+    ``overwrite``), a run with other settings to resume. A run that is open already, with this very
+    configuration, stays the same run: the command line opens it for the function of an experiment.
+
+    Args:
+        config: of the experiment; ``out`` is the folder.
+        experiment: its name. Default: by the class of the configuration.
+        command: words of the command line, for the record.
+        fresh: take the first of ``out``, ``out_2``, ``out_3``, ... that holds nothing.
+
+    Raises:
+        FolderRefused: if the folder holds what would be lost, or nothing to resume.
+        FolderInUse: if another process writes to it.
+        ModuleNotFoundError: if a package is missing.
+        ExperimentError: if an input is missing.
+        OSError: if the folder cannot be made or written to.
+    """
+    outer = _current.get()
+    if outer is not None and outer.config is config:
+        yield outer
+        return
+    if hasattr(config, "check_inputs"):
+        config.check_inputs()
+    name = experiment or next(
+        (
+            e.name
+            for e in ALL_EXPERIMENTS.values()
+            if e.config.endswith(f":{type(config).__name__}")
+        ),
+        "",
+    )
+    with contextlib.ExitStack() as stack:
+        config = _claim(stack, config, name, fresh)
+        resumes = getattr(config, "resume", False) and has_checkpoint(config.out)
+        run = Run(config, name, resumes)
+        if getattr(config, "overwrite", False):
+            clear(run.path)
+        from torchrl_hmcts.trainers.figures.report import machine, versions
+
+        start_record(name, config, command, {"versions": versions(), "machine": machine()})
+        token = _current.set(run)
+        stack.callback(_current.reset, token)
+        stack.enter_context(signals_handled())
+        stack.enter_context(_recorded(run.path))
+        yield run
+
+
+@contextlib.contextmanager
+def _recorded(path: Path) -> Iterator[None]:
+    """Note in ``run.json`` how what is done in the context ends."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        end_record(path, "stopped")
+        raise
+    except BaseException as error:
+        if stop_asked() and isinstance(error, Exception):  # the signal hit its processes as well
+            end_record(path, "stopped")
+            raise Stopped from error
+        end_record(path, getattr(error, "run_status", "failed"))
+        raise
+    end_record(path, "finished")
+
+
+def _claim(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool) -> Any:
+    """Lock the folder of a configuration, or with ``fresh`` the first free one; return it."""
+    for out in _names(config.out) if fresh else [config.out]:
+        chosen = dataclasses.replace(config, out=out) if fresh else config
+        try:
+            _check_folder(chosen, experiment)
+            # `resume` has one: a folder that it would make is refused above.
+            Path(out).mkdir(parents=True, exist_ok=True)
+            lock = folder_locked(out)
+            lock.__enter__()
+        except (FolderRefused, FolderInUse):
+            if fresh:
+                continue
+            raise
+        stack.push(lock)
+        try:
+            _check_folder(chosen, experiment)  # another may have written there meanwhile
+        except FolderRefused:
+            if not fresh:
+                raise
+            stack.pop_all().close()
+            continue
+        return chosen
+    raise AssertionError("names never end")
+
+
+def _names(base: str) -> Iterator[str]:
+    yield base
+    yield from (f"{base.rstrip('/')}_{number}" for number in count(2))
+
+
+def next_free(out: str) -> str:
+    """Return the first of ``out``, ``out_2``, ``out_3``, ... that does not exist or is empty.
+
+    Args:
+        out: folder.
+
+    Example:
+        >>> next_free("runs/none_there")
+        'runs/none_there'
+    """
+    return next(name for name in _names(out) if not _exists(name))
+
+
+def _exists(name: str) -> bool:
+    path = Path(name)
+    return path.is_file() or (path.is_dir() and any(path.iterdir()))
+
+
+def _check_folder(config: Any, experiment: str) -> None:
+    """Refuse a folder in which a run of this configuration would lose or mix up something."""
+    path = Path(config.out)
+    if path.exists() and not path.is_dir():
+        raise FolderRefused(
+            f"out={path} is a file. Name a folder, e.g. {_word('out', next_free(config.out))}."
+        )
+    resume, overwrite = (getattr(config, key, False) for key in ("resume", "overwrite"))
+    if resume and overwrite:
+        raise FolderRefused("resume=true continues a run, overwrite=true replaces it: choose one.")
+    if resume:
+        _check_resumable(config, experiment)
+        return
+    there = run_files(path)
+    if not there:
+        return
+    other = next_free(config.out)
+    run = None
+    with contextlib.suppress(ValueError):
+        run = read_run(path)
+        if not (run.experiment or run.metrics):  # nothing in it can be read
+            run = None
+    if overwrite and run is not None:
+        return
+    if run is None:
+        what = "a sweep" if set(there) & set(_SWEEP) else "files of the names that a run writes"
+        raise FolderRefused(
+            f"{path} holds {what} ({_some(there)}), which would be lost. Choose another folder, "
+            f"e.g. {_word('out', other)}."
+        )
+    seed = "" if run.seed is None else f", seed {run.seed}"
+    status = f"{run.status or ('finished' if run.metrics else 'unfinished')} run"
+    raise FolderRefused(
+        f"{path} holds a {status}{f' of {run.experiment}' if run.experiment else ''}{seed} "
+        f"({_some(there)}). Continue it with: {resume_command(config.out)}; replace it with "
+        f"overwrite=true; or choose another folder, e.g. {_word('out', other)}."
+    )
+
+
+def _check_resumable(config: Any, experiment: str) -> None:
+    """Refuse a folder without a run to continue, or with one of other settings."""
+    path = Path(config.out)
+    try:
+        run = read_run(path)
+    except ValueError:
+        if has_checkpoint(path):  # written from Python, by an older version
+            return
+        raise FolderRefused(
+            f"There is no checkpoint in {str(path)!r}, and no run to continue. Leave resume out to "
+            "begin one there, or name the folder of the run."
+        ) from None
+    if not has_checkpoint(path) and run.metrics:
+        raise FolderRefused(
+            f"There is no checkpoint in {str(path / 'checkpoints')!r}, but the figures of a run "
+            "that has finished. Replace it with overwrite=true, or choose another folder, e.g. "
+            f"{_word('out', next_free(config.out))}."
+        )
+    if experiment and run.experiment not in ("", experiment):
+        raise FolderRefused(f"{path} holds a run of {run.experiment}, not of {experiment}.")
+    changed = [
+        f"{key} was {run.config[key]!r} and is {getattr(config, key)!r} here"
+        for key in getattr(config, "KEPT", ())
+        if key in run.config and run.config[key] != getattr(config, key)
+    ]
+    if changed:
+        raise FolderRefused(
+            f"{path} holds a run with other settings: {'; '.join(changed)}. Continue it as it was "
+            f"with: {resume_command(config.out)}; or choose another folder for the new settings, "
+            f"e.g. {_word('out', next_free(config.out))}."
+        )
+
+
+def run_files(path: Path) -> list[str]:
+    """Return the names in a folder that a run or a sweep would write.
+
+    Args:
+        path: folder; need not exist.
+
+    Example:
+        >>> run_files(Path("nowhere"))
+        []
+    """
+    if not path.is_dir():
+        return []
+    names = sorted(entry.name for entry in path.iterdir())
+    ours = {*_RECORDS, *_FOLDERS, *_PICTURES, *_SWEEP}
+    return [name for name in names if name in ours or name.startswith("trial_")]
+
+
+def has_checkpoint(path: str | Path) -> bool:
+    """Return whether a run's folder has a checkpoint, whole or not.
+
+    Args:
+        path: of the run.
+    """
+    folder = Path(path) / "checkpoints"
+    return any(folder.glob("checkpoint-*")) or (folder / "run.pt").is_file()
+
+
+def clear(path: Path) -> None:
+    """Remove what a run wrote into its folder, and nothing else.
+
+    Args:
+        path: of the run.
+    """
+    run = RunFolder(path)
+    with contextlib.suppress(ValueError):
+        run = read_run(path)
+    pictures = {name for name in run.pictures if Path(name).name == name}
+    videos = {str(Path(name).with_suffix(".mp4")) for name in pictures if name.endswith(".gif")}
+    for name in {*_RECORDS, *_PICTURES, *pictures, *videos}:
+        (path / name).unlink(missing_ok=True)
+    for name in ("log", "tensorboard"):
+        shutil.rmtree(path / name, ignore_errors=True)
+    for name in ("checkpoints", "worker"):
+        folder = path / name
+        for pattern in _IN_CHECKPOINTS:
+            for entry in folder.glob(pattern):
+                if entry.is_dir() and not entry.is_symlink():
+                    shutil.rmtree(entry, ignore_errors=True)
+                else:
+                    entry.unlink(missing_ok=True)
+
+
+def resume_command(out: str | Path) -> str:
+    """Return the command that continues a run exactly, as it can be pasted into a shell.
+
+    Args:
+        out: folder of the run.
+
+    Example:
+        >>> resume_command("runs/one"), resume_command("true")
+        ('hmcts train resume=runs/one', 'hmcts train resume=./true')
+    """
+    folder = str(out)
+    return shlex.join(["hmcts", "train", f"resume={'./' * (folder.lower() in BOOL_WORDS)}{folder}"])
+
+
+def _word(key: str, value: str) -> str:
+    return shlex.quote(f"{key}={value}")
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")

@@ -1,0 +1,70 @@
+"""The networks of a finished run in one file, named with the training step they are from.
+
+The page of the run shows them, and ``hmcts evaluate`` tests them.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from torchrl.objectives import LossModule
+
+from torchrl_hmcts.trainers.runs.folder import read_run
+from torchrl_hmcts.trainers.saving.checkpoints import (
+    find_damage,
+    newest_checkpoint,
+    plain_checkpoint,
+)
+from torchrl_hmcts.trainers.saving.files import replacing
+from torchrl_hmcts.trainers.saving.stopping import unbroken
+
+_NAME = re.compile(r"worker-(\d+)\.torchrl")
+
+
+def save_worker(run: str | Path, loss_module: LossModule, step: int) -> Path:
+    """Write a run's networks as ``worker/worker-STEP.torchrl``, the only one there.
+
+    Args:
+        run: the run's folder.
+        loss_module: holds the networks.
+        step: base steps of training that they have seen.
+
+    Returns:
+        The file.
+    """
+    folder = Path(run) / "worker"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"worker-{step:012d}.torchrl"
+    with unbroken():
+        with replacing(path) as temporary:
+            plain_checkpoint(loss_module=loss_module).save(temporary)
+        for other in folder.iterdir():
+            if other != path and _NAME.fullmatch(other.name):
+                other.unlink()
+    return path
+
+
+def find_worker(run: str | Path) -> Path:
+    """Return the file that holds a run's networks: its worker, or its newest checkpoint.
+
+    A run that has not finished, or is of an older version, has no worker file; nor is one taken
+    that is damaged.
+
+    Args:
+        run: the run's folder.
+
+    Raises:
+        FileNotFoundError: if the run has written no checkpoint yet.
+    """
+    run = Path(run)
+    try:
+        over = read_run(run).status in ("", "finished")
+    except ValueError:  # no record: written from Python
+        over = True
+    if over and (run / "worker").is_dir():
+        workers = [p for p in (run / "worker").iterdir() if _NAME.fullmatch(p.name)]
+        whole = [path for path in workers if find_damage(path) is None]
+        if whole:
+            return max(whole)
+    return newest_checkpoint(run / "checkpoints")

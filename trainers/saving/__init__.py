@@ -1,0 +1,1 @@
+"""Files that survive: atomic writing, checksums, locks, signals, checkpoints."""

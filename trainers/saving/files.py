@@ -1,0 +1,238 @@
+"""Files that are written in one move, and files that a run can do without.
+
+Whoever reads a file finds the old content or the new one, never half of it. A picture that cannot
+be drawn or written is left out, with a line on stderr; the run goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+_CHECKSUM = "checksum"
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Hand out a path to write to; the file there takes its place in one move at the end.
+
+    Args:
+        path (path): of the file that is written, or written again.
+
+    Yields:
+        Path: in the same folder, with the same ending. After an error it is removed, and the old
+        file is as it was.
+
+    Raises:
+        OSError: if the file cannot be written, e.g. to a full disk.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.saving.files import replacing
+        >>> with replacing("numbers.txt") as temporary:
+        ...     _ = temporary.write_text("1 2 3", encoding="utf-8")
+        >>> temporary.exists(), Path("numbers.txt").exists()
+        (False, True)
+    """
+    path = Path(path)
+    remove_leftovers(path.parent, path.name)
+    temporary = path.with_name(f".writing-{os.getpid()}.{path.name}")
+    try:
+        yield temporary
+        _sync(temporary)
+        os.replace(temporary, path)
+        _sync(path.parent)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            remove(temporary)
+        raise
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text as UTF-8 in one move.
+
+    Args:
+        path (path): file.
+        text (str): its content.
+
+    Raises:
+        OSError: if it cannot be written.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.saving.files import write_text
+        >>> write_text("metrics.json", "{}")
+    """
+    with replacing(path) as temporary:
+        # A name from a locale without UTF-8 holds bytes as surrogates: they become bytes again.
+        temporary.write_bytes(text.encode("utf-8", "surrogateescape"))
+
+
+def write_json(path: str | Path, content: Any, *, checksum: bool = False) -> None:
+    """Write numbers and texts as JSON in one move; a number that is not finite becomes null.
+
+    Args:
+        path (path): file.
+        content: dicts, lists, texts and numbers.
+        checksum (bool): add the entry ``"checksum"`` to a dict, so that :func:`read_json` notices
+            damage. Default ``False``.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.saving.files import write_json
+        >>> write_json("metrics.json", {"solved": 0, "frames": float("nan")})
+    """
+    content = finite(content)
+    if checksum:
+        content = {**content, _CHECKSUM: digest(content)}
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Return the content of a JSON file that holds a dict; its checksum is compared, if it has one.
+
+    Args:
+        path (path): file.
+
+    Raises:
+        ValueError: if it is cut off, no JSON, no dict, or differs from its checksum.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.saving.files import read_json, write_json
+        >>> write_json("trials.json", {"seed": 1}, checksum=True)
+        >>> read_json("trials.json")
+        {'seed': 1}
+    """
+    try:
+        content = json.loads(Path(path).read_bytes().decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} cannot be read: {error}.") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} cannot be read: it holds no JSON object.")
+    if _CHECKSUM in content and content.pop(_CHECKSUM) != digest(content):
+        raise ValueError(f"{path} cannot be read: it differs from its checksum.")
+    return content
+
+
+def digest(content: Any) -> str:
+    """Return the SHA-256 of numbers and texts as they come back from JSON, in any layout.
+
+    Args:
+        content: dicts, lists, texts and numbers.
+
+    Example:
+        >>> digest({"a": 1, "b": (2,)}) == digest({"b": [2], "a": 1})
+        True
+    """
+    plain = json.loads(json.dumps(content))
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table as CSV in one move.
+
+    Args:
+        path (path): file.
+        head (list of str): names of the columns.
+        rows: their values.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.saving.files import write_csv
+        >>> write_csv("curves.csv", ("step", "value"), [(0, 0.5)])
+        >>> Path("curves.csv").read_text(encoding="utf-8").splitlines()
+        ['step,value', '0,0.5']
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([head, *rows])
+    write_text(path, text.getvalue())
+
+
+@contextlib.contextmanager
+def left_out(name: str) -> Iterator[None]:
+    """Continue after an error in the block, without the file it was to write; a line says so.
+
+    Args:
+        name (str): of the picture, video or page.
+
+    Example:
+        >>> with left_out("episode.mp4"):  # stderr: Left out episode.mp4: no ffmpeg
+        ...     raise RuntimeError("no ffmpeg")
+    """
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        with contextlib.suppress(OSError):  # of a stderr on the same full disk
+            print(f"Left out {name}: {reason}", file=sys.stderr, flush=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there.
+
+    Args:
+        path (path): of the file or folder; a link is removed, not what it leads to.
+    """
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path, name: str = "") -> None:
+    """Remove what processes that were killed while writing have left.
+
+    Args:
+        folder (path): to look into.
+        name (str): of the file that was being written. Default: every one.
+    """
+    for path in folder.glob(".*writing-*"):
+        process = int((re.findall(r"writing-(\d+)", path.name) or [0])[-1])
+        if name in path.name and (process == os.getpid() or not _is_running(process)):
+            with contextlib.suppress(OSError):
+                remove(path)
+
+
+def finite(content: Any) -> Any:
+    """Return content with None in place of a number that is not finite: JSON has no other.
+
+    Args:
+        content: dicts, lists, texts and numbers, NumPy's as well.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.saving.files import finite
+        >>> finite({"frames": [float("inf"), 2]})
+        {'frames': [None, 2]}
+    """
+    if isinstance(content, Mapping):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    if hasattr(content, "tolist"):  # of NumPy and torch
+        return finite(content.tolist())
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return process > 0
