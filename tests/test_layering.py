@@ -91,7 +91,7 @@ def layer(name: str) -> str:
     """Returns ``envs``, ``trainers``, ``components``, ``base`` or ``outside`` for an import."""
     if name.split(".")[0] != "torchrl_hmcts":
         return "outside"
-    if re.match(r"torchrl_hmcts\.(arguments|compiling|processes)\b", name):  # for all
+    if re.match(r"torchrl_hmcts\.(arguments|checks|compiling|processes)\b", name):  # for all
         return "base"
     second = [*name.split("."), ""][1]
     return second if second in ("envs", "trainers") else "components"

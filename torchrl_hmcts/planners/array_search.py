@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.planners.backups import Backup, MeanBackup
-from torchrl_hmcts.planners.counts import whole_number
 from torchrl_hmcts.planners.search import (
     Outcomes,
     RootStates,

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_hmcts.planners.counts import NO_LIMIT
+from torchrl_hmcts.checks import NO_LIMIT
 from torchrl_hmcts.planners.node_evaluation import (
     leaf_values,
     node_codes,

@@ -17,12 +17,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.nesting import option_gamma
 from torchrl_hmcts.planners.backups import Backup, MeanBackup
 from torchrl_hmcts.planners.budget import SearchBudget
 from torchrl_hmcts.planners.chance import ProgressiveWidening
 from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, MostVisited
-from torchrl_hmcts.planners.counts import whole_number
 from torchrl_hmcts.planners.growth import Growth, SearchProgress
 from torchrl_hmcts.planners.node_evaluation import (
     Evaluator,

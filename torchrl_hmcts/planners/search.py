@@ -11,9 +11,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from torchrl_hmcts.checks import NO_LIMIT, whole_number
 from torchrl_hmcts.planners.backups import Backup, MaxBackup
 from torchrl_hmcts.planners.chance import ProgressiveWidening
-from torchrl_hmcts.planners.counts import NO_LIMIT, whole_number
 from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.scored_descent import select_by_scores

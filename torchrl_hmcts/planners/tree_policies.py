@@ -17,7 +17,7 @@ from typing import Literal
 from tensordict import TensorClass
 from torch import Tensor
 
-from torchrl_hmcts.planners.counts import whole_number
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.planners.docstrings import KeepsDocstring
 
 

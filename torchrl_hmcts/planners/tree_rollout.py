@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_hmcts.planners.counts import whole_number
+from torchrl_hmcts.checks import whole_number
 
 
 @dataclass(frozen=True)
