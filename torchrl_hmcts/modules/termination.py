@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.modules.skill_actor import is_to_sample
 from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
 
@@ -42,7 +43,7 @@ class StallTermination:
             that writes no such count.
 
     Reference:
-        This project's; options end in states, as in Sutton, Precup and Singh, "Between MDPs and
+        This project's; options that end in states: Sutton, Precup and Singh, "Between MDPs and
         semi-MDPs", 1999.
 
     Examples:
@@ -61,12 +62,7 @@ class StallTermination:
         stalled_key: NestedKey = "stalled_steps",
         duration_key: NestedKey = "duration",
     ) -> None:
-        if isinstance(num_steps, bool) or not isinstance(num_steps, int) or num_steps < 1:
-            raise ValueError(
-                f"StallTermination ends an option after num_steps base steps without a change, an "
-                f"int >= 1; got {num_steps!r}."
-            )
-        self.num_steps = num_steps
+        self.num_steps = whole_number("StallTermination", "num_steps", num_steps, least=1)
         self.stalled_key = unravel_key(stalled_key)
         self.duration_key = unravel_key(duration_key)
         self.in_keys: list[NestedKey] = [self.stalled_key, self.duration_key]
@@ -97,8 +93,7 @@ class AnyTermination:
         ValueError: if there is no condition, or one cannot be called.
 
     Reference:
-        This project's; options end in states, as in Sutton, Precup and Singh, "Between MDPs and
-        semi-MDPs", 1999.
+        As :class:`StallTermination`.
 
     Examples:
         >>> import torch
@@ -139,14 +134,10 @@ class TerminationNetwork(SkillNetwork):
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
         num_options (int): number of options.
-        in_keys (sequence of NestedKey): float entries ``[*B, f_i]``, concatenated in order.
-        skill_key (NestedKey): the option, int64 ``[*B]``. Default ``"skill"``, as
-            ``OptionTransform`` names it inside an option.
+        in_keys, skill_key, hidden, activation: as :class:`SkillActor`'s.
         termination_logits_key (NestedKey): entry written, ``[*B, 1]``. Default
             ``"termination_logits"``.
-        initial_probability (float): where :math:`\beta` begins, about, in ``(0, 1)``. Default 0.5.
-        hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
-        activation (callable): builds the activations. Default ``torch.nn.ReLU``.
+        initial_probability (float): where :math:`\beta` begins, about, 0.001 to 0.999. Default 0.5.
 
     Raises:
         ValueError: if a size is not positive or the probability is out of its range.
@@ -177,14 +168,15 @@ class TerminationNetwork(SkillNetwork):
         hidden: Sequence[int] = (64, 64),
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
-        if not 0.0 < initial_probability < 1.0:
-            raise ValueError(
-                f"TerminationNetwork begins with a probability in (0, 1), of which there is a "
-                f"logit; got initial_probability={initial_probability}."
-            )
+        beta = real_number(
+            "TerminationNetwork",
+            "initial_probability",
+            initial_probability,
+            least=0.001,
+            most=0.999,
+        )
         network = SkillMLP(in_features, 1, num_options, hidden, activation)
-        odds = initial_probability / (1.0 - initial_probability)
-        nn.init.constant_(network.heads.bias, math.log(odds))
+        nn.init.constant_(network.heads.bias, math.log(beta / (1.0 - beta)))
         keys = [*key_list("TerminationNetwork", in_keys), skill_key]
         super().__init__(network, keys, termination_logits_key)
         self.num_options = num_options
@@ -197,7 +189,7 @@ class LearnedTermination:
     .. math:: \text{ends} \sim \mathrm{Bernoulli}(\beta(s, o)), \qquad
         \text{or, deterministic,} \quad \text{ends} \iff \beta(s, o) \ge 1/2
 
-    Deterministic is the choice for planning: a plan is carried out as it was simulated. The network
+    Deterministic is the choice for planning: a plan is executed as it was simulated. The network
     is called in the mode it is in, without gradients, and never becomes part of an env.
 
     Args:
@@ -243,10 +235,7 @@ class LearnedTermination:
         termination_logits_key: NestedKey = "termination_logits",
         duration_key: NestedKey = "duration",
     ) -> None:
-        if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-            raise ValueError(
-                f"LearnedTermination asks every so many base steps, an int >= 1; got {every!r}."
-            )
+        self.every = whole_number("LearnedTermination", "every", every, least=1)
         self.termination_logits_key = unravel_key(termination_logits_key)
         written = [unravel_key(key) for key in getattr(network, "out_keys", ())]
         if self.termination_logits_key not in written:
@@ -258,7 +247,6 @@ class LearnedTermination:
         self.network = network
         self.deterministic = bool(deterministic)
         self.generator = generator
-        self.every = every
         self.duration_key = unravel_key(duration_key)
         keys = [unravel_key(key) for key in network.in_keys]
         self.in_keys: list[NestedKey] = list(dict.fromkeys([*keys, self.duration_key]))
