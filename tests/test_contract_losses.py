@@ -20,7 +20,6 @@ from torchrl.objectives.utils import ValueEstimators
 import torchrl_hmcts.objectives
 from torchrl_hmcts.modules import (
     FixedSkillPrior,
-    GaussianSkillActor,
     GrowingSkillPrior,
     LearnedSkillPrior,
     OptionModel,
@@ -36,7 +35,6 @@ from torchrl_hmcts.modules import (
 )
 from torchrl_hmcts.objectives import (
     A3CLoss,
-    ContinuousDIAYNLoss,
     DIAYNLoss,
     DiscreteSkillSACLoss,
     ExpertIterationLoss,
@@ -167,9 +165,7 @@ def actor_and_critic(name: Callable, *, spec: Any = None) -> tuple[nn.Module, nn
     keys: dict[str, Any] = {"in_keys": [name("velocity")], "skill_key": name("skill")}
     spec = Categorical(A) if spec is None else spec
     if spec is SPEC:
-        actor: nn.Module = GaussianSkillActor(
-            2, spec, Z, action_key=name("action"), **keys, **SIZES
-        )
+        actor: nn.Module = SkillActor(2, spec, Z, action_key=name("action"), **keys, **SIZES)
         critic: nn.Module = SkillActionCritic(
             2,
             2,
@@ -197,13 +193,11 @@ def diayn(name: Callable, *, spec: Any = None, **kwargs: Any) -> DIAYNLoss:
     )
 
 
-def continuous_diayn(name: Callable, **kwargs: Any) -> ContinuousDIAYNLoss:
-    network = SkillDiscriminator(
-        2, Z, in_keys=[name("position")], skill_logits_key=name("skill_logits"), **SIZES
-    )
-    return ContinuousDIAYNLoss(
-        *actor_and_critic(name, spec=SPEC), network, fixed_alpha=False, **kwargs
-    )
+def continuous_diayn(name: Callable, *, reduction: str = "mean", **kwargs: Any) -> SkillSACLoss:
+    objective = discriminator(name, reduction=reduction)
+    objective.set_keys(skill_logits=name("skill_logits"))
+    networks = actor_and_critic(name, spec=SPEC)
+    return SkillSACLoss(*networks, objective, fixed_alpha=False, **kwargs)
 
 
 def discrete_sac(
@@ -342,9 +336,7 @@ CASES = {
     "diayn_one_hot": Case(
         functools.partial(diayn, spec=OneHot(A)), one_hot, DIAYN_GRADIENTS, **SAC
     ),
-    "continuous_diayn": Case(
-        continuous_diayn, continuous, DIAYN_GRADIENTS, **SAC, covers=[ContinuousDIAYNLoss]
-    ),
+    "continuous_diayn": Case(continuous_diayn, continuous, DIAYN_GRADIENTS, **SAC),
     "discrete_sac": Case(
         discrete_sac, discrete, METRA_GRADIENTS, **SAC, covers=[DiscreteSkillSACLoss]
     ),

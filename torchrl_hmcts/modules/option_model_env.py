@@ -161,7 +161,7 @@ class OptionModelEnv(ModelBasedEnvBase):
                 observation[key] = spec
         # All that a step reads, and no more: a real env may declare no state, and a planner
         # stores one for every node.
-        readers = [reader for reader in (self.model, self.memory, self.readout) if reader]
+        readers = [r for r in (self.model, self.memory, self.readout) if r is not None]
         keys = [*env.full_state_spec.keys(True, True), *self.counter_keys]
         keys += [key for reader in readers for key in reader.in_keys]
         reads = {unravel_key(key) for key in keys} - {unravel_key(key) for key in env.action_keys}

@@ -79,9 +79,7 @@ class _Choice:
     def __init__(self, spec: TensorSpec) -> None:
         self.size = self.num_actions = int(spec.space.n)
         self.one_hot = isinstance(spec, OneHot)
-        self.spec = (
-            OneHot(self.size, dtype=spec.dtype) if self.one_hot else Categorical(self.size)
-        )
+        self.spec = OneHot(self.size, dtype=spec.dtype) if self.one_hot else Categorical(self.size)
         self.distribution: type = _OneHotCategorical if self.one_hot else _Categorical
         self.distribution_kwargs: dict[str, Any] = {}
 

@@ -29,14 +29,9 @@ class SkillCritic(SkillNetwork):
         chapter 4.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillCritic
-        >>> critic = SkillCritic(2, num_actions=4, num_skills=3, in_keys=["velocity"])
-        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
-        ...                 batch_size=[5])
-        >>> critic(td)["action_value"].shape
-        torch.Size([5, 4])
+        >>> SkillCritic(2, num_actions=4, num_skills=3, in_keys=["velocity"]).in_keys
+        ['velocity', 'skill']
     """
 
     def __init__(
@@ -78,14 +73,9 @@ class SkillActionCritic(SkillNetwork):
         As :class:`SkillCritic`.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillActionCritic
-        >>> critic = SkillActionCritic(3, action_features=2, num_skills=4, in_keys=["velocity"])
-        >>> td = TensorDict(velocity=torch.randn(5, 3), action=torch.randn(5, 2),
-        ...                 skill=torch.zeros(5, dtype=torch.int64), batch_size=[5])
-        >>> critic(td)["state_action_value"].shape
-        torch.Size([5, 1])
+        >>> SkillActionCritic(3, action_features=2, num_skills=4, in_keys=["velocity"]).in_keys
+        ['velocity', 'action', 'skill']
     """
 
     def __init__(

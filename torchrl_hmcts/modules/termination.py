@@ -150,8 +150,7 @@ class TerminationNetwork(SkillNetwork):
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import TerminationNetwork
         >>> network = TerminationNetwork(2, num_options=4, in_keys=["velocity"])
-        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
-        ...                 batch_size=[5])
+        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5).long(), batch_size=[5])
         >>> network(td)["termination_logits"].shape
         torch.Size([5, 1])
     """

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_hmcts.modules.skill_prior import SkillPrior
-from torchrl_hmcts.objectives.skill_objective import SkillObjective, known_num_skills
+from torchrl_hmcts.objectives.loss import run_module
+from torchrl_hmcts.objectives.skill_objective import SkillObjective
 
 
 class SkillDynamicsLoss(SkillObjective):
@@ -33,10 +33,7 @@ class SkillDynamicsLoss(SkillObjective):
             and ``skill_scale``, both ``[*B, Z, D]``: mean and standard deviation of the change of
             its attribute ``target_key`` under each skill; e.g. a
             :class:`~torchrl_hmcts.modules.SkillDynamics`.
-        num_skills (int, optional): number of skills ``Z``. Default: that of the dynamics.
-        prior (SkillPrior, sequence of float or Tensor, optional): p(z), ``[Z]``. Default ``None``:
-            uniform. See :class:`SkillObjective`.
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        num_skills, prior, reduction: as in :class:`SkillObjective`.
 
     Returns:
         TensorDict with ``loss_dynamics`` (nats) and the detached ``dynamics_accuracy`` (fraction
@@ -44,30 +41,20 @@ class SkillDynamicsLoss(SkillObjective):
         ``reduction="none"`` both ``[*B]``.
 
     Raises:
-        ValueError: if the dynamics have no ``target_key``, or the number of skills is unknown or
-            contradicts that of the dynamics or prior.
+        AttributeError: if the dynamics have no ``target_key``.
 
-    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``skill_loc``,
-    ``skill_scale`` (defaults ``"skill_loc"``, ``"skill_scale"``), ``priority_weight`` (default
-    ``"priority_weight"``).
+    Keys (``set_keys``): those of :class:`SkillObjective`, ``skill_loc`` and ``skill_scale``
+    (defaults ``"skill_loc"``, ``"skill_scale"``).
 
     Reference:
         Sharma et al., "Dynamics-Aware Unsupervised Discovery of Skills", 2019, arXiv 1907.01657,
         algorithm 1.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillDynamics
         >>> from torchrl_hmcts.objectives import SkillDynamicsLoss
-        >>> objective = SkillDynamicsLoss(SkillDynamics(2, 2, num_skills=4))
-        >>> td = TensorDict(position=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
-        ...                 next=TensorDict(position=torch.randn(5, 2), batch_size=[5]),
-        ...                 batch_size=[5])
-        >>> list(objective(td).keys())
-        ['loss_dynamics', 'dynamics_accuracy']
-        >>> objective.reward(td).shape
-        torch.Size([5, 1])
+        >>> SkillDynamicsLoss(SkillDynamics(2, 2, num_skills=4)).in_keys
+        ['skill', 'position', ('next', 'position')]
     """
 
     @dataclass
@@ -83,39 +70,14 @@ class SkillDynamicsLoss(SkillObjective):
     dynamics_params: TensorDictParams
     target_dynamics_params: TensorDictParams
 
-    def __init__(
-        self,
-        dynamics: TensorDictModuleBase,
-        *,
-        num_skills: int | None = None,
-        prior: SkillPrior | Sequence[float] | Tensor | None = None,
-        reduction: str = "mean",
-    ) -> None:
-        num_skills = known_num_skills(type(self).__name__, dynamics, num_skills)
-        super().__init__(num_skills, prior=prior, reduction=reduction)
-        if not hasattr(dynamics, "target_key"):
-            raise ValueError(
-                f"SkillDynamicsLoss compares a change with a prediction, but "
-                f"{type(dynamics).__name__} does not say of which entry: it has no attribute "
-                "target_key. Use SkillDynamics, or set dynamics.target_key='position'."
-            )
-        self.convert_to_functional(dynamics, "dynamics", create_target_params=False)
-
-    @property
-    def root_features(self) -> list[NestedKey]:  # type: ignore[override]
-        """Entries read of the state before a transition."""
-        return list(dict.fromkeys([*self.dynamics.in_keys, self.dynamics.target_key]))
-
-    @property
-    def next_features(self) -> list[NestedKey]:  # type: ignore[override]
-        """Entry read of the state after a transition."""
-        return [self.dynamics.target_key]
+    def __init__(self, dynamics: TensorDictModuleBase, **settings: Any) -> None:
+        super().__init__(dynamics=dynamics, **settings)
+        self.next_features = [dynamics.target_key]
+        self.root_features = list(dict.fromkeys([*dynamics.in_keys, dynamics.target_key]))
 
     def log_densities(self, tensordict: TensorDictBase) -> Tensor:
         """Returns log q(s' | s, z) for every skill z, ``[*B, Z]``, for transitions ``[*B]``."""
-        root = tensordict.select(*self.dynamics.in_keys)
-        with self.dynamics_params.to_module(self.dynamics, preserve_module_state=False):
-            root = self.dynamics(root)
+        root = run_module(self.dynamics, self.dynamics_params, tensordict)
         loc = root.get(self.tensor_keys.skill_loc)
         scale = root.get(self.tensor_keys.skill_scale)
         key = self.dynamics.target_key
@@ -128,12 +90,9 @@ class SkillDynamicsLoss(SkillObjective):
         density = self.log_densities(tensordict)
         skill = self.skill(tensordict)
         loss = -density.gather(-1, skill.unsqueeze(-1)).squeeze(-1)
-        off = self.inactive()
-        if off is not None:
-            loss = loss.masked_fill(off[skill], 0.0)
         guess = (density.detach() + self.log_prior(density)).argmax(-1)
         return {
-            "loss_dynamics": self._reduce(loss, tensordict),
+            "loss_dynamics": self._reduce(self._of_active(loss, skill), tensordict),
             "dynamics_accuracy": self._average((guess == skill).to(density.dtype)),
         }
 
@@ -142,6 +101,4 @@ class SkillDynamicsLoss(SkillObjective):
         density = self.log_densities(tensordict)
         skill = self.skill(tensordict).unsqueeze(-1)
         evidence = (density + self.log_prior(density)).logsumexp(-1, keepdim=True)
-        reward = density.gather(-1, skill) - evidence
-        off = self.inactive()
-        return reward if off is None else reward.masked_fill(off[skill], 0.0)
+        return self._of_active(density.gather(-1, skill) - evidence, skill)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
 
+from torchrl_hmcts.checks import instance, real_number
 from torchrl_hmcts.modules.skill_prior import SkillPrior
-from torchrl_hmcts.objectives.skill_objective import check_reduction
+from torchrl_hmcts.objectives.loss import Loss
 
 
-class SkillPriorLoss(LossModule):
+class SkillPriorLoss(Loss):
     r"""Moves p(z) to the skills whose intrinsic reward is high, held apart by an entropy bonus.
 
     .. math::
@@ -45,7 +45,7 @@ class SkillPriorLoss(LossModule):
         prior_in_reward (bool): the reward that is read contains ``-log p(z)``, as DIAYN's and VIC's
             do; it is taken out, since the entropy stands for it. Pass ``False`` for a reward
             without it, e.g. METRA's. Default ``True``.
-        decay (float): share of the old running mean that a batch keeps, in ``[0, 1)``. Default
+        decay (float): share of the old running mean that a batch keeps, in ``[0, 1]``. Default
             ``0.9``; 0 looks at the latest batch only. In eval mode the mean stays.
         reduction (str): over skills: ``"sum"`` (default) is L above; ``"none"`` gives its terms,
             ``[Z]``; ``"mean"`` is L / Z.
@@ -105,48 +105,24 @@ class SkillPriorLoss(LossModule):
         decay: float = 0.9,
         reduction: str = "sum",
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-        check_reduction("SkillPriorLoss", reduction)
+        super().__init__(reduction)
+        instance("SkillPriorLoss", "prior", prior, SkillPrior)
         if not any(p.requires_grad for p in prior.parameters()):
             raise ValueError(
                 f"SkillPriorLoss trains the parameters of a prior; {type(prior).__name__} has none "
                 "to train. Pass a LearnedSkillPrior."
             )
-        if not entropy_coeff >= 0.0:
-            raise ValueError(
-                "SkillPriorLoss rewards entropy, so entropy_coeff must not be negative; got "
-                f"{entropy_coeff}."
-            )
-        if not 0.0 <= decay < 1.0:
-            raise ValueError(
-                f"SkillPriorLoss keeps a share decay in [0, 1) of its running mean; got {decay}."
-            )
         self.prior = prior
         self.num_skills = prior.num_skills
-        self.entropy_coeff = float(entropy_coeff)
+        coeff = real_number("SkillPriorLoss", "entropy_coeff", entropy_coeff, least=0.0)
+        self.entropy_coeff = coeff
         self.prior_in_reward = bool(prior_in_reward)
-        self.decay = float(decay)
-        self.reduction = reduction
+        self.decay = real_number("SkillPriorLoss", "decay", decay, least=0.0, most=1.0)
         self.register_buffer("mean_reward", torch.zeros(self.num_skills))
         self.register_buffer("seen", torch.zeros(self.num_skills, dtype=torch.bool))
 
-    _in_keys: Any  # list of keys, or None until it is known
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that ``forward`` reads."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            self._in_keys = [unravel_key(keys.skill), unravel_key(("next", keys.reward))]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        self._in_keys = None  # set_keys was called
+    def _reads(self) -> Iterable[NestedKey]:
+        return [self.tensor_keys.skill, ("next", self.tensor_keys.reward)]
 
     @torch.no_grad()
     def _remember(self, tensordict: TensorDictBase) -> None:

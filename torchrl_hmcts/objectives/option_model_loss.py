@@ -5,23 +5,22 @@ Letters: *B batch of the tensordict, K members of the ensemble, D predicted stat
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.objectives import LossModule, distance_loss
+from torchrl.objectives import distance_loss
 
+from torchrl_hmcts.checks import instance, real_number
 from torchrl_hmcts.modules.option_model import OptionModel
-from torchrl_hmcts.objectives.priority import PriorityWeights
-from torchrl_hmcts.objectives.skill_objective import check_reduction
+from torchrl_hmcts.objectives.loss import DISTANCES, Loss, one_of
 
 
-class OptionModelLoss(PriorityWeights, LossModule):
+class OptionModelLoss(Loss):
     r"""Regression of an option's outcome on recorded macro transitions, for every member.
 
     With normalised targets :math:`y` (see :meth:`OptionModel.targets`), predictions
@@ -65,39 +64,26 @@ class OptionModelLoss(PriorityWeights, LossModule):
         Exploration via Bootstrapped DQN", 2016, arXiv 1602.04621.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import OptionModel, SkillMLP
         >>> from torchrl_hmcts.objectives import OptionModelLoss
         >>> model = OptionModel(lambda n: SkillMLP(2, n, num_skills=4), ["position", "option"],
         ...                     {"position": 2}, max_duration=25, num_models=3)
-        >>> after = TensorDict(position=torch.ones(6, 2), reward=torch.zeros(6, 1),
-        ...                    duration=torch.full((6, 1), 25),
-        ...                    terminated=torch.zeros(6, 1, dtype=torch.bool), batch_size=[6])
-        >>> td = TensorDict(position=torch.zeros(6, 2), option=torch.zeros(6, dtype=torch.int64),
-        ...                 next=after, batch_size=[6])
-        >>> [key for key in OptionModelLoss(model.fit_normalization(td))(td).keys()]
-        ['loss_delta', 'loss_reward', 'loss_duration', 'loss_terminated', 'delta_error',
-         'terminated_accuracy']
+        >>> OptionModelLoss(model).in_keys[2:]
+        [('next', 'position'), ('next', 'reward'), ('next', 'duration'), ('next', 'terminated')]
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(Loss._AcceptedKeys):
         reward: NestedKey = "reward"
         duration: NestedKey = "duration"
         terminated: NestedKey = "terminated"
         bootstrap_mask: NestedKey = "bootstrap_mask"
-        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     out_keys = [
-        "loss_delta",
-        "loss_reward",
-        "loss_duration",
-        "loss_terminated",
-        "delta_error",
-        "terminated_accuracy",
+        *("loss_delta", "loss_reward", "loss_duration", "loss_terminated"),
+        *("delta_error", "terminated_accuracy"),
     ]
 
     model: OptionModel
@@ -119,60 +105,31 @@ class OptionModelLoss(PriorityWeights, LossModule):
         terminated_coeff: float = 1.0,
         reduction: str = "mean",
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-        check_reduction(type(self).__name__, reduction)
-        for name, loss in (
-            ("delta", delta_loss),
-            ("reward", reward_loss),
-            ("duration", duration_loss),
-        ):
-            if loss not in ("l1", "l2", "smooth_l1"):
-                raise ValueError(
-                    f"OptionModelLoss has the losses 'l1', 'l2' and 'smooth_l1'; got "
-                    f"{name}_loss={loss!r}."
-                )
+        super().__init__(reduction)
+        owner = type(self).__name__
+        instance(owner, "model", model, OptionModel)
         self.model = model
-        self.delta_loss = delta_loss
-        self.reward_loss = reward_loss
-        self.duration_loss = duration_loss
-        self.reduction = reduction
-        for name, coeff in (
-            ("delta_coeff", delta_coeff),
-            ("reward_coeff", reward_coeff),
-            ("duration_coeff", duration_coeff),
-            ("terminated_coeff", terminated_coeff),
-        ):
-            if not coeff >= 0.0:
-                raise ValueError(f"OptionModelLoss needs {name} >= 0, a weight; got {coeff}.")
-            self.register_coeff_buffer(name, float(coeff))
+        self.delta_loss = one_of(owner, "delta_loss", delta_loss, DISTANCES)
+        self.reward_loss = one_of(owner, "reward_loss", reward_loss, DISTANCES)
+        self.duration_loss = one_of(owner, "duration_loss", duration_loss, DISTANCES)
+        coefficients = {
+            "delta_coeff": delta_coeff,
+            "reward_coeff": reward_coeff,
+            "duration_coeff": duration_coeff,
+            "terminated_coeff": terminated_coeff,
+        }
+        for name, coeff in coefficients.items():
+            self.register_coeff_buffer(name, real_number(owner, name, coeff, least=0.0))
         self.set_keys(
             reward=model.reward_key, duration=model.duration_key, terminated=model.terminated_key
         )
 
-    _in_keys: Any  # list of keys, or None until it is known
-
-    def _set_in_keys(self) -> None:
+    def _reads(self) -> Iterable[NestedKey]:
         keys = self.tensor_keys
         outcome = [*self.model.delta_keys, keys.reward, keys.duration, keys.terminated]
-        self._in_keys = [*self.model.in_keys, *(unravel_key(("next", key)) for key in outcome)]
+        return [*self.model.in_keys, *(("next", key) for key in outcome)]
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that ``forward`` reads."""
-        if self._in_keys is None:
-            self._set_in_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        self._in_keys = None
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         keys, size = self.tensor_keys, self.model.num_deltas
         outputs = self.model.outputs(tensordict)  # [K, *B, D + 3]
         target = self.model.targets(
@@ -192,24 +149,22 @@ class OptionModelLoss(PriorityWeights, LossModule):
         def distance(part: slice | int, kind: str) -> Tensor:
             return distance_loss(outputs[..., part], target[..., part], kind)
 
+        end, ends = outputs[..., -1], target[..., -1]
+        cross_entropy = F.binary_cross_entropy_with_logits(end, ends, reduction="none")
         parts = {
             "loss_delta": distance(slice(size), self.delta_loss).mean(-1) * self.delta_coeff,
             "loss_reward": distance(size, self.reward_loss) * self.reward_coeff,
             "loss_duration": distance(size + 1, self.duration_loss) * self.duration_coeff,
-            "loss_terminated": self.terminated_coeff
-            * F.binary_cross_entropy_with_logits(
-                outputs[..., -1], target[..., -1], reduction="none"
-            ),
+            "loss_terminated": self.terminated_coeff * cross_entropy,
         }
-        weights = self._maybe_get_priority_weight(tensordict)
-        batch_size = tensordict.batch_size if self.reduction == "none" else torch.Size([])
-        out = TensorDict({}, batch_size=batch_size)
+        out = {}
         for name, part in parts.items():
             shared = (part if share is None else part * share).mean(0)
-            out.set(name, self._reduce_loss(shared, tensordict=tensordict, weights=weights))
-        with torch.no_grad():
-            errors = (outputs - target)[..., :size].abs().mean(-1).mean(0)
-            hits = ((outputs[..., -1] > 0) == (target[..., -1] > 0.5)).to(outputs.dtype).mean(0)
-        for name, value in (("delta_error", errors), ("terminated_accuracy", hits)):
-            out.set(name, value if self.reduction == "none" else value.mean())
-        return out
+            out[name] = self._reduce(shared, tensordict)
+        error = (outputs - target).detach()[..., :size].abs().mean(-1).mean(0)
+        hit = ((end > 0) == (ends > 0.5)).to(outputs.dtype).mean(0)
+        return {
+            **out,
+            "delta_error": self._average(error),
+            "terminated_accuracy": self._average(hit),
+        }
