@@ -11,16 +11,7 @@ from tensordict.nn import InteractionType, NormalParamExtractor, TensorDictModul
 from tensordict.nn.probabilistic import interaction_type
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    Composite,
-    MultiCategorical,
-    MultiOneHot,
-    OneHot,
-    TensorSpec,
-)
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.modules import (
     OneHotCategorical,
     ProbabilisticActor,
@@ -74,16 +65,16 @@ def is_to_sample(deterministic: bool) -> bool:
 class _Choice:
     """One of A actions, from A logits."""
 
-    keys = ("logits",)
+    writes = ("logits",)
+    distribution_kwargs: dict[str, Any] = {}
 
     def __init__(self, spec: TensorSpec) -> None:
         self.size = self.num_actions = int(spec.space.n)
         self.one_hot = isinstance(spec, OneHot)
-        self.spec = OneHot(self.size, dtype=spec.dtype) if self.one_hot else Categorical(self.size)
         self.distribution: type = _OneHotCategorical if self.one_hot else _Categorical
-        self.distribution_kwargs: dict[str, Any] = {}
+        self.spec = OneHot(self.size, dtype=spec.dtype) if self.one_hot else Categorical(self.size)
 
-    def action(
+    def choose(
         self, logits: Tensor, deterministic: bool, generator: torch.Generator | None
     ) -> Tensor:
         if not deterministic:
@@ -99,33 +90,43 @@ class _Choice:
 class _Squashed:
     """An action between bounds ``[D]``, from the 2 D raw parameters of a Gaussian."""
 
-    keys = ("loc", "scale")
+    writes = ("loc", "scale")
     distribution = TanhNormal
 
     def __init__(self, spec: Bounded) -> None:
-        low, high = (self._of_one_action(spec, end) for end in (spec.space.low, spec.space.high))
+        ends = torch.stack((spec.space.low, spec.space.high)).expand(2, *spec.shape)
+        flat = ends.reshape(2, -1, spec.shape[-1])
+        if not flat.isfinite().all() or not (flat == flat[:, :1]).all():
+            raise ValueError(
+                "SkillActor needs finite bounds of the action that are the same for the whole "
+                f"batch; got {ends.tolist()}."
+            )
+        low, high = flat[:, 0].clone()
         self.size = 2 * low.shape[-1]
         self.spec = Bounded(low, high, shape=low.shape, dtype=low.dtype)
         self.distribution_kwargs = {"low": low, "high": high}
         self.middle, self.half_range = (high + low) / 2, (high - low) / 2
-        self.extractor = NormalParamExtractor()
 
-    def action(
+    def choose(
         self, outputs: Tensor, deterministic: bool, generator: torch.Generator | None
     ) -> Tensor:
-        loc, scale = self.extractor(outputs)
+        loc, scale = _gaussian(outputs)
         if not deterministic:
             loc = loc + scale * torch.empty_like(loc).normal_(generator=generator)
         return self.half_range.to(loc) * loc.tanh() + self.middle.to(loc)
 
-    def _of_one_action(self, spec: Bounded, bound: Tensor) -> Tensor:
-        flat = bound.expand(spec.shape).reshape(-1, spec.shape[-1])
-        if not torch.isfinite(flat).all() or not (flat == flat[0]).all():
-            raise ValueError(
-                "SkillActor needs finite bounds of the action that are the same for the whole "
-                f"batch; got {bound.tolist()}."
-            )
-        return flat[0].clone()
+
+_gaussian = NormalParamExtractor()
+
+
+class _GaussianNetwork(SkillNetwork):
+    """Writes the location and scale that a network's outputs stand for."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        outputs = self.network(*entries(self, tensordict, self.in_keys))
+        for key, value in zip(self.out_keys, _gaussian(outputs), strict=True):
+            tensordict.set(key, value)
+        return tensordict
 
 
 class SkillActor(ProbabilisticActor):
@@ -196,14 +197,13 @@ class SkillActor(ProbabilisticActor):
         action_key = unravel_key(action_key)
         kind = _kind_of_action(action_spec, action_key)
         group = () if isinstance(action_key, str) else action_key[:-1]
-        written = [unravel_key((*group, name)) for name in kind.keys]
+        written = [unravel_key((*group, name)) for name in kind.writes]
         net = network(in_features, kind.size, num_skills, hidden, activation)
         keys = [*key_list("SkillActor", in_keys), skill_key]
+        run = (SkillNetwork if isinstance(kind, _Choice) else _GaussianNetwork)(net, keys, *written)
         super().__init__(
-            _GaussianNetwork(net, keys, written)
-            if isinstance(kind, _Squashed)
-            else SkillNetwork(net, keys, *written),
-            in_keys=dict(zip(kind.keys, written, strict=True)),
+            run,
+            in_keys=dict(zip(kind.writes, written, strict=True)),
             out_keys=[action_key],
             spec=Composite({action_key: kind.spec}),
             distribution_class=kind.distribution,
@@ -226,34 +226,14 @@ class SkillActor(ProbabilisticActor):
         self, outputs: Tensor, deterministic: bool, generator: torch.Generator | None = None
     ) -> Tensor:
         """Returns actions for the network's outputs: the best ones, or samples."""
-        return self._kind.action(outputs, deterministic, generator)
-
-
-class _GaussianNetwork(TensorDictModuleBase):
-    """Runs a network on entries of a tensordict and writes the location and scale it gives."""
-
-    def __init__(
-        self, network: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
-    ) -> None:
-        super().__init__()
-        self.in_keys = key_list("SkillActor", in_keys)
-        self.out_keys = list(out_keys)
-        self.network = network
-        self.extractor = NormalParamExtractor()
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        outputs = self.network(*entries(self, tensordict, self.in_keys))
-        for key, value in zip(self.out_keys, self.extractor(outputs), strict=True):
-            tensordict.set(key, value)
-        return tensordict
+        return self._kind.choose(outputs, deterministic, generator)
 
 
 def _kind_of_action(spec: TensorSpec, action_key: NestedKey) -> _Choice | _Squashed:
     """Returns how an action of a spec is made of a network's outputs."""
     if isinstance(spec, Composite) and action_key in spec.keys(True, True):
         spec = spec[action_key]
-    several = isinstance(spec, (Binary, MultiCategorical, MultiOneHot))
-    if isinstance(spec, (Categorical, OneHot)) and not several:
+    if type(spec) in (Categorical, OneHot):  # and not of several choices, which are subclasses
         return _Choice(spec)
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point and spec.shape:
         return _Squashed(spec)

@@ -1,11 +1,14 @@
 """Losses of the worker: actor and critics beside interchangeable skill objectives."""
 
 from torchrl_hmcts.objectives.a3c import A3CLoss, NStepReturn
-from torchrl_hmcts.objectives.dads import SkillDynamicsLoss
 from torchrl_hmcts.objectives.diayn import DIAYNLoss
-from torchrl_hmcts.objectives.discriminator import SkillDiscriminatorLoss
+from torchrl_hmcts.objectives.discovery import (
+    LSDEncoderLoss,
+    METRAEncoderLoss,
+    SkillDiscriminatorLoss,
+    SkillDynamicsLoss,
+)
 from torchrl_hmcts.objectives.durations import use_durations
-from torchrl_hmcts.objectives.encoders import LSDEncoderLoss, METRAEncoderLoss
 from torchrl_hmcts.objectives.option_critic import IntraOptionQLoss, OptionTerminationLoss
 from torchrl_hmcts.objectives.option_model_loss import OptionModelLoss
 from torchrl_hmcts.objectives.search_distillation import ExpertIterationLoss

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_hmcts.modules.skill_prior import SkillPrior
-from torchrl_hmcts.objectives.discriminator import SkillDiscriminatorLoss
+from torchrl_hmcts.objectives.discovery import SkillDiscriminatorLoss
 from torchrl_hmcts.objectives.skill_sac import DiscreteSkillSACLoss
 
 

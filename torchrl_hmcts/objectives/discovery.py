@@ -1,4 +1,4 @@
-"""Skills that travel far in a latent space, each in its own direction: METRA and LSD."""
+"""Published objectives of skill discovery: DIAYN's, METRA's, LSD's and DADS's."""
 
 from __future__ import annotations
 
@@ -11,12 +11,86 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.nn import functional as F
 from torch.nn.utils.parametrize import is_parametrized
 
 from torchrl_hmcts.checks import real_number
 from torchrl_hmcts.modules.objective_networks import SpectralLinear
-from torchrl_hmcts.objectives.loss import output_of
+from torchrl_hmcts.objectives.loss import output_of, run_module
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
+
+
+class SkillDiscriminatorLoss(SkillObjective):
+    r"""Skills that can be told apart: a discriminator guesses the skill from the state it led to.
+
+    .. math::
+
+        L(\phi) = -\log q_\phi(z \mid s'), \qquad r = \log q_\phi(z \mid s') - \log p(z)
+
+    ``s'`` stands for the entries ``("next", key)`` with ``key`` in ``discriminator.in_keys``.
+    Skills that the prior switches off are never guessed: their logits count as ``-inf``.
+
+    Args:
+        discriminator (TensorDictModuleBase): reads its ``in_keys`` and writes ``skill_logits``
+            ``[*B, Z]``, e.g. a :class:`~torchrl_hmcts.modules.SkillDiscriminator`.
+        num_skills, prior, reduction: as in :class:`SkillObjective`.
+
+    Returns:
+        TensorDict with ``loss_discriminator`` and the detached ``discriminator_accuracy`` (fraction
+        of transitions whose skill has the highest logit); with ``reduction="none"`` both ``[*B]``.
+
+    Keys (``set_keys``): those of :class:`SkillObjective` and ``skill_logits`` (default
+    ``"skill_logits"``).
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, algorithm 1.
+
+    Examples:
+        >>> from torchrl_hmcts.modules import SkillDiscriminator
+        >>> from torchrl_hmcts.objectives import SkillDiscriminatorLoss
+        >>> SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=4)).in_keys
+        ['skill', ('next', 'displacement')]
+    """
+
+    @dataclass
+    class _AcceptedKeys(SkillObjective._AcceptedKeys):
+        skill_logits: NestedKey = "skill_logits"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_discriminator", "discriminator_accuracy"]
+    root_features = ()
+
+    discriminator: TensorDictModuleBase
+    discriminator_params: TensorDictParams
+    target_discriminator_params: TensorDictParams
+
+    def __init__(self, discriminator: TensorDictModuleBase, **settings: Any) -> None:
+        super().__init__(discriminator=discriminator, **settings)
+        self.next_features = discriminator.in_keys
+
+    def skill_logits(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the logits ``[*B, Z]`` of q(z | s') for transitions ``[*B]``."""
+        module, params = self.discriminator, self.discriminator_params
+        logits = output_of(module, params, tensordict.get("next"), self.tensor_keys.skill_logits)
+        off = self.inactive()
+        return logits if off is None else logits.masked_fill(off, -torch.inf)
+
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        logits, skill = self.skill_logits(tensordict), self.skill(tensordict)
+        loss = F.cross_entropy(logits.flatten(0, -2), skill.flatten(), reduction="none")
+        loss = self._of_active(loss.view(skill.shape), skill)
+        hit = (logits.detach().argmax(-1) == skill).to(logits.dtype)
+        return {
+            "loss_discriminator": self._reduce(loss, tensordict),
+            "discriminator_accuracy": self._average(hit),
+        }
+
+    @torch.no_grad()
+    def reward(self, tensordict: TensorDictBase) -> Tensor:
+        log_q = self.skill_logits(tensordict).log_softmax(-1)
+        skill = self.skill(tensordict).unsqueeze(-1)
+        return self._of_active(log_q.gather(-1, skill) - self.log_prior(log_q)[skill], skill)
 
 
 class EncoderObjective(SkillObjective):
@@ -204,3 +278,91 @@ class LSDEncoderLoss(EncoderObjective):
             "loss_encoder": self._reduce(-self._travel(step, tensordict), tensordict),
             "latent_distance": self._average(step.norm(dim=-1)),
         }
+
+
+class SkillDynamicsLoss(SkillObjective):
+    r"""DADS: skills whose outcome can be predicted, and differs from that of the other skills.
+
+    .. math::
+
+        L(\phi) = -\log q_\phi(s' \mid s, z), \qquad
+        r = \log q_\phi(s' \mid s, z) - \log \sum_i p(z_i)\, q_\phi(s' \mid s, z_i)
+
+    with the skill dynamics :math:`q` a Gaussian of the change :math:`s' - s`. Where the paper draws
+    skills from the prior for the second term, this sums over all of them, which for discrete skills
+    is exact. The reward is at most :math:`-\log p(z)`, as DIAYN's.
+
+    Args:
+        dynamics (TensorDictModuleBase): reads its ``in_keys`` of a state and writes ``skill_loc``
+            and ``skill_scale``, both ``[*B, Z, D]``: mean and standard deviation of the change of
+            its attribute ``target_key`` under each skill; e.g. a
+            :class:`~torchrl_hmcts.modules.SkillDynamics`.
+        num_skills, prior, reduction: as in :class:`SkillObjective`.
+
+    Returns:
+        TensorDict with ``loss_dynamics`` (nats) and the detached ``dynamics_accuracy`` (fraction
+        of transitions for which the skill is the most probable one given the change); with
+        ``reduction="none"`` both ``[*B]``.
+
+    Raises:
+        AttributeError: if the dynamics have no ``target_key``.
+
+    Keys (``set_keys``): those of :class:`SkillObjective`, ``skill_loc`` and ``skill_scale``
+    (defaults ``"skill_loc"``, ``"skill_scale"``).
+
+    Reference:
+        Sharma et al., "Dynamics-Aware Unsupervised Discovery of Skills", 2019, arXiv 1907.01657,
+        algorithm 1.
+
+    Examples:
+        >>> from torchrl_hmcts.modules import SkillDynamics
+        >>> from torchrl_hmcts.objectives import SkillDynamicsLoss
+        >>> SkillDynamicsLoss(SkillDynamics(2, 2, num_skills=4)).in_keys
+        ['skill', 'position', ('next', 'position')]
+    """
+
+    @dataclass
+    class _AcceptedKeys(SkillObjective._AcceptedKeys):
+        skill_loc: NestedKey = "skill_loc"
+        skill_scale: NestedKey = "skill_scale"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_dynamics", "dynamics_accuracy"]
+
+    dynamics: TensorDictModuleBase
+    dynamics_params: TensorDictParams
+    target_dynamics_params: TensorDictParams
+
+    def __init__(self, dynamics: TensorDictModuleBase, **settings: Any) -> None:
+        super().__init__(dynamics=dynamics, **settings)
+        self.next_features = [dynamics.target_key]
+        self.root_features = list(dict.fromkeys([*dynamics.in_keys, dynamics.target_key]))
+
+    def log_densities(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns log q(s' | s, z) for every skill z, ``[*B, Z]``, for transitions ``[*B]``."""
+        root = run_module(self.dynamics, self.dynamics_params, tensordict)
+        loc = root.get(self.tensor_keys.skill_loc)
+        scale = root.get(self.tensor_keys.skill_scale)
+        key = self.dynamics.target_key
+        change = tensordict.get("next").get(key) - tensordict.get(key)
+        error = (change.unsqueeze(-2) - loc) / scale
+        constant = 0.5 * math.log(2.0 * math.pi)
+        return -(0.5 * error.square() + scale.log() + constant).sum(-1)
+
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        density = self.log_densities(tensordict)
+        skill = self.skill(tensordict)
+        loss = -density.gather(-1, skill.unsqueeze(-1)).squeeze(-1)
+        guess = (density.detach() + self.log_prior(density)).argmax(-1)
+        return {
+            "loss_dynamics": self._reduce(self._of_active(loss, skill), tensordict),
+            "dynamics_accuracy": self._average((guess == skill).to(density.dtype)),
+        }
+
+    @torch.no_grad()
+    def reward(self, tensordict: TensorDictBase) -> Tensor:
+        density = self.log_densities(tensordict)
+        skill = self.skill(tensordict).unsqueeze(-1)
+        evidence = (density + self.log_prior(density)).logsumexp(-1, keepdim=True)
+        return self._of_active(density.gather(-1, skill) - evidence, skill)
