@@ -518,21 +518,57 @@ def test_with_and_without_vmap_the_losses_are_the_same(
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_priority_weight_may_be_nested_and_weighs_each_transition(name: str) -> None:
+    case, outs = CASES[name], {}
+    for reduction in ("none", "sum"):
+        torch.manual_seed(0)
+        loss = case.make(lambda key: key, reduction=reduction)
+        if not hasattr(loss.tensor_keys, "priority_weight"):
+            pytest.skip("has no priority weights")
+        td = case.data()
+        weight = torch.arange(td.numel()).reshape(td.shape)
+        if reduction == "sum":
+            loss.set_keys(priority_weight=("buffer", "weight"))
+            td["buffer", "weight"] = weight.float()
+        torch.manual_seed(1)
+        outs[reduction] = loss(td)
+    for key in outs["sum"].keys():
+        if key.startswith("loss"):
+            torch.testing.assert_close(outs["sum"][key], (weight * outs["none"][key]).sum())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_gradient_of_each_loss_matches_finite_differences(name: str) -> None:
     case = CASES[name]
     torch.manual_seed(0)
-    loss = case.make(lambda key: key, reduction="sum")
-    if not hasattr(loss.tensor_keys, "priority_weight"):
-        pytest.skip("has no priority weights")
-    td = case.data()
-    torch.manual_seed(1)
-    plain = loss(td.clone())
-    loss.set_keys(priority_weight=("buffer", "weight"))
-    td["buffer", "weight"] = torch.full(td.batch_size, 2.0)
-    torch.manual_seed(1)
-    weighted = loss(td)
-    for key in plain.keys():
-        if key.startswith("loss"):
-            torch.testing.assert_close(weighted[key], 2.0 * plain[key])
+    loss = case.make(lambda key: key).double()
+    for module in vars(loss).values():  # networks that it reads and does not hold
+        if isinstance(module, nn.Module):
+            module.double()
+    td = case.data().apply(lambda x: x.double() if x.is_floating_point() else x)
+    if name.startswith("a3c"):  # whose return rests on the critic, and is held
+        td["advantage"], td["value_target"] = torch.randn(2, *td.shape, 1).double()
+    loss(td.clone())
+    loss.eval()  # no running mean and no power iteration moves below
+
+    def value(key: str) -> Tensor:
+        torch.manual_seed(1)  # of sampled actions
+        return loss(td.clone())[key]
+
+    for key, beginnings in case.gradients.items():
+        loss.zero_grad()
+        value(key).backward()
+        parameters = [p for n, p in loss.named_parameters() if n.startswith(tuple(beginnings))]
+        direction = [torch.randn_like(p) for p in parameters]
+        slope = sum((p.grad * d).sum() for p, d in zip(parameters, direction, strict=True))
+        sides = []
+        for step in (1e-6, -2e-6, 1e-6):
+            with torch.no_grad():
+                for p, d in zip(parameters, direction, strict=True):
+                    p.add_(d, alpha=step)
+            sides.append(value(key).detach())
+        # A spectral norm follows its matrix only with the next power iterations.
+        rtol = 1e-4 if name == "lsd" else 1e-6
+        torch.testing.assert_close(slope, (sides[0] - sides[1]) / 2e-6, rtol=rtol, atol=1e-7)
 
 
 @pytest.fixture(autouse=True)

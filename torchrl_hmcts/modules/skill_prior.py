@@ -228,7 +228,7 @@ def _per_skill(
     if made.shape != (num_skills,) or not torch.isfinite(made).all():
         raise ValueError(
             f"{owner} needs one finite number per skill, shape ({num_skills},); got "
-            f"{name}={made.tolist()}, shape {tuple(made.shape)}."
+            f"{name}={values!r}."
         )
     return made
 

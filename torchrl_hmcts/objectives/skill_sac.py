@@ -449,6 +449,7 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
         action_spec: TensorSpec | None = None,
         **sac: Any,
     ) -> None:
+        instance("SkillSACLoss", "action_spec", action_spec, TensorSpec, type(None))
         super().__init__(actor_network, qvalue_network, objective, action_spec=action_spec, **sac)
         _ = self.target_entropy  # TorchRL makes this buffer at the first use
 
