@@ -361,11 +361,11 @@ class TestAChainOfKnownValue:
             assert (advantage.abs().max() < 1e-6) == right
 
     def test_what_does_not_discount_is_refused(self):
-        with pytest.raises(TypeError, match="sets a TorchRL loss or value estimator; got Linear"):
+        with pytest.raises(TypeError, match="ValueEstimatorBase for module; got Linear"):
             durations(nn.Linear(1, 1))
         critic = ValueOperator(self.table(1), in_keys=["state"])
         gae = GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic)
         with pytest.raises(ValueError, match="gamma=0.9 for a GAE, which has its own"):
             durations(gae, gamma=0.9)
-        with pytest.raises(ValueError, match=r"in \(0, 1\] per base step; got 1.5"):
+        with pytest.raises(ValueError, match="gamma.*got 1.5"):
             durations(ClipPPOLoss(self.actor(), critic), gamma=1.5)

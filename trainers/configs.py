@@ -287,7 +287,7 @@ def to_yaml(component: type) -> str:
 
 
 def argument_docs(component: type) -> dict[str, str]:
-    """Return the meaning of each argument from the docstring of a class.
+    """Return the meaning of each argument from the docstrings of a class and those it extends.
 
     Args:
         component: class whose docstring has a section ``Args:``.
@@ -297,13 +297,14 @@ def argument_docs(component: type) -> dict[str, str]:
         >>> argument_docs(UCT)
         {'c': 'exploration constant, in units of the return. Default ``1.0``.'}
     """
-    text = inspect.cleandoc(component.__doc__ or "")
-    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
     docs: dict[str, str] = {}
     entry = r"^(\w+(?:, \w+)*)(?: \([^\n]*?\))?: (.*?)(?=^\w|\Z)"
-    body = textwrap.dedent(section[1]) if section else ""
-    for names, meaning in re.findall(entry, body, re.MULTILINE | re.DOTALL):
-        docs.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
+    for cls in reversed(component.__mro__):
+        text = inspect.cleandoc(vars(cls).get("__doc__") or "")
+        section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+        body = textwrap.dedent(section[1]) if section else ""
+        for names, meaning in re.findall(entry, body, re.MULTILINE | re.DOTALL):
+            docs.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
     return docs
 
 

@@ -67,7 +67,11 @@ class SkillDiscriminatorLoss(SkillObjective):
 
     def __init__(self, discriminator: TensorDictModuleBase, **settings: Any) -> None:
         super().__init__(discriminator=discriminator, **settings)
-        self.next_features = discriminator.in_keys
+
+    @property
+    def next_features(self) -> list[NestedKey]:  # type: ignore[override]
+        """The entries that the discriminator reads of the state after a transition."""
+        return self.discriminator.in_keys
 
     def skill_logits(self, tensordict: TensorDictBase) -> Tensor:
         """Returns the logits ``[*B, Z]`` of q(z | s') for transitions ``[*B]``."""
@@ -109,7 +113,13 @@ class EncoderObjective(SkillObjective):
 
     def __init__(self, encoder: TensorDictModuleBase, **settings: Any) -> None:
         super().__init__(encoder=encoder, **settings)
-        self.root_features = self.next_features = encoder.in_keys
+
+    @property
+    def root_features(self) -> list[NestedKey]:  # type: ignore[override]
+        """The entries that the encoder reads of the states before and after a transition."""
+        return self.encoder.in_keys
+
+    next_features = root_features  # type: ignore[assignment]
 
     def skill_vectors(self) -> Tensor:
         r"""Returns the zero-centred vector of each skill under the prior of now, ``[Z, Z]``.
@@ -337,7 +347,7 @@ class SkillDynamicsLoss(SkillObjective):
     def __init__(self, dynamics: TensorDictModuleBase, **settings: Any) -> None:
         super().__init__(dynamics=dynamics, **settings)
         self.next_features = [dynamics.target_key]
-        self.root_features = list(dict.fromkeys([*dynamics.in_keys, dynamics.target_key]))
+        self.root_features = list(dict.fromkeys([*dynamics.in_keys, *self.next_features]))
 
     def log_densities(self, tensordict: TensorDictBase) -> Tensor:
         """Returns log q(s' | s, z) for every skill z, ``[*B, Z]``, for transitions ``[*B]``."""

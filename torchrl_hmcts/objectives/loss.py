@@ -93,7 +93,9 @@ DISTANCES = ("l2", "l1", "smooth_l1")
 def one_of(owner: str, name: str, value: str, known: Iterable[str]) -> str:
     """Returns a value that is one of those known; else raises ValueError."""
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{owner} knows {name}={' or '.join(map(repr, known))}; got {value!r}.")
+        raise ValueError(
+            f"{owner} needs {name} to be {' or '.join(map(repr, known))}; got {value!r}."
+        )
     return value
 
 

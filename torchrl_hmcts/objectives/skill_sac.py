@@ -408,7 +408,9 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
         objective (SkillObjective): what makes skills different.
         action_spec (TensorSpec, optional): of the action ``[D]``. Default: that of the actor;
             needed only for ``target_entropy="auto"``.
-        **sac: as in :class:`DiscreteSkillSACLoss`; ``target_entropy="auto"`` stands for ``-D``.
+        target_entropy (float or "auto"): target entropy in nats. Default ``"auto"``: ``-D``.
+        gamma, alpha_init, fixed_alpha, min_alpha, max_alpha: as in :class:`DiscreteSkillSACLoss`.
+        num_qvalue_nets, loss_function, delay_qvalue, reduction, deactivate_vmap: so are these.
 
     Returns:
         TensorDict with the entries of :class:`DiscreteSkillSACLoss`; ``entropy`` is that of the
