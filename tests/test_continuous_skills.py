@@ -116,19 +116,6 @@ def test_the_policy_samples_from_the_actors_distribution() -> None:
     assert torch.equal(ours, again)
 
 
-def test_nested_keys_are_read_and_written() -> None:
-    td = TensorDict(agent=make_data(5).exclude("next", "action"), batch_size=[5])
-    keys = {"in_keys": [("agent", "velocity")], "skill_key": ("agent", "skill")}
-    actor = SkillActor(2, SPEC, 4, action_key=("agent", "action"), **keys)
-    critic = SkillActionCritic(
-        2, 2, 4, action_key=("agent", "action"), state_action_value_key=("agent", "q"), **keys
-    )
-    for policy in (actor, SkillPolicy(actor)):
-        assert policy(td)["agent", "action"].shape == (5, 2)
-    assert critic(td)["agent", "q"].shape == (5, 1)
-    assert "loc" not in td.keys()
-
-
 @pytest.mark.parametrize(
     ("spec", "message"),
     [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.modules import OneHotCategorical, ProbabilisticActor, ValueOperator
-from torchrl.objectives import DiscreteSACLoss, LossModule, SACLoss
+from torchrl.objectives import LossModule
 from torchrl.objectives.utils import ValueEstimators
 
 import torchrl_hmcts.objectives
@@ -301,106 +301,67 @@ class Case:
     gradients: dict[str, list[str]]
     targets: Sequence[str] = ()
     value_estimators: Sequence[Any] = ()
-    covers: Sequence[type] = field(default=())
 
 
-SAC_GRADIENTS = {
-    "loss_actor": ["actor_network_params"],
-    "loss_qvalue": ["qvalue_network_params"],
-    "loss_alpha": ["log_alpha"],
-}
-DIAYN_GRADIENTS = {**SAC_GRADIENTS, "loss_discriminator": ["objective.discriminator_params"]}
-METRA_GRADIENTS = {
-    **SAC_GRADIENTS,
-    "loss_encoder": ["objective.encoder_params"],
-    "loss_dual": ["objective.log_dual"],
-}
-SAC: dict[str, Any] = {"targets": ["qvalue_network"], "value_estimators": SAC_ESTIMATORS}
+METRA_GRADIENTS = {"loss_encoder": ["encoder_params"], "loss_dual": ["log_dual"]}
+DISCRIMINATOR_GRADIENTS = {"loss_discriminator": ["discriminator_params"]}
 
-A3C_GRADIENTS = {
-    "loss_objective": ["actor_network_params"],
-    "loss_entropy": ["actor_network_params"],
-    "loss_critic": ["critic_network_params"],
-}
-A3C_ESTIMATORS = (NStepReturn, *ValueEstimators)
 
+def sac(make: Callable, data: Callable, objective: dict[str, list[str]]) -> Case:
+    gradients = {
+        "loss_actor": ["actor_network_params"],
+        "loss_qvalue": ["qvalue_network_params"],
+        "loss_alpha": ["log_alpha"],
+        **{loss: [f"objective.{own[0]}"] for loss, own in objective.items()},
+    }
+    return Case(make, data, gradients, ["qvalue_network"], SAC_ESTIMATORS)
+
+
+def a3c_case(make: Callable, data: Callable) -> Case:
+    gradients = {
+        "loss_objective": ["actor_network_params"],
+        "loss_entropy": ["actor_network_params"],
+        "loss_critic": ["critic_network_params"],
+    }
+    return Case(make, data, gradients, (), (NStepReturn, *ValueEstimators))
+
+
+with_one_hot = functools.partial
+OPTION_MODEL_PARTS = ("delta", "reward", "duration", "terminated")
 CASES = {
-    "a3c": Case(a3c, segments, A3C_GRADIENTS, value_estimators=A3C_ESTIMATORS, covers=[A3CLoss]),
-    "a3c_one_hot": Case(
-        functools.partial(a3c, distribution=OneHotCategorical),
-        functools.partial(segments, one_hot_action=True),
-        A3C_GRADIENTS,
-        value_estimators=A3C_ESTIMATORS,
+    "a3c": a3c_case(a3c, segments),
+    "a3c_one_hot": a3c_case(
+        with_one_hot(a3c, distribution=OneHotCategorical),
+        with_one_hot(segments, one_hot_action=True),
     ),
-    "diayn": Case(diayn, discrete, DIAYN_GRADIENTS, **SAC, covers=[DIAYNLoss]),
-    "diayn_one_hot": Case(
-        functools.partial(diayn, spec=OneHot(A)), one_hot, DIAYN_GRADIENTS, **SAC
-    ),
-    "continuous_diayn": Case(continuous_diayn, continuous, DIAYN_GRADIENTS, **SAC),
-    "discrete_sac": Case(
-        discrete_sac, discrete, METRA_GRADIENTS, **SAC, covers=[DiscreteSkillSACLoss]
-    ),
-    "discrete_sac_one_hot": Case(
-        functools.partial(discrete_sac, spec=OneHot(A)), one_hot, METRA_GRADIENTS, **SAC
-    ),
-    "continuous_sac": Case(
-        continuous_sac, continuous, METRA_GRADIENTS, **SAC, covers=[SkillSACLoss]
-    ),
-    "discriminator": Case(
-        discriminator,
-        discrete,
-        {"loss_discriminator": ["discriminator_params"]},
-        covers=[SkillDiscriminatorLoss],
-    ),
-    "metra": Case(
-        metra,
-        discrete,
-        {"loss_encoder": ["encoder_params"], "loss_dual": ["log_dual"]},
-        covers=[METRAEncoderLoss],
-    ),
-    "lsd": Case(lsd, discrete, {"loss_encoder": ["encoder_params"]}, covers=[LSDEncoderLoss]),
-    "dads": Case(
-        dads, discrete, {"loss_dynamics": ["dynamics_params"]}, covers=[SkillDynamicsLoss]
-    ),
+    "diayn": sac(diayn, discrete, DISCRIMINATOR_GRADIENTS),
+    "diayn_one_hot": sac(with_one_hot(diayn, spec=OneHot(A)), one_hot, DISCRIMINATOR_GRADIENTS),
+    "continuous_diayn": sac(continuous_diayn, continuous, DISCRIMINATOR_GRADIENTS),
+    "discrete_sac": sac(discrete_sac, discrete, METRA_GRADIENTS),
+    "continuous_sac": sac(continuous_sac, continuous, METRA_GRADIENTS),
+    "discriminator": Case(discriminator, discrete, DISCRIMINATOR_GRADIENTS),
+    "metra": Case(metra, discrete, METRA_GRADIENTS),
+    "lsd": Case(lsd, discrete, {"loss_encoder": ["encoder_params"]}),
+    "dads": Case(dads, discrete, {"loss_dynamics": ["dynamics_params"]}),
     "termination": Case(
-        termination,
-        discrete,
-        {"loss_termination": ["termination_network_params"]},
-        covers=[OptionTerminationLoss],
+        termination, discrete, {"loss_termination": ["termination_network_params"]}
     ),
     "intra_option": Case(
-        intra_option,
-        discrete,
-        {"loss_qvalue": ["qvalue_network_params"]},
-        targets=["qvalue_network"],
-        covers=[IntraOptionQLoss],
+        intra_option, discrete, {"loss_qvalue": ["qvalue_network_params"]}, ["qvalue_network"]
     ),
     "option_model": Case(
-        option_model,
-        discrete,
-        {f"loss_{part}": ["model."] for part in ("delta", "reward", "duration", "terminated")},
-        covers=[OptionModelLoss],
+        option_model, discrete, {f"loss_{part}": ["model."] for part in OPTION_MODEL_PARTS}
     ),
     "expert_iteration": Case(
         expert_iteration,
         examples,
         {"loss_policy": ["network_params"], "loss_value": ["network_params"]},
-        covers=[ExpertIterationLoss],
     ),
-    "skill_prior": Case(
-        skill_prior, discrete, {"loss_skill_prior": ["prior."]}, covers=[SkillPriorLoss]
-    ),
+    "skill_prior": Case(skill_prior, discrete, {"loss_skill_prior": ["prior."]}),
 }
 OBJECTIVES = ["discriminator", "metra", "lsd", "dads"]
 # One of each kind: seconds each, and up to 15 for the others.
-QUICK_TO_COMPILE = {
-    "diayn",
-    "discriminator",
-    "dads",
-    "termination",
-    "expert_iteration",
-    "skill_prior",
-}
+QUICK_TO_COMPILE = set("diayn discriminator dads termination expert_iteration skill_prior".split())
 CHEAP_CHECKS = [check for check in LOSS_CHECKS if check != "compile"]
 
 
@@ -447,7 +408,7 @@ def test_every_prior_is_a_distribution(prior: Any) -> None:
 
 
 def test_no_loss_that_is_exported_is_left_out() -> None:
-    covered = {cls for case in CASES.values() for cls in case.covers}
+    covered = {type(case.make(lambda key: key)) for case in CASES.values()}
     exported = {getattr(torchrl_hmcts.objectives, n) for n in torchrl_hmcts.objectives.__all__}
     losses = {c for c in exported if isinstance(c, type) and issubclass(c, LossModule)}
     assert losses - {SkillObjective} == covered
@@ -472,8 +433,8 @@ def test_no_choice_of_a_loss_is_left_out() -> None:
             with pytest.raises(NotImplementedError):
                 case.make(lambda key: key).make_value_estimator(kind)
         if hasattr(loss, "deactivate_vmap"):
-            vmapped.update(case.covers)
-    assert vmapped == {cls for name in VMAPPED for cls in CASES[name].covers}
+            vmapped.add(name.removesuffix("_one_hot"))
+    assert vmapped == set(VMAPPED)
 
 
 @pytest.mark.slow
@@ -494,26 +455,6 @@ def test_where_there_is_one_action_a_loss_is_the_same_in_both_encodings(make: Ca
         losses.append(make(lambda key: key, spec=spec)(data.set("action", action)))
     for key in losses[0].keys():
         torch.testing.assert_close(losses[0][key], losses[1][key])
-
-
-@pytest.mark.parametrize("name", VMAPPED)
-def test_with_and_without_vmap_the_losses_are_the_same(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    case = CASES[name]
-
-    def losses(deactivate_vmap: bool) -> TensorDict:
-        torch.manual_seed(0)
-        loss = case.make(lambda key: key, deactivate_vmap=deactivate_vmap)
-        plain = DiscreteSACLoss if isinstance(loss, DiscreteSACLoss) else SACLoss
-        plain._make_vmap(loss)  # without the stacked critics, which need neither
-        torch.manual_seed(1)
-        return loss(case.data())
-
-    # The reparametrised actions are drawn alike: the critics alone are vmapped.
-    with_vmap, without = losses(False), losses(True)
-    for key in with_vmap.keys():
-        torch.testing.assert_close(with_vmap[key], without[key])
 
 
 @pytest.mark.parametrize("name", CASES)

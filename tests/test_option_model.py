@@ -263,8 +263,6 @@ def test_weights_scale_their_part_only() -> None:
 def test_unusable_losses_are_refused_with_their_value() -> None:
     with pytest.raises(ValueError, match="median"):
         OptionModelLoss(make_net(), reduction="median")
-    with pytest.raises(ValueError, match="delta_loss.*'huber'"):
-        OptionModelLoss(make_net(), delta_loss="huber")
     with pytest.raises(ValueError, match=r"reward_coeff >= 0.*-1"):
         OptionModelLoss(make_net(), reward_coeff=-1.0)
 

@@ -316,8 +316,8 @@ def make_transitions() -> TensorDictBase:
 def test_the_td_error_is_the_larger_of_both_critics_distances_to_the_target() -> None:
     loss, td = make_loss(make_objective("diayn", num_skills=4)), make_transitions()
     SoftUpdate(loss, tau=0.05)
-    _, metadata = loss.qvalue_loss(td)
-    values = loss._action_values(td, loss.qvalue_network_params)  # [2, 6, 4]
+    values = loss._critics(td, loss.qvalue_network_params)  # [2, 6, 4]
+    _, metadata = loss._qvalue_loss(values, td)
     distances = (values[:, torch.arange(6), td["action"]] - loss._compute_target(td)).abs()
     torch.testing.assert_close(metadata["td_error"], distances.amax(0).detach())
     for i in range(2):

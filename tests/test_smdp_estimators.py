@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ProbabilisticActor, QValueActor, ValueOperator
 from torchrl.objectives import (
@@ -18,7 +17,6 @@ from torchrl.objectives import (
     ClipPPOLoss,
     DiscreteSACLoss,
     DQNLoss,
-    SoftUpdate,
     ValueEstimators,
 )
 from torchrl.objectives.value import GAE, TD0Estimator, TDLambdaEstimator
@@ -163,101 +161,6 @@ class TestEstimators:
         torch.testing.assert_close(use_durations(make(critic))(ones)["advantage"], plain)
 
 
-class TestDQNLoss:
-    def make(self, delay_value=False):
-        network = QValueActor(
-            Table(OPTIONS), in_keys=["state"], spec=Categorical(OPTIONS), action_space="categorical"
-        )
-        loss = DQNLoss(
-            network, loss_function="l2", delay_value=delay_value, action_space="categorical"
-        )
-        loss.set_keys(action="option")
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-        return loss, network.module[0].module.entries.detach()
-
-    def by_hand(self, td, table, power=None):
-        best = table[td["next", "state"]].max(-1, keepdim=True).values
-        chosen = table[td["state"]].gather(-1, td["option"].unsqueeze(-1))
-        return (chosen - smdp_targets(td, best, power)).square().mean()
-
-    @pytest.mark.parametrize("delay_value", [False, True])
-    def test_it_equals_the_loss_by_hand(self, rollout, delay_value):
-        loss, table = self.make(delay_value)
-        use_durations(loss.value_estimator)
-        if delay_value:
-            SoftUpdate(loss, tau=0.1)  # without one TorchRL warns
-        actual = loss(rollout.clone())["loss"]
-        torch.testing.assert_close(actual, self.by_hand(rollout, table))
-
-    def test_without_the_key_it_is_another_loss(self, rollout):
-        loss, table = self.make()
-        actual = loss(rollout.clone())["loss"]
-        torch.testing.assert_close(actual, self.by_hand(rollout, table, power=1))
-        assert (actual - self.by_hand(rollout, table)).abs() > 1e-2
-
-    def test_a_new_estimator_has_to_be_told_again(self, rollout):
-        loss, table = self.make()
-        use_durations(loss.value_estimator)
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-        actual = loss(rollout.clone())["loss"]
-        torch.testing.assert_close(actual, self.by_hand(rollout, table, power=1))
-
-    def test_on_samples_of_a_replay_buffer(self, rollout):
-        buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
-        buffer.extend(rollout.reshape(-1))
-        loss, table = self.make()
-        use_durations(loss.value_estimator)
-        td = buffer.sample()
-        torch.testing.assert_close(loss(td.clone())["loss"], self.by_hand(td, table))
-
-
-class TestA2CLoss:
-    def make(self, critic, value_type, **hyperparams):
-        actor = ProbabilisticActor(
-            TensorDictModule(Table(OPTIONS), ["state"], ["logits"]),
-            in_keys=["logits"],
-            out_keys=["option"],
-            distribution_class=torch.distributions.Categorical,
-        )
-        loss = A2CLoss(actor, critic, entropy_bonus=False, critic_coeff=1.0, loss_critic_type="l2")
-        loss.set_keys(action="option")
-        loss.make_value_estimator(value_type, gamma=GAMMA, **hyperparams)
-        return loss, actor.module[0].module.entries.detach()
-
-    def by_hand(self, td, logits, advantage):
-        log_prob = logits.log_softmax(-1)[td["state"]].gather(-1, td["option"].unsqueeze(-1))
-        # The critic's error is target - value, which is the advantage in TD(0) and GAE.
-        return -(log_prob * advantage).mean(), advantage.square().mean()
-
-    def test_with_td0_it_equals_the_loss_by_hand(self, rollout, critic):
-        loss, logits = self.make(critic, ValueEstimators.TD0)
-        use_durations(loss.value_estimator)
-        value, next_value = values(rollout, critic)
-        expected = smdp_targets(rollout, next_value) - value
-        self.check(loss, rollout, self.by_hand(rollout, logits, expected))
-
-    def test_with_gae_it_equals_the_loss_by_hand(self, rollout, critic):
-        loss, logits = self.make(critic, ValueEstimators.GAE, lmbda=LMBDA)
-        use_durations(loss.value_estimator)
-        value, next_value = values(rollout, critic)
-        expected = advantages_by_loop(rollout, value, next_value)
-        self.check(loss, rollout, self.by_hand(rollout, logits, expected))
-
-    def check(self, loss, rollout, expected):
-        out = loss(rollout.clone())
-        torch.testing.assert_close(out["loss_objective"], expected[0], atol=1e-5, rtol=1e-4)
-        torch.testing.assert_close(out["loss_critic"], expected[1], atol=1e-5, rtol=1e-4)
-
-    @pytest.mark.parametrize("value_type", [ValueEstimators.TD0, ValueEstimators.GAE])
-    def test_without_the_key_it_is_another_loss(self, rollout, critic, value_type):
-        loss, _ = self.make(critic, value_type)
-        plain = loss(rollout.clone())
-        use_durations(loss.value_estimator)
-        smdp = loss(rollout.clone())
-        for key in ("loss_objective", "loss_critic"):
-            assert (plain[key] - smdp[key]).abs() > 1e-3
-
-
 class TestAChainOfKnownValue:
     """The values of going to the right are known; where durations count, they are a fixed point.
 
@@ -359,6 +262,13 @@ class TestAChainOfKnownValue:
             )
             advantage = trainer._pre_epoch_hook(known.clone())["advantage"]
             assert (advantage.abs().max() < 1e-6) == right
+
+    def test_a_new_estimator_has_to_be_told_again(self, known):
+        q = QValueActor(self.table(OPTIONS), in_keys=["state"], action_space="categorical")
+        loss = DQNLoss(q, action_space="categorical", delay_value=False)
+        assert durations(loss, gamma=GAMMA)(known.clone())["loss"] < 1e-6
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+        assert loss(known)["loss"] > 1e-3
 
     def test_what_does_not_discount_is_refused(self):
         with pytest.raises(TypeError, match="ValueEstimatorBase for module; got Linear"):

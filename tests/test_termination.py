@@ -240,9 +240,9 @@ class TestAnyTermination:
         assert either.in_keys == ["a", "k", "b"]
 
     def test_nothing_to_ask_is_refused(self):
-        with pytest.raises(ValueError, match="one or more callables"):
+        with pytest.raises(TypeError, match="one or more callables"):
             AnyTermination()
-        with pytest.raises(ValueError, match="one or more callables"):
+        with pytest.raises(TypeError, match="one or more callables"):
             AnyTermination(StallTermination(1), None)
 
 
@@ -363,7 +363,7 @@ class TestLearnedTermination:
             LearnedTermination(network, every=0)
         with pytest.raises(ValueError, match="reads 'beta', which TensorDictModule does not"):
             LearnedTermination(network, termination_logits_key="beta")
-        with pytest.raises(ValueError, match=r"probability in \(0, 1\)"):
+        with pytest.raises(ValueError, match="initial_probability.*got 1.0"):
             TerminationNetwork(2, 4, in_keys=["x"], initial_probability=1.0)
         with pytest.raises(ValueError, match="reads 'view'"):
             TransformedEnv(
@@ -440,12 +440,6 @@ class TestOptionTerminationLoss(ThreeStates):
         assert gradient[0, self.PAST] > 0  # PAST is the best here: down, by the cost alone
         assert gradient[0, self.PAST].item() == pytest.approx(0.5 * 0.25 * 0.1)  # mean of two rows
 
-    def test_no_gradient_reaches_the_values(self):
-        loss, _, values = self.make()
-        loss(self.arrival())["loss_termination"].backward()
-        assert values.module.entries.grad is None
-        assert len(list(loss.parameters())) == 1
-
     def test_after_the_end_of_an_episode_nothing_is_learned(self):
         loss, *_ = self.make(deliberation_cost=0.3)
         out = loss(transitions([(1, self.GOAL, 1.0, 2, True)], torch.float64))
@@ -465,15 +459,6 @@ class TestOptionTerminationLoss(ThreeStates):
         past = self.GAMMA * self.value(0.3)
         expected = past - (0.25 * past + 0.75)
         assert loss.advantage(self.arrival()).item() == pytest.approx(expected)
-
-    def test_a_state_dict_holds_the_termination_alone_and_restores_it(self):
-        loss, *_ = self.make(0.3, deliberation_cost=0.1)
-        other, *_ = self.make(0.8)
-        other.qvalue_network.load_state_dict(loss.qvalue_network.state_dict())
-        other.load_state_dict(loss.state_dict())
-        td = self.arrival()
-        torch.testing.assert_close(other(td)["loss_termination"], loss(td)["loss_termination"])
-        assert not any("qvalue" in key for key in loss.state_dict())
 
     def test_what_makes_no_sense_is_refused(self):
         with pytest.raises(ValueError, match="deliberation_cost >= 0.*got -0.1"):

@@ -83,8 +83,7 @@ class SkillEncoder(SkillNetwork):
     Losses call it on both ends of a transition, so ``in_keys`` are written without ``"next"``.
 
     Args:
-        in_features (int): summed sizes of the entries ``in_keys``.
-        num_skills (int): number of skills ``Z``.
+        in_features, num_skills: as :class:`SkillDiscriminator`'s.
         in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
             ``["position"]``.
         representation_key (NestedKey): entry written, ``[*B, Z]``. Default ``"representation"``.
@@ -188,9 +187,8 @@ class SkillDynamics(TensorDictModuleBase):
     It writes mean and standard deviation for all skills at once, since the reward compares them.
 
     Args:
-        in_features (int): summed sizes of the entries ``in_keys``.
+        in_features, num_skills: as :class:`SkillDiscriminator`'s.
         target_features (int): size ``D`` of the entry whose change is predicted.
-        num_skills (int): number of skills ``Z``.
         in_keys (sequence of NestedKey): entries ``[*B, f_i]`` the prediction depends on. Default
             ``["position"]``.
         target_key (NestedKey): entry ``[*B, D]`` whose change is predicted. Default ``"position"``.
@@ -202,9 +200,7 @@ class SkillDynamics(TensorDictModuleBase):
             changes must not get an infinite density.
         loc_key, scale_key (NestedKey): entries written, both ``[*B, Z, D]``. Defaults
             ``"skill_loc"`` and ``"skill_scale"``.
-        hidden, activation: as :class:`SkillActor`'s.
-        network (callable): as :class:`SkillActor`'s, with the method ``all_skills`` of
-            :class:`SkillMLP`, the default.
+        hidden, activation, network: as :class:`SkillActor`'s; the network needs ``all_skills``.
 
     Raises:
         ValueError: if a size is not positive, or not ``0 < min_std < std``.

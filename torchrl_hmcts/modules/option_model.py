@@ -49,13 +49,11 @@ class OptionModel(TensorDictModuleBase):
             sub-module. Default: none.
         reward_key, duration_key, terminated_key (NestedKey): names of the outcomes, under
             ``"next"``. Defaults ``"reward"``, ``"duration"``, ``"terminated"``.
-        probability_key, disagreement_key (NestedKey): names of two further outputs. Defaults
-            ``"terminated_probability"`` and ``"disagreement"``.
 
     Writes (under ``"next"``): the predicted state entries; the reward and the duration (float
-    ``[*B, 1]``, base steps); terminated (bool ``[*B, 1]``, probability above one half); the
-    probability (float ``[*B, 1]``) and the disagreement (float ``[*B, 1]``: standard deviation
-    over the members, in units of :math:`\sigma`, root of the mean square over the D numbers).
+    ``[*B, 1]``, base steps); terminated (bool ``[*B, 1]``, probability above one half);
+    ``"terminated_probability"`` and ``"disagreement"`` (float ``[*B, 1]``: standard deviation over
+    the members, in units of :math:`\sigma`, root of the mean square over the D numbers).
 
     Raises:
         ValueError: if a number is not positive, no key is given, or the members differ in their
@@ -79,6 +77,7 @@ class OptionModel(TensorDictModuleBase):
         (torch.Size([5, 2]), torch.Size([5, 1]))
     """
 
+    probability_key, disagreement_key = "terminated_probability", "disagreement"
     output_mean: Tensor
     output_scale: Tensor
 
@@ -94,8 +93,6 @@ class OptionModel(TensorDictModuleBase):
         reward_key: NestedKey = "reward",
         duration_key: NestedKey = "duration",
         terminated_key: NestedKey = "terminated",
-        probability_key: NestedKey = "terminated_probability",
-        disagreement_key: NestedKey = "disagreement",
     ) -> None:
         super().__init__()
         check_sizes("OptionModel", max_duration=max_duration, num_models=num_models)
@@ -117,8 +114,6 @@ class OptionModel(TensorDictModuleBase):
         self.reward_key = unravel_key(reward_key)
         self.duration_key = unravel_key(duration_key)
         self.terminated_key = unravel_key(terminated_key)
-        self.probability_key = unravel_key(probability_key)
-        self.disagreement_key = unravel_key(disagreement_key)
         self.features = features
         read = [] if features is None else [unravel_key(key) for key in features.in_keys]
         made = [] if features is None else [unravel_key(key) for key in features.out_keys]

@@ -47,7 +47,6 @@ class OptionModelEnv(ModelBasedEnvBase):
         counter_keys (sequence of NestedKey): integer state entries that count base steps. Where
             one has a bounded spec, reaching its upper bound is ``truncated``, as a time limit is.
             Default: none.
-        threshold (float): probability of an end above which a step is ``terminated``. Default 0.5.
         min_reward (float): predicted rewards of smaller magnitude are 0. A regression is never
             exactly 0, and a planner that stops at the first reward would stop at noise. Default 0:
             as predicted; for a sparse reward of 1 about 0.25.
@@ -60,8 +59,6 @@ class OptionModelEnv(ModelBasedEnvBase):
             follow from the predicted ones. Default: none.
         starts (TensorDictBase, optional): recorded states ``[M]`` from which ``reset()`` draws.
             Default: drawn from the specs.
-        exclude_keys (sequence of NestedKey): entries of the env's observation that are left out.
-            Default ``("trajectory",)``, the base transitions inside an option.
         batch_size (sequence of int): of the specs and of ``reset()``; any other can be stepped.
             Default none.
         seed (int, optional): of the draws of ``reset()``. Default: from torch's global generator.
@@ -104,20 +101,17 @@ class OptionModelEnv(ModelBasedEnvBase):
         env: EnvBase,
         *,
         counter_keys: Sequence[NestedKey] = (),
-        threshold: float = 0.5,
         min_reward: float = 0.0,
         disagreement_coeff: float = 0.0,
         max_disagreement: float | None = None,
         memory: OptionMemory | None = None,
         readout: TensorDictModuleBase | None = None,
         starts: TensorDictBase | None = None,
-        exclude_keys: Sequence[NestedKey] = ("trajectory",),
         batch_size: Sequence[int] = (),
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         owner = "OptionModelEnv"
-        threshold = real_number(owner, "threshold", threshold, least=0.0, most=1.0)
         min_reward = real_number(owner, "min_reward", min_reward, least=0.0)
         disagreement_coeff = real_number(owner, "disagreement_coeff", disagreement_coeff, least=0.0)
         if max_disagreement is not None:
@@ -129,7 +123,6 @@ class OptionModelEnv(ModelBasedEnvBase):
             )
         device = (env.device or "cpu") if device is None else device
         super().__init__(model, device=device, batch_size=torch.Size(batch_size))
-        self.threshold = threshold
         self.min_reward = min_reward
         self.disagreement_coeff = disagreement_coeff
         self.max_disagreement = max_disagreement
@@ -137,7 +130,7 @@ class OptionModelEnv(ModelBasedEnvBase):
         self.memory = memory
         self.readout = readout
         self.counter_keys = [unravel_key(key) for key in counter_keys]
-        self._copy_specs(env, [unravel_key(key) for key in exclude_keys])
+        self._copy_specs(env)
         self._check_entries(type(env.base_env if hasattr(env, "base_env") else env).__name__)
         self.starts = None if starts is None else starts.reshape(-1).to(self.device)
         self._generator = torch.Generator()
@@ -148,14 +141,13 @@ class OptionModelEnv(ModelBasedEnvBase):
         """The option model; TorchRL's name for it is ``world_model``."""
         return self.world_model
 
-    def _copy_specs(self, env: EnvBase, exclude_keys: list[NestedKey]) -> None:
+    def _copy_specs(self, env: EnvBase) -> None:
         def own(spec: Composite) -> Composite:
             return spec.clone().to(self.device)
 
         observation = own(env.full_observation_spec_unbatched)
-        for key in exclude_keys:
-            if key in observation.keys(True):
-                del observation[key]
+        if "trajectory" in observation.keys():  # the base transitions inside an option
+            del observation["trajectory"]
         for key, spec in own(env.full_state_spec_unbatched).items(True, True):
             if key not in observation.keys(True, True):
                 observation[key] = spec
@@ -227,7 +219,7 @@ class OptionModelEnv(ModelBasedEnvBase):
         duration = predicted.get(model.duration_key).round().to(torch.int64)
         if model.duration_key in self._predicted:
             out.set(model.duration_key, duration.to(self._predicted[model.duration_key].dtype))
-        terminated = predicted.get(model.probability_key) > self.threshold
+        terminated = predicted.get(model.terminated_key)
         truncated = torch.zeros_like(terminated)
         for key in self.counter_keys:
             count = tensordict.get(key)

@@ -18,10 +18,9 @@ class SkillCritic(SkillNetwork):
     Pass one to a loss; TorchRL makes the twin (and the targets) from it.
 
     Args:
-        in_features (int): summed sizes of the entries ``in_keys``.
         num_actions (int): number of actions ``A``.
-        num_skills (int): number of skills.
-        in_keys, skill_key, hidden, activation, network: as :class:`SkillActor`'s.
+        in_features, num_skills, in_keys, skill_key: as :class:`SkillActor`'s.
+        hidden, activation, network: so are these.
         action_value_key (NestedKey): entry written, ``[*B, A]``. Default ``"action_value"``.
 
     Reference:
@@ -63,8 +62,7 @@ class SkillActionCritic(SkillNetwork):
     Args:
         in_features (int): summed sizes of the entries ``in_keys``, without the action.
         action_features (int): size of the action, ``D``.
-        num_skills (int): number of skills.
-        in_keys, skill_key, hidden, activation, network: as :class:`SkillActor`'s.
+        num_skills, in_keys, skill_key, hidden, activation, network: as :class:`SkillActor`'s.
         action_key (NestedKey): entry of the action, ``[*B, D]``. Default ``"action"``.
         state_action_value_key (NestedKey): entry written, ``[*B, 1]``. Default
             ``"state_action_value"``.

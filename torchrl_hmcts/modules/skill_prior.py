@@ -57,10 +57,6 @@ class SkillPrior(nn.Module, ABC):
         """Returns which skills are switched on, bool ``[Z]``."""
         return self.probs() > 0
 
-    def entropy(self) -> Tensor:
-        """Returns the entropy of p(z) in nats, a scalar."""
-        return torch.special.entr(self.probs()).sum()
-
     def forward(self) -> Tensor:
         """Returns the probabilities of the skills, ``[Z]``."""
         return self.probs()

@@ -90,7 +90,7 @@ class AnyTermination:
         From a call: bool ``[*B]``.
 
     Raises:
-        ValueError: if there is no condition, or one cannot be called.
+        TypeError: if there is no condition, or one cannot be called.
 
     Reference:
         As :class:`StallTermination`.
@@ -108,7 +108,7 @@ class AnyTermination:
 
     def __init__(self, *conditions: Condition) -> None:
         if not conditions or not all(callable(condition) for condition in conditions):
-            raise ValueError(
+            raise TypeError(
                 f"AnyTermination needs one or more callables condition(td) -> bool [*B]; got "
                 f"{conditions!r}."
             )
@@ -195,9 +195,8 @@ class LearnedTermination:
         network (TensorDictModuleBase): writes logits ``[*B, 1]``, e.g. a
             :class:`TerminationNetwork`, or a ``TensorDictSequential`` of what computes its
             features and one.
-        deterministic (bool): do not sample. Default ``True``. With ``False`` it samples, unless
-            TorchRL's ``set_exploration_type`` asks for anything but ``RANDOM``.
-        generator (torch.Generator, optional): source of the samples. Default: torch's global one.
+        deterministic (bool): do not sample, as :class:`SkillPolicy`. Default ``True``.
+        generator (torch.Generator, optional): as :class:`SkillPolicy`'s.
         every (int): base steps between two questions, so that an option may end after that many,
             twice that many and so on; asking costs a call of the network. Default 1.
         termination_logits_key (NestedKey): Default ``"termination_logits"``.

@@ -17,7 +17,7 @@ from torchrl.objectives import distance_loss
 
 from torchrl_hmcts.checks import instance, real_number
 from torchrl_hmcts.modules.option_model import OptionModel
-from torchrl_hmcts.objectives.loss import DISTANCES, Loss, one_of
+from torchrl_hmcts.objectives.loss import Loss
 
 
 class OptionModelLoss(Loss):
@@ -30,6 +30,10 @@ class OptionModelLoss(Loss):
         + c_R\, \ell_R(f^j_R, y_R) + c_k\, \ell_k(f^j_k, y_k)
         + c_p\, \mathrm{BCE}(f^j_p, y_p) \big]
 
+    with :math:`\ell_s` and :math:`\ell_k` Huber's: the outcome at a corner is one of two, of which it
+    favours the likelier while the square prefers a place between them. :math:`\ell_R` is the
+    square: a sparse reward is to be met in the mean.
+
     Members differ by their first weights and, if the data hold ``bootstrap_mask``, by which
     transitions each of them learns from; store such a mask with the data, so that a member never
     sees what it is to be surprised by.
@@ -39,10 +43,6 @@ class OptionModelLoss(Loss):
 
     Args:
         model (OptionModel): what is trained; it stays a sub-module as it is.
-        delta_loss, reward_loss, duration_loss (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``
-            (Huber). Defaults ``"smooth_l1"``, ``"l2"`` and ``"smooth_l1"``: the outcome at a
-            corner is one of two, of which Huber's loss favours the likelier while the square
-            prefers a place between them; a sparse reward is to be met in the mean.
         delta_coeff, reward_coeff, duration_coeff, terminated_coeff (float): :math:`c_s, c_R, c_k,
             c_p`, the weights of the parts. Default 1 each.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` over the batch.
@@ -53,7 +53,7 @@ class OptionModelLoss(Loss):
         and ``terminated_accuracy``; with ``reduction="none"`` all ``[*B]``.
 
     Raises:
-        ValueError: if the reduction, a loss or a weight is not usable.
+        ValueError: if the reduction or a weight is not usable.
 
     Keys (``set_keys``): ``reward``, ``duration``, ``terminated`` (under ``"next"``; defaults: the
     model's), ``bootstrap_mask`` (``[*B, K]``, any number >= 0, read if it is there; default
@@ -96,9 +96,6 @@ class OptionModelLoss(Loss):
         self,
         model: OptionModel,
         *,
-        delta_loss: str = "smooth_l1",
-        reward_loss: str = "l2",
-        duration_loss: str = "smooth_l1",
         delta_coeff: float = 1.0,
         reward_coeff: float = 1.0,
         duration_coeff: float = 1.0,
@@ -109,9 +106,6 @@ class OptionModelLoss(Loss):
         owner = type(self).__name__
         instance(owner, "model", model, OptionModel)
         self.model = model
-        self.delta_loss = one_of(owner, "delta_loss", delta_loss, DISTANCES)
-        self.reward_loss = one_of(owner, "reward_loss", reward_loss, DISTANCES)
-        self.duration_loss = one_of(owner, "duration_loss", duration_loss, DISTANCES)
         coefficients = {
             "delta_coeff": delta_coeff,
             "reward_coeff": reward_coeff,
@@ -152,9 +146,9 @@ class OptionModelLoss(Loss):
         end, ends = outputs[..., -1], target[..., -1]
         cross_entropy = F.binary_cross_entropy_with_logits(end, ends, reduction="none")
         parts = {
-            "loss_delta": distance(slice(size), self.delta_loss).mean(-1) * self.delta_coeff,
-            "loss_reward": distance(size, self.reward_loss) * self.reward_coeff,
-            "loss_duration": distance(size + 1, self.duration_loss) * self.duration_coeff,
+            "loss_delta": distance(slice(size), "smooth_l1").mean(-1) * self.delta_coeff,
+            "loss_reward": distance(size, "l2") * self.reward_coeff,
+            "loss_duration": distance(size + 1, "smooth_l1") * self.duration_coeff,
             "loss_terminated": self.terminated_coeff * cross_entropy,
         }
         out = {}

@@ -39,6 +39,7 @@ class _TrainsObjective(Reduction):
     """The common part of both losses: they train a SkillObjective beside actor and critics."""
 
     objective: SkillObjective
+    _value_name: str  # of the key of the critics' output
 
     def __init__(
         self,
@@ -138,11 +139,10 @@ class _TrainsObjective(Reduction):
         value = run_network(self.qvalue_network, params, tensordict)
         return TensorDict({self.qvalue_network.out_key: value}, batch_size=value.shape[:-1])
 
-    def _critics(
-        self, tensordict: TensorDictBase, params: TensorDictBase, key: NestedKey
-    ) -> Tensor:
-        """Returns what N critics write under a key, ``[N, *B, ...]``."""
+    def _critics(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """Returns what N critics write, ``[N, *B, A]`` or ``[N, *B, 1]``."""
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        key = getattr(self.tensor_keys, self._value_name)
         return self._vmap_qnetworkN0(inputs, params).get(key)
 
     def _what_follows(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -281,6 +281,7 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
     # The parent has a list, with which select_out_keys fails in every class derived from it.
     out_keys = TensorDictModuleBase.out_keys
 
+    _value_name = "action_value"
     policy_prior: TensorDictModuleBase | None
 
     def __init__(
@@ -333,16 +334,12 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
             logits = self.policy_prior(tensordict.copy()).get("logits")
         return log_prob - logits.log_softmax(-1).clamp_min(_LEAST_LOG_PROB)
 
-    def _action_values(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """Returns Q(s, z, .) of all critics, ``[N, *B, A]``."""
-        return self._critics(tensordict, params, self.tensor_keys.action_value)
-
     def _compute_target(self, tensordict: TensorDictBase) -> Tensor:
         """Returns r + gamma (1 - d) V(s', z), ``[*B]``, without gradients."""
         with torch.no_grad():
             after = self._what_follows(tensordict)
             log_prob = self._log_probs(after)
-            value = self._action_values(after, self.target_qvalue_network_params).amin(0)
+            value = self._critics(after, self.target_qvalue_network_params).amin(0)
             relative = self._relative(log_prob, after)
             value = (log_prob.exp() * (value - self._alpha * relative)).sum(-1, keepdim=True)
             after.set(self.value_estimator.tensor_keys.value, value)
@@ -369,20 +366,9 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
         loss = (prob * (self._alpha * relative - min_value)).sum(-1)
         return self._reduce(loss, tensordict), {"log_prob": (prob * log_prob).sum(-1).detach()}
 
-    def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Figures]:
-        """Returns the critics' summed loss, ``td_error`` and each critic's own loss."""
-        action_value = self._action_values(tensordict, self.qvalue_network_params)
-        return self._qvalue_loss(action_value, tensordict)
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Figures]:
-        """Returns the actor's loss and ``log_prob``, the negative entropy of the policy."""
-        with torch.no_grad():
-            action_value = self._action_values(tensordict, self.qvalue_network_params)
-        return self._actor_loss(action_value.amin(0), tensordict)
-
     def _sac_losses(self, tensordict: TensorDictBase) -> tuple[Tensor, Figures, Tensor, Figures]:
         # The critics are asked once for both losses: the actor's needs no gradient through them.
-        action_value = self._action_values(tensordict, self.qvalue_network_params)
+        action_value = self._critics(tensordict, self.qvalue_network_params)
         critics = self._qvalue_loss(action_value, tensordict)
         return *critics, *self._actor_loss(action_value.detach().amin(0), tensordict)
 
@@ -441,6 +427,7 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    _value_name = "state_action_value"
 
     def __init__(
         self,
@@ -459,6 +446,5 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
         """Returns the critics' summed loss, ``td_error`` and each critic's own loss."""
         following = tensordict.copy().set("next", self._what_follows(tensordict))
         target = self._compute_target_v2(following)  # [*B]
-        key = self.tensor_keys.state_action_value
-        value = self._critics(tensordict, self.qvalue_network_params, key)  # [N, *B, 1]
+        value = self._critics(tensordict, self.qvalue_network_params)  # [N, *B, 1]
         return self._critic_losses(value.squeeze(-1), target, tensordict)
