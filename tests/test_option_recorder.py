@@ -203,7 +203,7 @@ def test_an_env_that_hands_nothing_out_is_refused() -> None:
     recorder = OptionRecorder(["state", ("next", "state")])
     options = OptionTransform(make_worker(), 2, 3, trajectory_keys=["state"])
     env = TransformedEnv(ChainEnv(), Compose(options, recorder))
-    with pytest.raises(KeyError, match=r"\('next', 'state'\).*does not hand out"):
+    with pytest.raises(KeyError, match=r"\('next', 'state'\).*the env before it does not write"):
         env.observation_spec  # noqa: B018
     with pytest.raises(KeyError, match="trajectory_keys=recorder.trajectory_keys"):
         TransformedEnv(ChainEnv(), OptionRecorder(["state"])).observation_spec  # noqa: B018
@@ -216,7 +216,7 @@ def test_nothing_to_record_is_refused() -> None:
 
 def test_it_refuses_data_and_the_workers_of_a_batched_env() -> None:
     recorder = OptionRecorder(["state"])
-    with pytest.raises(RuntimeError, match="hold the transitions already"):
+    with pytest.raises(RuntimeError, match="hold what it writes already"):
         recorder(TensorDict(batch_size=[2]))
     with pytest.raises(RuntimeError, match="Put it outside"):
         SerialEnv(2, lambda: make_env(OptionRecorder(["state"])))

@@ -7,6 +7,8 @@ import numbers
 from typing import Any
 
 import numpy as np
+from tensordict import unravel_key
+from tensordict.utils import NestedKey
 
 NO_LIMIT = np.iinfo(np.int64).max
 
@@ -70,7 +72,7 @@ def real_number(
     ):
         bounds = [f">= {least}"] * (least > -math.inf) + [f"> {above}"] * (above > -math.inf)
         bounds += [f"<= {most}"] * (most < math.inf) or ["finite"] * finite
-        raise ValueError(f"{owner} needs {name} {' and '.join(bounds)}; got {value}.")
+        raise ValueError(f"{owner} needs {name} to be {' and '.join(bounds)}; got {value}.")
     return number
 
 
@@ -91,3 +93,27 @@ def instance(owner: str, name: str, value: Any, *kinds: type) -> None:
         raise TypeError(
             f"{owner} needs a {wanted} for {name}; got {value!r}, a {type(value).__name__}."
         )
+
+
+def nested_key(owner: str, name: str, value: Any) -> NestedKey:
+    """Return a key of a tensordict in its flat form.
+
+    Args:
+        owner: who needs it, for messages.
+        name: of the argument.
+        value: a string, or a tuple of them.
+
+    Raises:
+        TypeError: if it is no key.
+    """
+    if not _is_key(value):
+        raise TypeError(
+            f"{owner} needs a string or a tuple of strings for {name}; got {value!r}, a "
+            f"{type(value).__name__}."
+        )
+    return unravel_key(value)
+
+
+def _is_key(value: Any) -> bool:
+    nested = isinstance(value, tuple) and bool(value) and all(map(_is_key, value))
+    return isinstance(value, str) or nested
