@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -160,18 +159,6 @@ def test_one_hot_options_are_stored_as_the_workers_skill() -> None:
     env = make_env(recorder, one_hot=True)
     env.step(env.reset().set("option", torch.tensor([False, True])))
     assert recorder.take()["skill"].tolist() == [1, 1, 1]
-
-
-def test_a_replay_buffer_is_extended_at_every_step() -> None:
-    buffer = ReplayBuffer(storage=LazyTensorStorage(100), batch_size=4)
-    recorder = OptionRecorder(KEYS, buffer)
-    env = make_env(recorder)
-    after = step(env, [0, 3], [1, 1])
-    assert len(buffer) == 5
-    env.step(after[:1].select("state", "done", "terminated").set("option", torch.tensor([0])))
-    assert len(buffer) == 8
-    assert buffer[:]["state"].tolist() == [0, 1, 2, 3, 4, 3, 2, 1]
-    assert not len(recorder.take())
 
 
 def test_what_was_taken_is_forgotten() -> None:

@@ -867,14 +867,14 @@ class TestBadInput:
             ({"max_steps": True}, "whole number for max_steps; got True"),
             ({"num_options": 0}, "num_options >= 1; got 0"),
             ({"num_options": -3}, "num_options >= 1; got -3"),
-            ({"gamma": 0.0}, "gamma to be > 0.0 and <= 1.0; got 0.0"),
-            ({"gamma": 1.1}, "gamma to be > 0.0 and <= 1.0; got 1.1"),
-            ({"gamma": float("nan")}, "gamma to be > 0.0 and <= 1.0; got nan"),
+            ({"gamma": 0.0}, "gamma > 0.0 and <= 1.0; got 0.0"),
+            ({"gamma": 1.1}, "gamma > 0.0 and <= 1.0; got 1.1"),
+            ({"gamma": float("nan")}, "gamma > 0.0 and <= 1.0; got nan"),
             ({"worker": "walk"}, "needs a worker that it can call .* got 'walk'"),
         ],
     )
     def test_arguments_out_of_range_are_refused_at_construction(self, kwargs, message):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((TypeError, ValueError), match=message):
             OptionTransform(
                 **{"worker": skill_is_action(), "num_options": 2, "max_steps": 4, **kwargs}
             )
@@ -975,7 +975,7 @@ class TestBadInput:
         buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=2)
         buffer.extend(macro(ChainEnv(6)).rollout(3))
         buffer.append_transform(OptionTransform(skill_is_action(), 2, 4))
-        with pytest.raises(RuntimeError, match="cannot be applied to data.*TransformedEnv"):
+        with pytest.raises(RuntimeError, match="stored data hold what it writes.*TransformedEnv"):
             buffer.sample()
         for td in (ChainEnv(6).rollout(3), macro(ChainEnv(6)).rollout(3)):
             with pytest.raises(RuntimeError, match="no meaning in a replay buffer"):

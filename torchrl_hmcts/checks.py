@@ -72,7 +72,7 @@ def real_number(
     ):
         bounds = [f">= {least}"] * (least > -math.inf) + [f"> {above}"] * (above > -math.inf)
         bounds += [f"<= {most}"] * (most < math.inf) or ["finite"] * finite
-        raise ValueError(f"{owner} needs {name} to be {' and '.join(bounds)}; got {value}.")
+        raise ValueError(f"{owner} needs {name} {' and '.join(bounds)}; got {value}.")
     return number
 
 

@@ -96,10 +96,7 @@ def set_states(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
 def complete_done(env: EnvBase, after: TensorDictBase, spec: Composite | None = None) -> None:
     """Write the done entries that an env left out, as TorchRL's ``step`` does; in place.
 
-    Args:
-        env: whose they are.
-        after: what it has written, ``[*B]``.
-        spec: its ``full_done_spec_unbatched``, which takes long to ask for.
+    ``spec`` is the env's ``full_done_spec_unbatched``, which takes long to ask for.
     """
     if all(after.get(key, None) is not None for key in env.done_keys):
         return

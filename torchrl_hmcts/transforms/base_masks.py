@@ -17,9 +17,6 @@ class BaseMasks:
 
     Above an OptionTransform the action is the option, and what is written under ``"action_mask"``
     there is the mask of the options. Below it, worker, termination and env see the base env's.
-
-    Args:
-        env: with all transforms below the OptionTransform.
     """
 
     def __init__(self, env: EnvBase) -> None:

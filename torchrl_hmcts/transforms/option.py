@@ -134,7 +134,8 @@ class OptionTransform(HasOptions):
         for name, part in (("worker", worker), ("termination", termination)):
             if not callable(part) and (part is not None or name == "worker"):
                 raise ValueError(
-                    f"OptionTransform needs a {name} that it can call on a tensordict; got {part!r}."
+                    f"OptionTransform needs a {name} that it can call on a tensordict; got "
+                    f"{part!r}."
                 )
         if not isinstance(worker_memory, str) or worker_memory not in ("reset", "keep"):
             raise ValueError(

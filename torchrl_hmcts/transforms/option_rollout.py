@@ -34,15 +34,7 @@ from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
 
 class OptionRollout:
-    """Takes the base steps of options in the env below an OptionTransform.
-
-    Args:
-        transform: the OptionTransform, whose worker and termination are checked against the env.
-
-    Raises:
-        ValueError: if the env has several rewards, steps elements whose option has ended, or the
-            worker does not fit it.
-    """
+    """Takes the base steps of options in the env below an OptionTransform, if both fit."""
 
     def __init__(self, transform: HasOptions) -> None:
         self._options, self._parent = transform, env_below(transform)
@@ -120,13 +112,7 @@ class OptionRollout:
     def run(
         self, root: TensorDictBase, after: TensorDictBase, skipped: Tensor | None
     ) -> TensorDictBase:
-        """Continue after the first base step, until all options have ended.
-
-        Args:
-            root: entries before the first step, the worker's action among them, ``[*B]``.
-            after: entries after it.
-            skipped: elements that a batched env has left alone, bool ``[*B]``.
-        """
+        """Continue after the first base step, but where ``skipped``, until all options have ended."""
         if self._alone and self._options.trajectory is None:
             out = self._run_alone(root, after)
         elif self.batch_locked or not after.batch_size:

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, ReplayBuffer
+from torchrl.data import Composite
 
 from torchrl_hmcts.checks import instance, nested_key
 from torchrl_hmcts.transforms.env_transform import EnvTransform
@@ -28,15 +28,14 @@ class OptionRecorder(EnvTransform):
     .. math:: \Delta_t = x_t - x_{t_0}, \qquad t_0 = \text{the option's first base step}
 
     as :class:`DisplacementTransform` writes it in the env of a skill's training. What is simulated
-    by a planner is recorded like what is carried out, so that search itself feeds the training of
-    its worker. The env gives the same as without it.
+    by a planner is recorded like what is executed, so that search itself feeds the training of its
+    worker. The transitions are kept until :meth:`take` is called. The env gives the same as without
+    it.
 
     Args:
         keys (sequence of NestedKey): entries of a base transition to store, e.g. the ``in_keys`` of
             the loss: ``"velocity"``, ``"action"``, ``("next", "velocity")``. ``skill_key`` and
             ``displacement_key``, under ``"next"`` too, are written by the recorder.
-        replay_buffer (ReplayBuffer, optional): extended at every macro-step. Default ``None``: the
-            recorder keeps the transitions until :meth:`take` is called, which is faster.
         position_key (NestedKey): entry ``[*B, D]`` whose displacement is measured. Default
             ``"position"``; read only if ``displacement_key`` is among the ``keys``.
         displacement_key (NestedKey): displacement to write, ``[n, D]`` in the units of the
@@ -70,7 +69,6 @@ class OptionRecorder(EnvTransform):
     def __init__(
         self,
         keys: Sequence[NestedKey],
-        replay_buffer: ReplayBuffer | None = None,
         *,
         position_key: NestedKey = "position",
         displacement_key: NestedKey = "displacement",
@@ -82,9 +80,6 @@ class OptionRecorder(EnvTransform):
         self.position_key = nested_key("OptionRecorder", "position_key", position_key)
         self.displacement_key = nested_key("OptionRecorder", "displacement_key", displacement_key)
         self.skill_key = nested_key("OptionRecorder", "skill_key", skill_key)
-        if replay_buffer is not None:
-            instance("OptionRecorder", "replay_buffer", replay_buffer, ReplayBuffer)
-        self.replay_buffer = replay_buffer
         self.num_base_steps = 0
         """Base steps recorded so far, an int."""
         self._next_position = _next(self.position_key)
@@ -114,8 +109,6 @@ class OptionRecorder(EnvTransform):
         skill = skill.clone()  # its own: a planner may use the memory of its options again
         self._blocks.append((block.reshape(-1, block.shape[-1]), skill.reshape(-1)))
         self.num_base_steps += int(block.get(OptionTrajectory.MASK_KEY).sum())
-        if self.replay_buffer is not None:
-            self.replay_buffer.extend(self.take())
         return next_tensordict
 
     def _reset(

@@ -16,13 +16,7 @@ from torchrl.envs import EnvBase
 
 
 class OptionTrajectory:
-    """Collects chosen entries of an option's base transitions into a tensordict ``[*B, T]``.
-
-    Args:
-        keys: entries of a base transition, the env's or the worker's, e.g. ``"position"``,
-            ``"action"``, ``"action_log_prob"`` or ``("next", "reward")``.
-        max_steps: T.
-    """
+    """Collects chosen entries of an option's base transitions into a tensordict ``[*B, T]``."""
 
     KEY = "trajectory"
     MASK_KEY = "mask"
@@ -44,13 +38,7 @@ class OptionTrajectory:
         root: TensorDictBase,
         memory: Mapping[NestedKey, tuple[torch.Size, torch.dtype]],
     ) -> Composite:
-        """Return the spec of the block, ``[*B, T]``.
-
-        Args:
-            env: the env that takes the base steps.
-            root: what a base step begins with, after the worker has acted.
-            memory: what the worker itself writes under ``"next"``: shapes and types.
-        """
+        """Return the spec of the block, ``[*B, T]``, of the env's and the worker's entries."""
         after = env.full_observation_spec.clone()
         after.update(env.full_reward_spec)
         after.update(env.full_done_spec)
@@ -86,15 +74,7 @@ class OptionTrajectory:
     def write(
         self, taken: int, rows: Tensor | None, root: TensorDictBase, after: TensorDictBase
     ) -> None:
-        """Write the transition ``taken`` steps into the option.
-
-        Args:
-            taken: base steps taken before this one.
-            rows: where it belongs: indices, a mask over the batch (whose other rows are then left
-                out), or None for all.
-            root: entries before the step.
-            after: entries after it.
-        """
+        """Write the transition ``taken`` steps into the option; ``rows`` are indices, a mask or all."""
         lead = self.data.batch_dims - 1
         index = ... if rows is None else rows
         for key in self.keys:
