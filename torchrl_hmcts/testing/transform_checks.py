@@ -34,22 +34,23 @@ from torchrl_hmcts.testing.env_checks import check_env, recorded, rollout
 MakeTransform = Callable[[], Transform]
 MakeEnv = Callable[[], EnvBase]
 
-TRANSFORM_CHECKS = (
-    "single",
-    "serial",
-    "parallel",
-    "trans_serial",
-    "trans_parallel",
-    "no_env",
-    "compose",
-    "env",
-    "model",
-    "replay_buffer",
-    "inverse",
-    "state_dict",
-    "copy",
-    "device",
-)
+_PLACES = {
+    "single": "on an env ('single')",
+    "serial": "inside a SerialEnv ('serial')",
+    "parallel": "inside a ParallelEnv ('parallel')",
+    "trans_serial": "around a SerialEnv ('trans_serial')",
+    "trans_parallel": "around a ParallelEnv ('trans_parallel')",
+    "no_env": "on data without an env ('no_env')",
+    "compose": "on data in a Compose ('compose')",
+    "env": "in rollouts ('env')",
+    "model": "in front of a network ('model')",
+    "replay_buffer": "on a replay buffer ('replay_buffer')",
+    "inverse": "in an inverse call ('inverse')",
+    "state_dict": "loading the state dict of another ('state_dict')",
+    "copy": "under a copy ('copy')",
+    "device": "on an explicit device ('device')",
+}
+TRANSFORM_CHECKS = tuple(_PLACES)
 """The names of what :func:`check_transform` checks, in order."""
 
 
@@ -145,19 +146,6 @@ def check_transform(
             advice = "Let the transform_*_spec methods say exactly what it writes."
             with during(it.name, _PLACES[check], advice):
                 it.specs_hold(check)
-
-
-_PLACES = {
-    "single": "on an env ('single')",
-    "serial": "inside a SerialEnv ('serial')",
-    "parallel": "inside a ParallelEnv ('parallel')",
-    "trans_serial": "around a SerialEnv ('trans_serial')",
-    "trans_parallel": "around a ParallelEnv ('trans_parallel')",
-    "no_env": "on data without an env ('no_env')",
-    "compose": "on data in a Compose ('compose')",
-    "model": "in front of a network ('model')",
-    "replay_buffer": "on a replay buffer ('replay_buffer')",
-}
 
 
 class _Transform:
@@ -305,7 +293,7 @@ def _in_rollouts(
 
 def _inverse(it: _Transform, writes: set[NestedKey]) -> None:
     env = it.env()
-    with during(it.name, "in an inverse call ('inverse')"), seeded(0):
+    with during(it.name, _PLACES["inverse"]), seeded(0):
         td = env.rand_action(env.reset())
         out = flat_transforms(env)[-1].inv(td.clone())
     for key in writes:
@@ -322,7 +310,7 @@ def _state_dict(it: _Transform) -> None:
     rollout(first, it.num_steps)  # what is made at the first use would be missing from the state
     state = copy.deepcopy(first.state_dict())
     advice = "Make all that is saved in __init__, in buffers or get_extra_state."
-    with during(it.name, "loading the state dict of another ('state_dict')", advice):
+    with during(it.name, _PLACES["state_dict"], advice):
         second.load_state_dict(state)
     where = _unequal_state(state, second.state_dict())
     require(
@@ -352,14 +340,15 @@ def _unequal_state(one: dict, two: dict) -> str | None:
 def _copies(it: _Transform) -> None:
     env, twins = it.env(), {}
     rollout(env, 2)
-    with during(it.name, "under a deep copy ('copy')", "Keep nothing that cannot be copied."):
+    advice = "Keep nothing that cannot be copied."
+    with during(it.name, _PLACES["copy"], advice):
         twins["a deep copy"] = copy.deepcopy(env)
     try:
         pickle.dumps(it.make_env())
     except Exception:
         pass  # the env itself cannot be pickled
     else:
-        with during(it.name, "under a pickle ('copy')", "Keep nothing that cannot be copied."):
+        with during(it.name, _PLACES["copy"], advice):
             twins["a pickle"] = pickle.loads(pickle.dumps(env))
     expected = rollout(env, it.num_steps, 1)
     for how, twin in twins.items():
@@ -371,7 +360,7 @@ def _copies(it: _Transform) -> None:
 def _device(it: _Transform) -> None:
     device = torch.device("cpu")
     env = TransformedEnv(it.make_env().to(device), it.make(), auto_unwrap=True)
-    with during(it.name, "on an explicit device ('device')"):
+    with during(it.name, _PLACES["device"]):
         data = rollout(env, it.num_steps)
     require(
         data.device == device,

@@ -112,7 +112,7 @@ class OptionRollout:
     def run(
         self, root: TensorDictBase, after: TensorDictBase, skipped: Tensor | None
     ) -> TensorDictBase:
-        """Continue after the first base step, but where ``skipped``, until all options have ended."""
+        """Continue after the first base step until all options that are not ``skipped`` end."""
         if self._alone and self._options.trajectory is None:
             out = self._run_alone(root, after)
         elif self.batch_locked or not after.batch_size:

@@ -74,7 +74,7 @@ class OptionTrajectory:
     def write(
         self, taken: int, rows: Tensor | None, root: TensorDictBase, after: TensorDictBase
     ) -> None:
-        """Write the transition ``taken`` steps into the option; ``rows`` are indices, a mask or all."""
+        """Write what ``taken`` steps into the option happened; ``rows``: indices, a mask or all."""
         lead = self.data.batch_dims - 1
         index = ... if rows is None else rows
         for key in self.keys:
