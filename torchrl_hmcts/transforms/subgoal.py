@@ -7,7 +7,7 @@ plan, G goals kept, K goals that the worker is shown, D coordinates of a goal.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -165,7 +165,7 @@ class SubgoalTransform(EnvTransform):
         def key(name: str, value: NestedKey) -> NestedKey:
             return nested_key("SubgoalTransform", name, value)
 
-        def number(name: str, value: float, **bounds: float) -> float:
+        def number(name: str, value: float, **bounds: Any) -> float:
             return real_number("SubgoalTransform", name, value, **bounds)
 
         plan_goals = getattr(planner, "plan_goals", planner)
@@ -407,7 +407,8 @@ def _numbers(tensordict: TensorDictBase, key: NestedKey, m: int) -> np.ndarray:
 
 def _any(value: Tensor, m: int) -> np.ndarray:
     """Return in which elements an entry is true anywhere, bool ``[m]``."""
-    return value.numpy(force=True).reshape(m, -1).any(-1)
+    found: np.ndarray = value.numpy(force=True).reshape(m, -1).any(-1)
+    return found
 
 
 def _within(index: np.ndarray, length: np.ndarray) -> np.ndarray:
