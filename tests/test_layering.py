@@ -44,7 +44,6 @@ DEPENDENCIES = {"torch", "tensordict", "torchrl", "numpy", "numba"}  # of compon
 OPTIONAL = {"planners.drawing": "matplotlib", "planners.export": "networkx"}
 # What is still wrong today: lines go, and none comes.
 KNOWN = {
-    "envs.atari.preload": "all envs",
     "envs.gym_envs": "lab mazes",
     "trainers.figures.animation": "experiments",
     "trainers.figures.atari_results": "runs",
