@@ -445,9 +445,7 @@ def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
 
 @linux
 @pytest.mark.parametrize("length", [10, pytest.param(90, marks=pytest.mark.slow), 200])
-def test_the_forkserver_has_a_socket_whatever_the_temporary_folder(
-    tmp_path: Path, length: int
-) -> None:
+def test_the_forkserver_has_a_socket_for_any_temporary_folder(tmp_path: Path, length: int) -> None:
     folder = tmp_path / ("x" * (length - length // 2)) / ("y" * (length // 2))
     folder.mkdir(parents=True)
     script = tmp_path / "script.py"

@@ -229,7 +229,7 @@ def test_the_check_lets_the_right_direction_pass(module: str, source: str) -> No
     assert not wrong(source, f"{TOP}.{module}")
 
 
-def test_a_circle_is_found_whatever_its_length() -> None:
+def test_circles_of_any_length_are_found() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
     assert len(circles({"a": {"b"}, "b": {"c"}, "c": {"a"}})) == 1
     assert len(circles({"a": {"b"}, "b": {"a"}, "c": {"d"}, "d": {"c"}})) == 2

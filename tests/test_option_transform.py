@@ -112,7 +112,7 @@ def nested_worker():
 
 
 def constant(action):
-    """A worker that always takes one action, whatever it sees."""
+    """A worker that always takes the same action."""
     return TensorDictModule(
         lambda skill: action.expand(*skill.shape, *action.shape).clone(), ["skill"], ["action"]
     )

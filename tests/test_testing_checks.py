@@ -242,7 +242,7 @@ def transitions() -> TensorDict:
 Good = SkillDiscriminatorLoss
 
 
-def halve(loss: Tensor, self: Any, *_: Any) -> Tensor:
+def reduce_again(loss: Tensor, self: Any, *_: Any) -> Tensor:
     return loss / (2.0 if self.reduction == "mean" else 1.0)
 
 
@@ -265,7 +265,7 @@ def undetached(out: dict[str, Tensor], *_: Any) -> dict[str, Tensor]:
 
 
 Undetached = broken(Good, losses=undetached)("Undetached")
-ReducesTwice = broken(Good, _reduce=halve)("ReducesTwice")
+ReducesTwice = broken(Good, _reduce=reduce_again)("ReducesTwice")
 ForgetsKeys = broken(Good, skill_logits=read_by_its_name)("ForgetsKeys")
 Lazy = broken(Good, losses=make_late)("Lazy")
 Detached = broken(Good, losses=lambda out, *_: {k: v.detach() for k, v in out.items()})("Detached")

@@ -70,7 +70,7 @@ class CarriedFrames(CatFrames):
 
 
 class CarriedInit(InitTracker):
-    """InitTracker of as many states as there are, whatever the batch of the env."""
+    """InitTracker of any number of states, which need not be the batch of the env."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for init_key in self.init_keys:

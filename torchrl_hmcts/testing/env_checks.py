@@ -292,7 +292,7 @@ def _check_continuity(env: EnvBase, data: TensorDictBase, redrawn: set[NestedKey
         require(
             not _ended(env, after).any(),
             f"{name}: step {t + 1} of a rollout starts in a state that is done. A reset must give "
-            "a state from which an episode can go on.",
+            "a state from which an episode can continue.",
         )
         running = ~_ended(env, before.get("next"))
         require_same(

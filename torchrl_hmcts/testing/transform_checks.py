@@ -234,7 +234,7 @@ def _on_data(
             "writes.",
         )
     if check != "replay_buffer":
-        message = "which it is not said to write. Name it in data_writes, or leave it."
+        message = "which is not among its data_writes. Name it there, or leave it."
         message = f"{it.name} changed <key> {where}, {message}"
         require_same(data, out, message, leaves(data) - writes)
         return
@@ -282,8 +282,8 @@ def _in_rollouts(
         require_same(
             reference,
             data,
-            f"{it.name} changed <key> of the env, which it is not said to. Name it in changes, or "
-            "leave it. (It may also draw random numbers that the env needs: then give one of the "
+            f"{it.name} changed <key> of the env, which is not among its changes. Name it there, "
+            "or leave it. (It may also draw random numbers that the env needs: then give one of the "
             "two a generator of its own.)",
             leaves(reference) - own,
         )
@@ -301,7 +301,7 @@ def _inverse(it: _Transform, writes: set[NestedKey]) -> None:
             out.get(key, None) is not None,
             f"{it.name}.inv wrote no {key!r}. Set it in _inv_call from the outer action.",
         )
-    message = "which it is not said to write. Name it in inverse_writes, or leave it."
+    message = "which is not among its inverse_writes. Name it there, or leave it."
     require_same(td, out, f"{it.name}.inv changed <key>, {message}", leaves(td) - writes)
 
 

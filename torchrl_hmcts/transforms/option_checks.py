@@ -123,7 +123,7 @@ def _check_holds_elements(env: EnvBase) -> None:
         raise ValueError(
             f"OptionTransform lets the elements of a batch whose option has ended wait for the "
             f"others; {type(env).__name__} steps, and at their end resets, all its {n} at once, so "
-            f"that episodes would go on unseen inside an option. Make {n} envs of one each: "
+            f"that episodes would continue unseen inside an option. Make {n} envs of one each: "
             f"SerialEnv({n}, make_env) or ParallelEnv({n}, make_env)."
         )
 

@@ -24,7 +24,7 @@ class SkillTransform(EnvTransform):
     Writes two entries: the skill, int64 ``[*B]``, and ``skill_step``, int64 ``[*B, 1]``, the base
     steps taken with it so far. Each batch element has its own mini-episodes. On the last transition
     of one, ``("next", "skill")`` is still the old skill, so that values are bootstrapped with the
-    skill that acted; the next root holds the new one. Episodes go on: nothing is marked as done.
+    skill that acted; the next root holds the new one. Episodes continue: nothing is done.
 
     A reset draws new skills where it resets. To choose the skill, reset with it: a reset
     tensordict that holds a skill and no ``"_reset"`` mask keeps its skill (and ``skill_step``).

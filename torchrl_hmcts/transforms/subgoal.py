@@ -63,10 +63,10 @@ class SubgoalTransform(EnvTransform):
         r = r_\text{tick} + r_\text{met}\,[d < d_\text{met}] + r_\text{div}\,[d > d_\text{div}]
 
     A goal that is met makes way for the next one. Where :math:`d > d_\text{div}`, and where the
-    last goal is met though the episode goes on, a new plan is made from :math:`x` before the next
+    last goal is met though the episode continues, a new plan is made from :math:`x` before the next
     action. All elements of a batch that need a plan at the same base step get it in one call.
 
-    Writes, in the root and under ``"next"`` (all of it state: the env stays stateless and goes on
+    Writes, in the root and under ``"next"`` (all of it state: the env stays stateless and continues
     from any tensordict): ``goals_key`` (float32 ``[*B, K D]``, the next K goals, the last one
     repeated), ``"plan"`` (float32 ``[*B, G, D]``), ``"plan_length"`` and ``"goal_index"`` (int64
     ``[*B, 1]``), and the counters of the episode ``"num_plans"``, ``"num_goals_met"`` and
@@ -86,14 +86,14 @@ class SubgoalTransform(EnvTransform):
             half a tile.
         goal_divergence_threshold (float): :math:`d_\text{div}`; must be larger than the distance of
             one goal to the next. ``math.inf`` never plans again. Default 2 tiles.
-        r_tick (float): reward of every base step. The source gives no number. Default -0.025:
+        r_tick (float): reward of every base step. The dissertation gives none. Default -0.025:
             going to and fro around a corner of Waterworld, where a plan pays for the same goals
             again, earns 0.020 per base step before it, so that with a smaller one it would pay not
             to arrive.
         r_goal_met (float): Default 1.
         r_goal_divergence (float): Default -1.
         num_goals (int): K. Default 3.
-        max_goals (int): G; a longer plan is cut, and goes on from a new plan when its last goal is
+        max_goals (int): G; a longer plan is cut, and a new plan follows when its last goal is
             met. Default 64.
         relative (bool): show goals relative to the position (default), so that what the worker
             learns in one place holds in all, or as they are.
@@ -209,6 +209,7 @@ class SubgoalTransform(EnvTransform):
         self.num_goals = whole_number("SubgoalTransform", "num_goals", num_goals, least=1)
         self.max_goals = whole_number("SubgoalTransform", "max_goals", max_goals, least=1)
         self.relative = relative
+        self._ahead = np.arange(self.num_goals)
 
     # ------------------------------------------------------------------ planning
 
@@ -253,7 +254,7 @@ class SubgoalTransform(EnvTransform):
         self, path: np.ndarray, length: np.ndarray, index: np.ndarray, position: np.ndarray
     ) -> np.ndarray:
         """Return the next K goals, ``[m, K, D]``."""
-        ahead = _within(index[:, None] + np.arange(self.num_goals), length)
+        ahead = _within(index[:, None] + self._ahead, length)
         shown: np.ndarray = path[np.arange(len(path))[:, None], ahead]
         if self.relative:
             shown -= position[:, None]
@@ -338,8 +339,8 @@ class SubgoalTransform(EnvTransform):
                 index[rows] = 0
                 plan = torch.from_numpy(path.reshape(plan.shape)).to(plan.device)
         shown = self._shown(path, length, index, position).reshape(m, -1)
-        next_tensordict.set(self.task_reward_key, next_tensordict.get(self.reward_key))
-        next_tensordict.set(self.plan_key, plan)
+        put(next_tensordict, self.task_reward_key, next_tensordict.get(self.reward_key))
+        put(next_tensordict, self.plan_key, plan)
         counted = [
             count + new for count, new in zip(counters, (replan, met, diverged), strict=True)
         ]
