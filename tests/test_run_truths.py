@@ -17,10 +17,10 @@ from torchrl_hmcts.trainers.experiments.evaluations import load_networks
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
 from torchrl_hmcts.trainers.figures.report import write_run_page
 from torchrl_hmcts.trainers.runs.config import DemoConfig
-from torchrl_hmcts.trainers.runs.folder import end_record, read_run
 from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.runs.worker_file import find_worker, save_worker
 from torchrl_hmcts.trainers.saving.files import read_json, write_json
+from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run
 
 
 def finish(out: Path, metrics: dict[str, Any], **captions: str) -> str:
