@@ -34,6 +34,7 @@ from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer, ExpertIterationTrainer, HMCTSTrainer
+from torchrl_hmcts.trainers.experiments.registry import load_config
 from torchrl_hmcts.trainers.runs.config import DemoConfig
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
@@ -42,7 +43,7 @@ from torchrl_hmcts.trainers.saving.checkpoints import (
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.saving.run_folder import load_config, read_run, start_record
+from torchrl_hmcts.trainers.saving.run_folder import read_run, start_record
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 REFUSED = (CheckpointError, ValueError)  # of checkpoints, and of JSON

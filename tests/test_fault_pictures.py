@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from torchrl.record.loggers import CSVLogger, Logger
 
-from torchrl_hmcts.trainers import cli, files
+from torchrl_hmcts.trainers import cli
 from torchrl_hmcts.trainers.figures.animation import write_gif
-from torchrl_hmcts.trainers.figures.report import finish
+from torchrl_hmcts.trainers.figures.run_page import finish
 from torchrl_hmcts.trainers.runs.loggers import ScalarLoggers
+from torchrl_hmcts.trainers.saving import files
 from torchrl_hmcts.trainers.saving.files import left_out, replacing, write_text
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -140,6 +141,7 @@ class TestPageAtTheEnd:
     ) -> None:
         (tmp_path / "curves.csv").write_text("name,step,value\nloss,1,2\nloss,2,1\n")
         without(monkeypatch, "matplotlib")
+        monkeypatch.delitem(sys.modules, "torchrl_hmcts.trainers.figures.curves", raising=False)
         page = self.end(tmp_path, lambda path: None)
         assert "one.png" in page
         assert "Curves" not in page

@@ -15,12 +15,12 @@ from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.figures.curves import Panel, common_steps, plot_training
 from torchrl_hmcts.trainers.figures.skill_figures import (
     search_coverage,
     skill_figures,
     smallest_angle,
 )
-from torchrl_hmcts.trainers.figures.solving_curves import band, plot_solving_curves
 
 PUSH = TensorDictModule(lambda skill: skill, ["skill"], ["action"])  # skill z: thrust z
 
@@ -128,15 +128,13 @@ def test_figures_need_no_gradient() -> None:
 
 
 def test_curves_of_seeds_are_brought_to_the_steps_that_all_of_them_reached() -> None:
-    short = {"training_steps": [0, 10], "solved": [0.0, 1.0]}
-    long = {"training_steps": [0, 5, 10, 20], "solved": [0.0, 0.0, 0.5, 1.0]}
-    shown = band([long, short], "solved")
-    assert shown["training_steps"].tolist() == [0.0, 5.0, 10.0]
-    assert shown["mean"].tolist() == [0.0, 0.25, 0.75]
-    assert shown["least"].tolist() == [0.0, 0.0, 0.5]
-    assert shown["largest"].tolist() == [0.0, 0.5, 1.0]
+    short = ([0, 5, 10], [0.0, 0.5, 1.0])
+    long = ([0, 5, 10, 20], [0.0, 0.0, 0.5, 1.0])
+    steps, values = common_steps([long, short])
+    assert steps.tolist() == [0.0, 5.0, 10.0]
+    assert values.tolist() == [[0.0, 0.0, 0.5], [0.0, 0.5, 1.0]]
     with pytest.raises(ValueError, match="got none"):
-        band([], "solved")
+        common_steps([])
 
 
 def test_solving_curves_are_drawn(tmp_path: Path) -> None:
@@ -146,8 +144,10 @@ def test_solving_curves_are_drawn(tmp_path: Path) -> None:
         "executed_steps": [90.0, 50.0],
         "solved": [0.5, 1.0],
     }
-    plot_solving_curves({"from scratch": [curve, curve]}, tmp_path / "a.png", title="two seeds")
+    steps = Panel("base_steps", "to solve", log=True, dotted=("executed_steps", "executed only"))
+    panels = [steps, Panel("solved", "solved", share=True, level=(0.9, "wanted"))]
+    plot_training({"from scratch": [curve, curve]}, panels, tmp_path / "a.png", title="two seeds")
     picture = iio.imread(tmp_path / "a.png")
-    assert picture.shape[:2] == (550, 1210)
+    assert picture.shape[:2] == (506, 1210)
     blue = (np.abs(picture[..., :3].astype(int) - (29, 78, 216)) < 12).all(-1)
     assert blue.sum() > 500  # the curve is there

@@ -28,9 +28,9 @@ CHECKPOINT_VERSION = 1
 MAX_UNPACKED_BYTES = 2**31
 """Bytes to which a checkpoint may unpack: 2 GiB, or its own size on the disk if that is more (what
 is written here is not compressed). The variable ``TORCHRL_HMCTS_MAX_UNPACKED_BYTES`` raises it."""
-MANIFEST = "manifest.json"
 _SEAL = b"torchrl_hmcts sha256 "
 _HEX = 64  # digits of the digest
+_TYPES = {"settings": dict, "checkpoint_version": int, "serial": int}  # of what is read here
 
 
 class NewerCheckpointError(CheckpointError):
@@ -62,10 +62,8 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
                 _check_size(path, archive)
         manifest = Checkpoint.manifest(path)
         ours = manifest.setdefault("metadata", {}).setdefault("torchrl_hmcts", {})
-        if not isinstance(ours, dict):
-            raise TypeError(f"torchrl_hmcts is {ours!r}")
-        for name, kind in (("settings", dict), ("checkpoint_version", int), ("serial", int)):
-            if name in ours and type(ours[name]) is not kind:
+        for name, kind in _TYPES.items():
+            if type(ours.get(name, kind())) is not kind:
                 raise TypeError(f"{name} is {ours[name]!r}")
     except FileNotFoundError:
         raise
@@ -139,14 +137,6 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
 
     Raises:
         CheckpointError: naming each value that differs.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_hmcts.trainers.saving.checkpoints import check_settings, plain_checkpoint
-        >>> checkpoint = plain_checkpoint(net=torch.nn.Linear(2, 1))
-        >>> path = checkpoint.save(
-        ...     "linear.torchrl", metadata={"torchrl_hmcts": {"settings": {"batch_size": 64}}})
-        >>> check_settings(path, {"batch_size": 64})
     """
     other = read_manifest(path)["metadata"]["torchrl_hmcts"].get("settings", {})
     here = json.loads(json.dumps(dict(settings)))
@@ -162,44 +152,26 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
         )
 
 
-def read_arrays(folder: Path) -> dict[str, torch.Tensor]:
-    """Read the arrays of a component, as TorchRL writes them, with ordinary reads.
+def find_short_array(meta: Path) -> str | None:
+    """Return a sentence about a file that is shorter than its array, or ``None``.
 
     Args:
-        folder (path): with ``meta.json`` and a file for each array.
-
-    Raises:
-        CheckpointError: if a file is shorter than its array.
+        meta (path): the file ``meta.json`` beside the files of the arrays.
     """
-    arrays = {}
-    for key, (dtype, shape, file, size) in _array_files(folder).items():
-        data = bytearray(file.read_bytes()[:size]) if size else bytearray()
-        if len(data) < size:
-            raise CheckpointError(f"{file.name} is cut off: {len(data)} bytes of {size}")
-        flat = torch.frombuffer(data, dtype=dtype) if size else torch.empty(0, dtype=dtype)
-        arrays[key] = flat.reshape(shape)
-    return arrays
-
-
-def _array_files(folder: Path) -> dict[str, tuple[torch.dtype, list[int], Path, int]]:
-    """Type, shape, file and bytes of each array."""
-    found = {}
-    for key, entry in json.loads((folder / "meta.json").read_text(encoding="utf-8")).items():
+    for key, entry in json.loads(meta.read_text(encoding="utf-8")).items():
         if isinstance(entry, dict) and "dtype" in entry:
             dtype = getattr(torch, entry["dtype"].removeprefix("torch."))
-            size = math.prod(entry["shape"]) * dtype.itemsize
-            found[key] = (dtype, entry["shape"], folder / f"{Path(key).name}.memmap", size)
-    return found
+            array = meta.with_name(f"{Path(key).name}.memmap")
+            if array.stat().st_size < math.prod(entry["shape"]) * dtype.itemsize:
+                return f"{array.name} of {meta.parent.parent.name} is cut off"
+    return None
 
 
 def _digest(file: Any, end: int) -> bytes:
     """Digest of the first bytes of an open file, in hexadecimal digits; leaves it at their end."""
     found, left = hashlib.sha256(), end
     file.seek(0)
-    while left:
-        block = file.read(min(left, 2**20))
-        if not block:
-            break
+    while block := file.read(min(left, 2**20)):
         found.update(block)
         left -= len(block)
     return found.hexdigest().encode()
@@ -207,8 +179,7 @@ def _digest(file: Any, end: int) -> bytes:
 
 def _is_sealed(path: Path) -> bool | None:
     """Whether the digest at the end is right; None if there is none."""
-    size = path.stat().st_size
-    end = size - _HEX
+    end = path.stat().st_size - _HEX
     if end < len(_SEAL):
         return None
     with path.open("rb") as file:
@@ -239,7 +210,7 @@ def _inventory(manifest: Mapping[str, Any]) -> list[str]:
 
 def _archive_damage(archive: zipfile.ZipFile, manifest: Mapping[str, Any]) -> str | None:
     names = Counter(archive.namelist())
-    expected = {MANIFEST, *_inventory(manifest)}
+    expected = {"manifest.json", *_inventory(manifest)}
     for name, number in names.items():
         if number > 1:
             return f"{name} is in it {number} times"
@@ -256,8 +227,6 @@ def _folder_damage(folder: Path, manifest: Mapping[str, Any]) -> str | None:
         file = folder / name
         if file.is_symlink() or not file.is_file():
             return f"{name} is {'a link' if file.is_symlink() else 'missing'}"
-        if file.name == "meta.json":
-            for _, _, array, size in _array_files(file.parent).values():
-                if array.stat().st_size < size:
-                    return f"{array.name} of {file.parent.parent.name} is cut off"
+        if file.name == "meta.json" and (damage := find_short_array(file)):
+            return damage
     return None
