@@ -12,18 +12,17 @@ import subprocess
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from small_trainers import make_diayn
 from torch import nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
-from torchrl.envs import Compose, TransformedEnv
 
-from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.saving import checkpoints
 from torchrl_hmcts.trainers.saving.checkpoints import (
@@ -33,8 +32,7 @@ from torchrl_hmcts.trainers.saving.checkpoints import (
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.saving.files import write_json, write_text
-from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+from torchrl_hmcts.trainers.saving.files import write_json
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 
@@ -94,26 +92,17 @@ def strip(path: Path) -> None:
 
 
 @pytest.fixture
-def trainer(tmp_path: Path) -> Iterator[Callable[..., DIAYNTrainer]]:
-    made: list[DIAYNTrainer] = []
+def trainer(tmp_path) -> Callable[..., DIAYNTrainer]:
+    def make(folder: Path | None = tmp_path / "run", **kw: Any) -> DIAYNTrainer:
+        return make_diayn(folder, kw.pop("total_frames", 48), **kw)
 
-    def make(folder: Path | None = tmp_path / "run", hidden: int = 8, **kw: Any) -> DIAYNTrainer:
-        base = WaterworldMazeEnv(batch_size=[8], observation=False, max_steps=10)
-        env = TransformedEnv(base, Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()))
-        loss = DIAYNTrainer.make_loss(env, 4, hidden=(hidden,), seed=0)
-        settings = {"total_frames": 48, "frames_per_batch": 16, "batch_size": 8, "seed": 0, **kw}
-        made.append(DIAYNTrainer(env, loss, save_dir=folder, buffer_size=64, **settings))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.collector.shutdown()
+    return make
 
 
 class TestDamage:
     @pytest.mark.parametrize("damage", [cut, flip, empty, text, strip])
     def test_the_newest_whole_checkpoint_is_taken_and_a_line_says_so(
-        self, damage: Callable[[Path], None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, damage: Callable[[Path], None], tmp_path, capsys
     ) -> None:
         newest = save(tmp_path, 1, 2, 3).checkpoints()[-1]
         damage(newest)
@@ -123,7 +112,7 @@ class TestDamage:
         assert said.startswith(f"Checkpoint {newest.name} is damaged (")
         assert said.endswith("Continuing from checkpoint-000000000002.torchrl.\n")
 
-    def test_every_cut_of_a_checkpoint_is_noticed(self, tmp_path: Path) -> None:
+    def test_every_cut_of_a_checkpoint_is_noticed(self, tmp_path) -> None:
         (path,) = save(tmp_path, 1).checkpoints()
         whole = path.read_bytes()
         for length in range(0, len(whole), len(whole) // 50):
@@ -132,13 +121,13 @@ class TestDamage:
         path.write_bytes(whole)
         assert find_damage(path) is None
 
-    def test_a_damaged_checkpoint_that_was_asked_for_is_refused(self, tmp_path: Path) -> None:
+    def test_a_damaged_checkpoint_that_was_asked_for_is_refused(self, tmp_path) -> None:
         path = save(tmp_path, 1, 2).checkpoints()[-1]
         flip(path)
         with pytest.raises(CheckpointError, match=r"damaged \(.*checksum\).*Pass its folder"):
             newest_checkpoint(path)
 
-    def test_when_all_are_damaged_each_is_named(self, tmp_path: Path) -> None:
+    def test_when_all_are_damaged_each_is_named(self, tmp_path) -> None:
         for path in save(tmp_path, 1, 2).checkpoints():
             cut(path)
         with pytest.raises(CheckpointError, match=r"is whole.*02\.torchrl.*01\.torchrl.*again"):
@@ -146,7 +135,7 @@ class TestDamage:
 
     @pytest.mark.parametrize("damage", ["cut", "missing"])
     def test_folders_that_torchrl_wrote_are_read_and_checked_too(
-        self, damage: str, tmp_path: Path
+        self, damage: str, tmp_path
     ) -> None:
         rotation = CheckpointRotation(tmp_path, keep_last=2)
         for step in (1, 2):
@@ -156,13 +145,13 @@ class TestDamage:
         cut(array) if damage == "cut" else array.unlink()
         assert load(newest_checkpoint(tmp_path)) == 1.0
 
-    def test_torchrl_reads_what_is_written_here(self, tmp_path: Path) -> None:
+    def test_torchrl_reads_what_is_written_here(self, tmp_path) -> None:
         save(tmp_path, 7)
         net = Big()
         CheckpointRotation(tmp_path, keep_last=1).load_latest(Checkpoint(net=net))
         assert net.weights[0] == 7.0
 
-    def test_every_kind_of_entry_comes_back_as_it_was(self, tmp_path: Path) -> None:
+    def test_every_kind_of_entry_comes_back_as_it_was(self, tmp_path) -> None:
         class Holder:
             state: dict[Any, Any] = {
                 "scalar": torch.tensor(2.5),
@@ -191,14 +180,12 @@ class TestDamage:
 
 
 class TestRotation:
-    def test_only_the_newest_are_kept(self, tmp_path: Path) -> None:
+    def test_only_the_newest_are_kept(self, tmp_path) -> None:
         rotation = save(tmp_path, 1, 2, 3, 4, keep_last=2)
         assert [load(path) for path in rotation.checkpoints()] == [3.0, 4.0]
         assert len(names(tmp_path)) == 2
 
-    def test_a_damaged_one_does_not_count_so_that_the_last_good_one_stays(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_damaged_one_does_not_count_so_that_the_last_good_one_stays(self, tmp_path) -> None:
         rotation = save(tmp_path, 1, 2, 3)
         rotation.keep_last = 1
         for path in rotation.checkpoints()[1:]:
@@ -207,16 +194,14 @@ class TestRotation:
         assert len(names(tmp_path)) == 3
         assert load(newest_checkpoint(tmp_path)) == 1.0
 
-    def test_after_a_fall_back_the_new_ones_count_as_the_newest(self, tmp_path: Path) -> None:
+    def test_after_a_fall_back_the_new_ones_count_as_the_newest(self, tmp_path) -> None:
         rotation = save(tmp_path, 100, 200, keep_last=1)
         flip(rotation.checkpoints()[-1])
         rotation.save(plain_checkpoint(net=Big(150)), step=150)
         assert names(tmp_path) == ["checkpoint-000000000150.torchrl"]
         assert load(newest_checkpoint(tmp_path)) == 150.0
 
-    def test_a_clock_that_is_set_back_changes_nothing(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_clock_that_is_set_back_changes_nothing(self, tmp_path, monkeypatch) -> None:
         class Clock(datetime):
             @classmethod
             def now(cls, tz: Any = None) -> datetime:
@@ -230,9 +215,7 @@ class TestRotation:
             assert load(newest_checkpoint(tmp_path)) == step
         assert [load(path) for path in DurableRotation(tmp_path).checkpoints()] == [3.0, 4.0]
 
-    def test_checkpoints_of_older_versions_are_in_the_order_of_their_steps(
-        self, tmp_path: Path
-    ) -> None:
+    def test_checkpoints_of_older_versions_are_in_the_order_of_their_steps(self, tmp_path) -> None:
         for step in (3, 1, 2):
             Checkpoint(net=Big(step), format="archive").save(
                 tmp_path / f"checkpoint-{step:012d}.torchrl"
@@ -241,12 +224,12 @@ class TestRotation:
         save(tmp_path, 1, keep_last=2)  # of this version: newer than they are
         assert [load(path) for path in DurableRotation(tmp_path).checkpoints()] == [3.0, 1.0]
 
-    def test_the_same_step_can_be_saved_again(self, tmp_path: Path) -> None:
+    def test_the_same_step_can_be_saved_again(self, tmp_path) -> None:
         rotation = save(tmp_path, 5)
         rotation.save(plain_checkpoint(net=Big(6)), step=5)
         assert load(newest_checkpoint(tmp_path)) == 6.0
 
-    def test_what_a_killed_process_left_is_removed(self, tmp_path: Path) -> None:
+    def test_what_a_killed_process_left_is_removed(self, tmp_path) -> None:
         gone = subprocess.Popen([sys.executable, "-c", ""])
         gone.wait()
         left = tmp_path / f"..checkpoint-000000000001.torchrl.writing-{gone.pid}.stage-0a"
@@ -259,7 +242,7 @@ class TestRotation:
 
 
 class TestDisk:
-    def full_after(self, monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
+    def full_after(self, monkeypatch, calls: int) -> None:
         """Makes the write of a checkpoint fail at one of its files."""
         real, left = Path.write_bytes, [calls]
 
@@ -274,7 +257,7 @@ class TestDisk:
 
     @pytest.mark.parametrize("where", ["arrays", "archive", "fsync", "rename"])
     def test_a_full_disk_loses_no_checkpoint_and_is_named(
-        self, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, where: str, tmp_path, monkeypatch
     ) -> None:
         def fail(*_: Any, **__: Any) -> None:
             raise FULL
@@ -298,7 +281,7 @@ class TestDisk:
         rotation.save(plain_checkpoint(net=Big(4)), step=4)  # there is room again
         assert load(newest_checkpoint(tmp_path)) == 4.0
 
-    def test_a_small_disk_that_really_is_full_ends_in_an_error(self, tmp_path: Path) -> None:
+    def test_a_small_disk_that_really_is_full_ends_in_an_error(self, tmp_path) -> None:
         """Memory maps, which TorchRL writes by, would kill the process: hence a process."""
         disk = tmp_path / "disk"
         disk.mkdir()
@@ -319,13 +302,13 @@ class TestDisk:
         assert "No space left on device; " in done.stderr.splitlines()[-1]
         assert done.stdout.splitlines()[-1] == "[0.0, 1.0]"
 
-    def test_a_folder_that_cannot_be_written_is_named_before_any_work(self, tmp_path: Path) -> None:
+    def test_a_folder_that_cannot_be_written_is_named_before_any_work(self, tmp_path) -> None:
         (tmp_path / "file").write_text("")
         with pytest.raises(OSError, match="cannot be written to '.*file/run' .Not a directory"):
             DurableRotation(tmp_path / "file" / "run")
 
     def test_a_read_only_folder_is_named_before_any_work_and_can_be_read(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path, monkeypatch
     ) -> None:
         def read_only(*_: Any, **__: Any) -> None:
             raise OSError(errno.EROFS, "Read-only file system")
@@ -336,24 +319,6 @@ class TestDisk:
             with pytest.raises(OSError, match=r"Read-only file system.*Choose a save_dir"):
                 DurableRotation(tmp_path)
             assert load(newest_checkpoint(tmp_path)) == 1.0
-
-    def test_a_text_is_replaced_in_one_move_or_not_at_all(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        path = tmp_path / "metrics.json"
-        write_text(path, "old")
-
-        def fail(*_: Any) -> None:
-            raise FULL
-
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "fsync", fail)
-            with pytest.raises(OSError, match="No space"):
-                write_text(path, "new")
-        assert path.read_text() == "old"
-        assert names(tmp_path) == ["metrics.json"]
-        write_text(path, "new")
-        assert path.read_text() == "new"
 
 
 class TestForeign:
@@ -393,7 +358,7 @@ class TestForeign:
     )
     @pytest.mark.parametrize("form", ["archive", "directory"])
     def test_a_manifest_of_any_content_is_an_error_of_the_checkpoint(
-        self, manifest: str, form: str, tmp_path: Path
+        self, manifest: str, form: str, tmp_path
     ) -> None:
         path = tmp_path / "c"
         if form == "directory":
@@ -412,9 +377,7 @@ class TestForeign:
                 read(path)
 
     @pytest.mark.parametrize("name", ["twice", "/root", "../up", "folder/", "components/other"])
-    def test_files_that_the_manifest_does_not_have_are_refused(
-        self, name: str, tmp_path: Path
-    ) -> None:
+    def test_files_that_the_manifest_does_not_have_are_refused(self, name: str, tmp_path) -> None:
         path = Checkpoint(net=Big(1), format="archive").save(tmp_path / "c")
         with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of names that are there already
@@ -422,7 +385,7 @@ class TestForeign:
         with pytest.raises(CheckpointError, match=r"in it 2 times|not in its manifest|damaged"):
             load(path)
 
-    def test_links_in_a_folder_are_refused(self, tmp_path: Path) -> None:
+    def test_links_in_a_folder_are_refused(self, tmp_path) -> None:
         path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
         (array,) = path.rglob("*.memmap")
         array.rename(tmp_path / "elsewhere")
@@ -431,7 +394,7 @@ class TestForeign:
             load(path)
 
     def test_a_checkpoint_that_would_unpack_to_too_much_is_refused_unopened(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path, monkeypatch
     ) -> None:
         made = Checkpoint(net=Big(1), format="archive", archive_compression="deflate")
         path = made.save(tmp_path / "c")  # 0.5 MiB of ones, in some KiB
@@ -444,9 +407,7 @@ class TestForeign:
         monkeypatch.setenv("TORCHRL_HMCTS_MAX_UNPACKED_BYTES", "600000")
         assert load(path) == 1.0
 
-    def test_a_newer_version_is_named_and_nothing_older_is_taken_instead(
-        self, tmp_path: Path
-    ) -> None:
+    def test_a_newer_version_is_named_and_nothing_older_is_taken_instead(self, tmp_path) -> None:
         path = save(tmp_path, 1, 2).checkpoints()[-1]
         self.rewrite(
             path,
@@ -459,7 +420,7 @@ class TestForeign:
             newest_checkpoint(tmp_path)
 
     def test_a_run_with_other_settings_is_refused_with_both_values(
-        self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+        self, trainer: Callable[..., DIAYNTrainer], tmp_path
     ) -> None:
         trainer().train()
         with pytest.raises(
@@ -473,7 +434,7 @@ class TestForeign:
 
     @pytest.mark.parametrize("frames", [float("nan"), -16, "16", None])
     def test_base_steps_that_are_no_count_are_refused(
-        self, frames: Any, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+        self, frames: Any, trainer: Callable[..., DIAYNTrainer], tmp_path
     ) -> None:
         one = trainer(folder=None)
         one.collected_frames = frames
@@ -482,7 +443,7 @@ class TestForeign:
             trainer(folder=None).load(path)
 
     def test_a_checkpoint_without_a_component_is_refused(
-        self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+        self, trainer: Callable[..., DIAYNTrainer], tmp_path
     ) -> None:
         one = trainer(folder=None)
         path = plain_checkpoint(loss_module=one.loss_module).save(tmp_path / "c")
@@ -490,7 +451,7 @@ class TestForeign:
             one.load(path)
 
     @pytest.mark.parametrize("what", ["shape", "dtype", "short"])
-    def test_arrays_that_are_not_what_they_say_are_refused(self, what: str, tmp_path: Path) -> None:
+    def test_arrays_that_are_not_what_they_say_are_refused(self, what: str, tmp_path) -> None:
         path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
         (meta,) = path.rglob("meta.json")
         said = json.loads(meta.read_text())
@@ -504,13 +465,13 @@ class TestForeign:
             load(path)
 
     def test_networks_of_other_sizes_are_refused(
-        self, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+        self, trainer: Callable[..., DIAYNTrainer], tmp_path
     ) -> None:
         trainer().train()
         with pytest.raises(CheckpointError, match="size mismatch|shape"):
             trainer(tmp_path / "new", hidden=9).load(tmp_path / "run")
 
-    def test_settings_are_compared_as_they_come_back_from_json(self, tmp_path: Path) -> None:
+    def test_settings_are_compared_as_they_come_back_from_json(self, tmp_path) -> None:
         rotation = DurableRotation(tmp_path)
         rotation.settings = {"hidden": (8, 8), "fraction": None}
         path = rotation.save(plain_checkpoint(net=Big()), step=0)
@@ -518,7 +479,7 @@ class TestForeign:
         with pytest.raises(CheckpointError, match=r"hidden was \[8, 8\] and is \[8\] here"):
             check_settings(path, {"hidden": (8,)})
 
-    def test_a_pickle_inside_a_checkpoint_is_not_opened(self, tmp_path: Path) -> None:
+    def test_a_pickle_inside_a_checkpoint_is_not_opened(self, tmp_path) -> None:
         class Bomb:
             def __reduce__(self) -> Any:
                 return os.mkdir, (str(tmp_path / "exploded"),)
@@ -538,7 +499,7 @@ class TestForeign:
 class TestNaN:
     @pytest.mark.parametrize("how", ["loss", "gradient"])
     def test_it_stops_the_training_unchanged_and_names_the_last_good_checkpoint(
-        self, how: str, trainer: Callable[..., DIAYNTrainer], tmp_path: Path
+        self, how: str, trainer: Callable[..., DIAYNTrainer], tmp_path
     ) -> None:
         one = trainer(total_frames=160, save_trainer_interval=15)
         forward, weights = one.loss_module.forward, {}
@@ -576,14 +537,14 @@ class TestNaN:
             one.train()
 
 
-def test_a_folder_that_vanishes_while_training_is_made_again(tmp_path: Path) -> None:
+def test_a_folder_that_vanishes_while_training_is_made_again(tmp_path) -> None:
     rotation = save(tmp_path / "run", 1)
     shutil.rmtree(tmp_path / "run")
     rotation.save(plain_checkpoint(net=Big(2)), step=2)
     assert load(newest_checkpoint(tmp_path / "run")) == 2.0
 
 
-def test_numbers_that_are_not_finite_are_null_in_json(tmp_path: Path) -> None:
+def test_numbers_that_are_not_finite_are_null_in_json(tmp_path) -> None:
     content = {"a": [1, float("nan")], "b": {"c": float("inf"), "d": 0.5}, "e": "nan", "f": None}
     write_json(tmp_path / "a.json", content)
     text = (tmp_path / "a.json").read_text()

@@ -120,7 +120,7 @@ def test_a_page_in_another_place_holds_its_pictures(tmp_path) -> None:
     ],
 )
 def test_a_damaged_file_is_named_once_and_spares_all_else(
-    name: str, content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, content: bytes, tmp_path, capsys
 ) -> None:
     bad, good = write_run(tmp_path / "bad"), write_run(tmp_path / "good", 7, gamma=0.9)
     (bad / name).write_bytes(content)
