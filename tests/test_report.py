@@ -237,15 +237,13 @@ def test_a_page_can_be_written_where_no_run_was_recorded(tmp_path) -> None:
 
 
 def test_the_bootstrap_interval_of_one_seed_is_its_value() -> None:
-    alone = bootstrap([3.0])
-    assert (alone.middle, alone.low, alone.high, alone.count) == (3.0, 3.0, 3.0, 1)
+    assert bootstrap([3.0]) == (3.0, 3.0, 3.0)
 
 
 def test_the_bootstrap_covers_the_mean_about_as_often_as_it_says() -> None:
     generator = np.random.default_rng(1)
-    samples = generator.normal(5.0, 2.0, size=(200, 30))
-    covered = [bootstrap(list(x), resamples=500) for x in samples]
-    share = np.mean([interval.low <= 5.0 <= interval.high for interval in covered])
+    samples = generator.normal(5.0, 2.0, size=(100, 30))
+    share = np.mean([low <= 5.0 <= high for _, low, high in map(bootstrap, samples)])
     assert 0.88 <= share <= 0.99  # 95 %, less what 30 values cost
 
 

@@ -16,13 +16,6 @@ _VIDEO_SECONDS = 300  # after which ffmpeg is given up
 def steps_to_show(last: int, every: int) -> list[int]:
     """Return the base steps of an episode of which there is a picture.
 
-    Args:
-        last: base step, always shown.
-        every: base steps from one picture to the next.
-
-    Raises:
-        ValueError: if ``every`` is below 1.
-
     Example:
         >>> steps_to_show(5, 2)
         [0, 2, 4, 5]

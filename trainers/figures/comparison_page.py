@@ -32,12 +32,7 @@ _KEYS_IN_NAME = 3  # of a group; all that differ are in the table of configs
 
 @dataclass
 class RunGroup:
-    """Runs of one experiment and config that differ in their seeds only.
-
-    Args:
-        name: what sets it apart from the other groups.
-        runs: one per seed.
-    """
+    """Runs of one experiment and config that differ in their seeds only."""
 
     name: str
     runs: list[RunFolder] = field(default_factory=list)
@@ -58,9 +53,6 @@ class RunGroup:
 
 def group_runs(runs: Sequence[RunFolder]) -> list[RunGroup]:
     """Put runs that differ in their seeds only into groups, named by what sets them apart.
-
-    Args:
-        runs: in the order of the page.
 
     Example:
         >>> configs = [{"seed": seed, "size": size} for size in (9, 15) for seed in (0, 1)]
@@ -88,18 +80,7 @@ def group_runs(runs: Sequence[RunFolder]) -> list[RunGroup]:
 
 
 def write_comparison(runs: Sequence[RunFolder], out: str | Path) -> Path:
-    """Write the page that compares runs; it holds all its pictures.
-
-    Args:
-        runs: as they were read; one that is given twice counts once.
-        out: file to write, or a folder for ``index.html``.
-
-    Returns:
-        The file.
-
-    Raises:
-        ValueError: if ``out`` is a run's folder or a file that this package did not write.
-    """
+    """Write the page that compares runs; it holds all its pictures."""
     runs = list({run.path.resolve(): run for run in runs}.values())
     file = Path(out)
     if file.suffix.lower() not in (".html", ".htm"):
@@ -184,11 +165,11 @@ def _statistics(values: list[float] | None) -> Cell:
     def shown(value: float) -> str:
         return plain(int(value) if value.is_integer() else value)
 
-    mean = bootstrap(values)
-    below = [f"{shown(mean.low)} to {shown(mean.high)}"] if mean.low < mean.high else []
-    if below and mean.count >= _SEEDS_FOR_IQM:
-        below.append(f"middle half {shown(bootstrap(values, interquartile_mean).middle)}")
-    return Cell(shown(mean.middle), below=below, number=True)
+    mean, low, high = bootstrap(values)
+    below = [f"{shown(low)} to {shown(high)}"] if low < high else []
+    if below and len(values) >= _SEEDS_FOR_IQM:
+        below.append(f"middle half {shown(bootstrap(values, interquartile_mean)[0])}")
+    return Cell(shown(mean), below=below, number=True)
 
 
 def _panels(groups: Sequence[RunGroup]) -> list[Picture]:

@@ -62,11 +62,7 @@ class MapDrawing(Protocol):
 
 @dataclass
 class WaterworldMap:
-    """Draws Waterworld's mazes, x to the right and y down, in tiles.
-
-    Args:
-        env: whose mazes the states index.
-    """
+    """Draws Waterworld's mazes, x to the right and y down, in tiles."""
 
     env: WaterworldMazeEnv
 
@@ -89,12 +85,7 @@ class WaterworldMap:
         return image
 
     def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
-        """Return an open room and a maze with states in their middle, for :func:`plot_skill_fan`.
-
-        Args:
-            num: of states in each.
-            maze: index of the maze.
-        """
+        """Return an open room and a maze with states in their middle, for :func:`plot_skill_fan`."""
         walls = self.env.mazes[maze]
         height, width = walls.shape
         center = torch.tensor([width / 2, height / 2])
@@ -112,11 +103,7 @@ class WaterworldMap:
 
 @dataclass
 class LabMap:
-    """Draws lab mazes in cells, x to the east and y to the north.
-
-    Args:
-        env: whose mazes the states index.
-    """
+    """Draws lab mazes in cells, x to the east and y to the north."""
 
     env: LabMazeEnv
 
@@ -154,11 +141,6 @@ class LabMap:
 
         Each state has a heading of its own: a skill is a direction on the map, whichever way the
         player faces.
-
-        Args:
-            num: of states in each.
-            maze: index of the maze.
-            seed: of the headings.
         """
         generator = np.random.default_rng(seed)
         layout = self.env.layout
@@ -332,11 +314,6 @@ def write_episode_gif(
 def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 1, 2, 3)) -> None:
     """Draw mazes as text, goal "G" and walls "*", and below as they look from above.
 
-    Args:
-        env: whose mazes are drawn.
-        path: PNG to write.
-        mazes: indices.
-
     Reference:
         Dissertation, figure 4.4.
     """
@@ -356,14 +333,7 @@ def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 
 
 
 def draw_walls(axes: Axes, walls: Any, *, north_up: bool = False, grid: bool = False) -> None:
-    """Draw walls as black squares, (x, y) in tiles.
-
-    Args:
-        axes: to draw in.
-        walls: bool ``[H, W]``, the first row at the top.
-        north_up: let y grow upwards.
-        grid: draw lines between the tiles.
-    """
+    """Draw walls as black squares, (x, y) in tiles."""
     walls = np.asarray(walls)
     height, width = walls.shape
     axes.imshow(
@@ -385,13 +355,7 @@ def draw_walls(axes: Axes, walls: Any, *, north_up: bool = False, grid: bool = F
 
 
 def legend_below(figure: Figure, legend: Legend, *, ncols: int) -> None:
-    """Move a panel's legend below the figure, as the legend of all panels.
-
-    Args:
-        figure: receives it.
-        legend: of one panel; it is removed there.
-        ncols: columns.
-    """
+    """Move a panel's legend below the figure, as the legend of all panels."""
     handles: Any = legend.legend_handles  # typed as if one could be None
     names = [text.get_text() for text in legend.get_texts()]
     legend.remove()

@@ -132,13 +132,7 @@ class Section:
 
 
 def write_sections(path: str | Path, title: str, sections: Sequence[Section]) -> None:
-    """Write a page in one move.
-
-    Args:
-        path: file.
-        title: shown at the top and in the browser's tab.
-        sections: below it.
-    """
+    """Write a page in one move."""
     folder = FileSystemLoader(Path(__file__).parent)
     environment = Environment(
         loader=folder,
@@ -154,9 +148,6 @@ def write_sections(path: str | Path, title: str, sections: Sequence[Section]) ->
 
 def plain(value: Any) -> str:
     """Return a value as people read it: four digits, thousands apart.
-
-    Args:
-        value: numbers, texts, and lists of them.
 
     Example:
         >>> plain([1, 2.5, True]), plain(1234567.8)
@@ -176,13 +167,7 @@ def plain(value: Any) -> str:
 
 
 def picture(path: Path, caption: str = "", *, embed: bool) -> Picture:
-    """Return a picture, with a link to the video of the same name if there is one.
-
-    Args:
-        path: PNG or GIF.
-        caption: below it.
-        embed: put the file into the page; otherwise it must lie beside the page.
-    """
+    """Return a picture, with a link to the video of the same name if there is one."""
     ending = path.suffix.lower()
     video = path.with_suffix(".mp4")
     return Picture(
@@ -195,12 +180,7 @@ def picture(path: Path, caption: str = "", *, embed: bool) -> Picture:
 
 
 def drawing(svg: str, name: str) -> Picture:
-    """Return an SVG drawing, embedded as a picture: it can run nothing and styles nothing else.
-
-    Args:
-        svg: the document.
-        name: what it shows.
-    """
+    """Return an SVG drawing, embedded as a picture: it can run nothing and styles nothing else."""
     return Picture(_embedded(svg.encode(), "image/svg+xml"), name)
 
 

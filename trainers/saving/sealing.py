@@ -46,15 +46,7 @@ def seal(path: Path) -> None:
 
 
 def read_manifest(path: str | Path) -> dict[str, Any]:
-    """Return the manifest of a checkpoint; what of it is read here has its right type.
-
-    Args:
-        path (path): of a checkpoint, a file or a folder.
-
-    Raises:
-        FileNotFoundError: if there is nothing.
-        CheckpointError: if it is damaged, of a newer version, or would unpack to too much.
-    """
+    """Return the manifest of a checkpoint; what of it is read here has its right type."""
     path = Path(path)
     try:
         if path.is_file():
@@ -129,15 +121,7 @@ def find_damage(path: str | Path) -> str | None:
 
 
 def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint of a run with other settings.
-
-    Args:
-        path (path): of a checkpoint.
-        settings (mapping): of this run. Names that only one of the two has are not compared.
-
-    Raises:
-        CheckpointError: naming each value that differs.
-    """
+    """Refuse a checkpoint of a run with other settings; names that one of them lacks are skipped."""
     other = read_manifest(path)["metadata"]["torchrl_hmcts"].get("settings", {})
     here = json.loads(json.dumps(dict(settings)))
     differing = [
@@ -153,11 +137,7 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
 
 
 def find_short_array(meta: Path) -> str | None:
-    """Return a sentence about a file that is shorter than its array, or ``None``.
-
-    Args:
-        meta (path): the file ``meta.json`` beside the files of the arrays.
-    """
+    """Return a sentence about a file that is shorter than its array, or ``None``."""
     for key, entry in json.loads(meta.read_text(encoding="utf-8")).items():
         if isinstance(entry, dict) and "dtype" in entry:
             dtype = getattr(torch, entry["dtype"].removeprefix("torch."))
