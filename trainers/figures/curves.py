@@ -29,7 +29,7 @@ Points = tuple[Sequence[float], Sequence[float]]
 def common_steps(curves: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves to common steps, as far as all of them go.
 
-    Returns the steps ``[G]`` of the curve that ends first, and values ``[S, G]`` interpolated there.
+    Returns the steps ``[G]`` of the curve that ends first, and values ``[S, G]`` at them.
 
     Example:
         >>> common_steps([([0, 10, 20], [0, 1, 2]), ([0, 20], [1, 3])])[1].mean(0).tolist()

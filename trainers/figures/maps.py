@@ -85,7 +85,7 @@ class WaterworldMap:
         return image
 
     def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
-        """Return an open room and a maze with states in their middle, for :func:`plot_skill_fan`."""
+        """Return an open room and a maze with states in their middle: :func:`plot_skill_fan`."""
         walls = self.env.mazes[maze]
         height, width = walls.shape
         center = torch.tensor([width / 2, height / 2])

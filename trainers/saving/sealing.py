@@ -121,7 +121,7 @@ def find_damage(path: str | Path) -> str | None:
 
 
 def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint of a run with other settings; names that one of them lacks are skipped."""
+    """Refuse a checkpoint of a run with other settings; names that one lacks are skipped."""
     other = read_manifest(path)["metadata"]["torchrl_hmcts"].get("settings", {})
     here = json.loads(json.dumps(dict(settings)))
     differing = [
