@@ -21,7 +21,7 @@ def steps_to_show(last: int, every: int) -> list[int]:
         [0, 2, 4, 5]
     """
     if every < 1:
-        raise ValueError(f"a GIF needs one base step or more for a picture; got {every}.")
+        raise ValueError(f"a GIF needs steps_per_frame >= 1; got {every}.")
     return [*range(0, last, every), last]
 
 

@@ -119,23 +119,14 @@ def panel(name: str, groups: Sequence[Sequence[Points]], x_label: str = "steps")
 
 @dataclass(frozen=True)
 class Panel:
-    """One panel of :func:`plot_training`.
+    """One panel of :func:`plot_training`."""
 
-    Args:
-        entry: of the curves.
-        title: above it.
-        share: whether the y axis goes from 0 to 100 %.
-        log: whether it is logarithmic.
-        dotted: further entry, and its name in the legend, drawn dotted in the colour of the first.
-        level: a value that is drawn as a dashed line, and its name.
-    """
-
-    entry: str
+    entry: str  # of the curves
     title: str
-    share: bool = False
-    log: bool = False
-    dotted: tuple[str, str] | None = None
-    level: tuple[float, str] | None = None
+    share: bool = False  # whether the y axis goes from 0 to 100 %
+    log: bool = False  # whether it is logarithmic
+    dotted: tuple[str, str] | None = None  # a further entry, and its name in the legend
+    level: tuple[float, str] | None = None  # of a dashed line, and its name
 
 
 def plot_training(

@@ -59,6 +59,9 @@ class MapDrawing(Protocol):
     def picture(self, state: TensorDictBase, paths: Sequence[Path2D]) -> np.ndarray:
         """Return a picture of a state, uint8 ``[h, w, 3]``, with paths in the units of the axes."""
 
+    def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
+        """Return, for each panel of :func:`plot_skill_fan`, a drawing and ``num`` equal states."""
+
 
 @dataclass
 class WaterworldMap:
@@ -85,7 +88,7 @@ class WaterworldMap:
         return image
 
     def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
-        """Return an open room and a maze with states in their middle: :func:`plot_skill_fan`."""
+        """Return an open room and a maze, with states in their middle."""
         walls = self.env.mazes[maze]
         height, width = walls.shape
         center = torch.tensor([width / 2, height / 2])
@@ -137,7 +140,7 @@ class LabMap:
     def rooms(
         self, num: int, maze: int = 0, seed: int = 0
     ) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
-        """Return an open room and a maze with states in their middle, for :func:`plot_skill_fan`.
+        """Return an open room and a maze, with states in their middle.
 
         Each state has a heading of its own: a skill is a direction on the map, whichever way the
         player faces.
@@ -208,6 +211,10 @@ class FeatureMap:
         axes.plot(*self.points(state).tolist(), "o", color="black")
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
+        """Return states at the beginning of an episode, for :func:`plot_skill_fan`."""
+        return {"from a start": (self, self.env.reset().expand(num).clone())}
 
 
 @torch.no_grad()
@@ -286,7 +293,7 @@ def write_episode_gif(
     plan: Plan,
     path: str | Path,
     *,
-    steps_per_picture: int = 2,
+    steps_per_frame: int = 2,
 ) -> None:
     """Write an episode as a GIF: the plan pale, the way so far in the colours of its options.
 
@@ -296,7 +303,7 @@ def write_episode_gif(
         options: executed in each base step, ``[T]``.
         plan: without batch dimensions.
         path: file to write.
-        steps_per_picture: base steps from one picture to the next.
+        steps_per_frame: base steps from one picture to the next.
     """
     length = int(plan.lengths)
     colors = _colors(plan.options[:length].tolist())
@@ -305,10 +312,10 @@ def write_episode_gif(
     trail = torch.stack([drawing.points(state) for state in states]).numpy()
     taken = _colors(options)
     pictures = []
-    for step in steps_to_show(len(states) - 1, steps_per_picture):
+    for step in steps_to_show(len(states) - 1, steps_per_frame):
         walked = [(trail[: step + 1], taken[:step])] if step else []
         pictures.append(drawing.picture(states[step], [*paths, *walked]))
-    write_gif(pictures, path, milliseconds=drawing.milliseconds * steps_per_picture)
+    write_gif(pictures, path, milliseconds=drawing.milliseconds * steps_per_frame)
 
 
 def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 1, 2, 3)) -> None:
