@@ -116,23 +116,6 @@ def demo(folder: Path) -> Kind:
     return newest_checkpoint(folder / "checkpoints"), load
 
 
-def labmaze(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-    from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-    from torchrl_hmcts.trainers.experiments.lab.training import train_worker
-
-    config = LabMazeConfig(
-        algorithm="diayn", train_frames=256, expansions=2, curve_mazes=1, curve_points=1
-    )
-    loss = train_worker(config, save_dir=folder / "checkpoints").loss
-
-    def load() -> Any:
-        load_networks(loss, folder)
-        return loss.state_dict()
-
-    return newest_checkpoint(folder / "checkpoints"), load
-
-
 def _atari_run(folder: Path) -> Any:
     from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
     from torchrl_hmcts.trainers.experiments.atari.run import AtariRun
@@ -237,7 +220,7 @@ def sweep_journal(folder: Path) -> Kind:
 
 
 KINDS = [
-    diayn, hmcts, a3c, expert_iteration, demo, labmaze, checkpoint_of_older_versions, atari_run,
+    diayn, hmcts, a3c, expert_iteration, demo, checkpoint_of_older_versions, atari_run,
     atari_run_of_older_versions, atari_trials, run_record, sweep_journal,
 ]  # fmt: skip
 
@@ -279,13 +262,7 @@ def damage(kind: Callable[[Path], Kind], folder: Path, count: int, seed: int = 0
     return counts
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param(kind, id=kind.__name__, marks=[pytest.mark.slow] if kind is labmaze else [])
-        for kind in KINDS
-    ],
-)
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_a_damaged_file_is_refused_or_read_as_it_was_saved(
     kind: Callable[[Path], Kind], tmp_path
 ) -> None:

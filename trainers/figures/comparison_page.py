@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from torchrl_hmcts.trainers.figures.pages import (
 from torchrl_hmcts.trainers.figures.pictures import COLORS, refuse_foreign
 from torchrl_hmcts.trainers.figures.run_page import config_tables, damage_of, say_damage
 from torchrl_hmcts.trainers.saving.files import left_out
-from torchrl_hmcts.trainers.saving.run_folder import RunFolder, is_run
+from torchrl_hmcts.trainers.saving.run_folder import RunFolder, flat, is_run
 
 _NOT_COMPARED = ("seed", "out", "resume", "logger")  # keys in which runs of a group may differ
 _SEEDS_FOR_IQM = 4
@@ -41,7 +41,7 @@ class RunGroup:
         """Return the numbers of the finished runs, by name."""
         values: dict[str, list[float]] = {}
         for run in self.runs:
-            for name, value in _flat(run.metrics):
+            for name, value in flat(run.metrics):
                 number = isinstance(value, int | float) and not isinstance(value, bool)
                 if not number or name == "seed" or not math.isfinite(value):
                     continue
@@ -118,15 +118,6 @@ def _sections(groups: Sequence[RunGroup]) -> list[Section]:
             "Runs", words=[words for run in runs for words in damage_of(run)], tables=[_runs(runs)]
         ),
     ]
-
-
-def _flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Nested figures as one list, names joined by dots."""
-    rows: list[tuple[str, Any]] = []
-    for name, value in metrics.items():
-        inside = isinstance(value, Mapping)
-        rows += _flat(value, f"{prefix}{name}.") if inside else [(prefix + name, value)]
-    return rows
 
 
 def _compared(run: RunFolder) -> dict[str, Any]:

@@ -27,7 +27,10 @@ from torchrl.checkpoint import (
     CheckpointRotation,
     StateDictCheckpointAdapter,
 )
-from torchrl.checkpoint._checkpoint import _encode_state_dict_value  # its format, our writing
+from torchrl.checkpoint._checkpoint import (  # its format, our reading and writing
+    _decode_state_dict_value,
+    _encode_state_dict_value,
+)
 
 from torchrl_hmcts import __version__
 from torchrl_hmcts.trainers.saving.files import remove, remove_leftovers, replacing
@@ -36,7 +39,7 @@ from torchrl_hmcts.trainers.saving.sealing import (
     NewerCheckpointError,
     check_settings,
     find_damage,
-    find_short_array,
+    read_arrays,
     read_manifest,
     seal,
 )
@@ -89,16 +92,17 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
         (path / self.schema_filename).write_text(text, encoding="utf-8")
         return state
 
-    def load(self, component: Any, path: Path, **options: Any) -> Any:
+    def load(self, component: Any, path: Path, *, map_location: Any, **options: Any) -> Any:
         for file in path.rglob("*"):
             if file.is_symlink() or (file.is_file() and file.suffix not in (".json", ".memmap")):
                 raise CheckpointError(
                     f"the checkpoint holds {file.name!r}, and only JSON and plain arrays are "
                     "read: other files could execute code. It was not written by this package."
                 )
-        if damage := find_short_array(path / self.state_directory / "meta.json"):
-            raise CheckpointError(damage)
-        return super().load(component, path, **options)
+        schema = json.loads((path / self.schema_filename).read_text(encoding="utf-8"))
+        arrays = read_arrays(path / self.state_directory)
+        state = _decode_state_dict_value(schema, arrays, map_location)
+        component.load_state_dict(state, *options["args"], **options["kwargs"])
 
 
 class _PlainCheckpoint(Checkpoint):

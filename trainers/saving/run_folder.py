@@ -246,6 +246,20 @@ def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
     return file
 
 
+def flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return nested figures as one list, names joined by dots.
+
+    Example:
+        >>> flat({"seed": 1, "test": {"solved": 3}})
+        [('seed', 1), ('test.solved', 3)]
+    """
+    rows: list[tuple[str, Any]] = []
+    for name, value in metrics.items():
+        inside = isinstance(value, Mapping)
+        rows += flat(value, f"{prefix}{name}.") if inside else [(prefix + name, value)]
+    return rows
+
+
 def versions() -> dict[str, str]:
     """Return the versions that a run's figures depend on, by package.
 

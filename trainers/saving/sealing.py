@@ -136,15 +136,30 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
         )
 
 
-def find_short_array(meta: Path) -> str | None:
-    """Return a sentence about a file that is shorter than its array, or ``None``."""
-    for key, entry in json.loads(meta.read_text(encoding="utf-8")).items():
+def read_arrays(folder: Path) -> dict[str, torch.Tensor]:
+    """Read the arrays of a component, as TorchRL writes them, with ordinary reads.
+
+    TorchRL's own reader picks a class by a name in ``meta.json`` and may unpickle other files.
+    """
+    arrays = {}
+    for key, (dtype, shape, file, size) in _array_files(folder).items():
+        data = bytearray(file.read_bytes()[:size]) if size else bytearray()
+        if len(data) < size:
+            raise CheckpointError(f"{file.name} is cut off: {len(data)} bytes of {size}")
+        flat = torch.frombuffer(data, dtype=dtype) if size else torch.empty(0, dtype=dtype)
+        arrays[key] = flat.reshape(shape)
+    return arrays
+
+
+def _array_files(folder: Path) -> dict[str, tuple[torch.dtype, list[int], Path, int]]:
+    """Type, shape, file and bytes of each array."""
+    found = {}
+    for key, entry in json.loads((folder / "meta.json").read_text(encoding="utf-8")).items():
         if isinstance(entry, dict) and "dtype" in entry:
             dtype = getattr(torch, entry["dtype"].removeprefix("torch."))
-            array = meta.with_name(f"{Path(key).name}.memmap")
-            if array.stat().st_size < math.prod(entry["shape"]) * dtype.itemsize:
-                return f"{array.name} of {meta.parent.parent.name} is cut off"
-    return None
+            size = math.prod(entry["shape"]) * dtype.itemsize
+            found[key] = (dtype, entry["shape"], folder / f"{Path(key).name}.memmap", size)
+    return found
 
 
 def _digest(file: Any, end: int) -> bytes:
@@ -207,6 +222,8 @@ def _folder_damage(folder: Path, manifest: Mapping[str, Any]) -> str | None:
         file = folder / name
         if file.is_symlink() or not file.is_file():
             return f"{name} is {'a link' if file.is_symlink() else 'missing'}"
-        if file.name == "meta.json" and (damage := find_short_array(file)):
-            return damage
+        if file.name == "meta.json":
+            for _, _, array, size in _array_files(file.parent).values():
+                if array.stat().st_size < size:
+                    return f"{array.name} of {file.parent.parent.name} is cut off"
     return None
