@@ -227,7 +227,6 @@ GOOD: dict[str, Good] = {
             "num_options": 4,
             "max_steps": 5,
         },
-        DIAYNReward={"discriminator": lambda: discriminator(), "num_skills": 4},
         SkillReward={"objective": lambda: objective()},
         SkillMaskTransform={"prior": lambda: modules.GrowingSkillPrior(4)},
         SkillTransform={"num_skills": 4},
@@ -314,19 +313,13 @@ EXCLUDED = {  # why public names are not fuzzed here
 }
 
 NAN, NO_ROWS = float("nan"), torch.zeros(0)
+ROWS = TensorDict(a=torch.zeros(2), batch_size=[2])
 NASTY: list[Any] = [
     *(None, True, -1, 0, 1, 2, 2**62, -(2**62), 0.0, -0.5, 1.5, 1e300),
     *(NAN, float("inf"), float("-inf"), np.float64("nan"), np.int64(-3), complex(1, 1)),
     *("", "x", "no such thing", b"bytes", (), [], {}, set()),
     *((-1,), (0,), (2.5,), ("a", "b"), [None], {"a": 1}, object(), object, len),
-    *(
-        NO_ROWS,
-        torch.tensor(NAN),
-        torch.ones(2, 2),
-        np.zeros(3),
-        TensorDict(a=torch.zeros(2), batch_size=[2]),
-        OneHot(2),
-    ),
+    *(NO_ROWS, torch.tensor(NAN), torch.ones(2, 2), np.zeros(3), ROWS, OneHot(2)),
 ]
 
 

@@ -76,18 +76,13 @@ class OptionModelEnv(ModelBasedEnvBase):
         >>> import torch
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.envs import TransformedEnv
-        >>> from torchrl_hmcts.modules import OptionModel, OptionModelEnv, SkillMLP
+        >>> from torchrl_hmcts.modules import OptionModel, OptionModelEnv
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> from torchrl_hmcts.transforms import OptionTransform
         >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         >>> real = TransformedEnv(ChainEnv(length=6), OptionTransform(worker, 2, max_steps=2))
-        >>> class Net(torch.nn.Module):
-        ...     def __init__(self, out_features):
-        ...         super().__init__()
-        ...         self.table = torch.nn.Embedding(2, out_features)
-        ...     def forward(self, option):
-        ...         return self.table(option)
-        >>> model = OptionModel(Net, ["option"], {"state": ()}, max_duration=2)
+        >>> table = lambda out_features: torch.nn.Embedding(2, out_features)
+        >>> model = OptionModel(table, ["option"], {"state": ()}, max_duration=2)
         >>> env = OptionModelEnv(model, real)
         >>> env.rollout(3, break_when_any_done=False)["next", "state"].shape
         torch.Size([3])

@@ -30,8 +30,8 @@ class OptionModelLoss(Loss):
         + c_R\, \ell_R(f^j_R, y_R) + c_k\, \ell_k(f^j_k, y_k)
         + c_p\, \mathrm{BCE}(f^j_p, y_p) \big]
 
-    with :math:`\ell_s` and :math:`\ell_k` Huber's: the outcome at a corner is one of two, of which it
-    favours the likelier while the square prefers a place between them. :math:`\ell_R` is the
+    with :math:`\ell_s` and :math:`\ell_k` Huber's: the outcome at a corner is one of two, of which
+    it favours the likelier while the square prefers a place between them. :math:`\ell_R` is the
     square: a sparse reward is to be met in the mean.
 
     Members differ by their first weights and, if the data hold ``bootstrap_mask``, by which
