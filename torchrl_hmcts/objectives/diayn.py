@@ -64,8 +64,6 @@ class DIAYNLoss(DiscreteSkillSACLoss):
     class _AcceptedKeys(DiscreteSkillSACLoss._AcceptedKeys):
         skill_logits: NestedKey = "skill_logits"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     objective: SkillDiscriminatorLoss
 
     def __init__(

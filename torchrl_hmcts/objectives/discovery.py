@@ -56,8 +56,6 @@ class SkillDiscriminatorLoss(SkillObjective):
     class _AcceptedKeys(SkillObjective._AcceptedKeys):
         skill_logits: NestedKey = "skill_logits"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = ["loss_discriminator", "discriminator_accuracy"]
     root_features = ()
 
@@ -103,9 +101,6 @@ class EncoderObjective(SkillObjective):
     @dataclass
     class _AcceptedKeys(SkillObjective._AcceptedKeys):
         representation: NestedKey = "representation"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
 
     encoder: TensorDictModuleBase
     encoder_params: TensorDictParams
@@ -336,8 +331,6 @@ class SkillDynamicsLoss(SkillObjective):
         skill_loc: NestedKey = "skill_loc"
         skill_scale: NestedKey = "skill_scale"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = ["loss_dynamics", "dynamics_accuracy"]
 
     dynamics: TensorDictModuleBase

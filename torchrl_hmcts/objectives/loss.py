@@ -21,6 +21,13 @@ _Base: Any = LossModule if TYPE_CHECKING else object
 class Reduction(_Base):
     """Weighs and reduces losses; for TorchRL's own losses as well as for :class:`Loss`."""
 
+    tensor_keys: Any  # of the class's own _AcceptedKeys
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if hasattr(cls, "_AcceptedKeys"):
+            cls.default_keys = cls._AcceptedKeys  # what set_keys(key=None) returns to
+
     def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
         # TorchRL's lookup refuses a nested key.
         if self.use_prioritized_weights not in (True, "auto"):
@@ -50,8 +57,6 @@ class Loss(Reduction, LossModule):
     class _AcceptedKeys:
         priority_weight: NestedKey = "priority_weight"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     _in_keys: Any = None  # list of keys, or None until it is known
 
     def __init__(self, reduction: str = "mean") -> None:

@@ -35,9 +35,6 @@ class _OptionLoss(Loss):
         action_value: NestedKey = "action_value"
         terminated: NestedKey = "terminated"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     def _features(self, *modules: Any) -> list[NestedKey]:
         """Returns what modules read besides the option."""
         keys = [unravel_key(key) for module in modules for key in getattr(module, "in_keys", ())]
@@ -234,8 +231,6 @@ class IntraOptionQLoss(_OptionLoss):
         reward: NestedKey = "reward"
         duration: NestedKey = "duration"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = ["loss_qvalue", "td_error"]
 
     qvalue_network: TensorDictModuleBase

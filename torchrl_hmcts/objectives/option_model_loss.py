@@ -79,8 +79,6 @@ class OptionModelLoss(Loss):
         terminated: NestedKey = "terminated"
         bootstrap_mask: NestedKey = "bootstrap_mask"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = [
         *("loss_delta", "loss_reward", "loss_duration", "loss_terminated"),
         *("delta_error", "terminated_accuracy"),

@@ -88,8 +88,6 @@ class ExpertIterationLoss(Loss):
         value_weight: NestedKey = "value_weight"
         action_mask: NestedKey = "action_mask"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = [
         *("loss_policy", "loss_value"),
         *("policy_accuracy", "policy_divergence", "value_error"),

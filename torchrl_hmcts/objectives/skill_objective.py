@@ -84,9 +84,6 @@ class SkillObjective(Loss):
         skill: NestedKey = "skill"
         terminated: NestedKey = "terminated"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     #: Names of the entries that :meth:`losses` returns, in order.
     out_keys: list[str]
     #: Entries that are read of the state before a transition.

@@ -89,8 +89,6 @@ class SkillPriorLoss(Loss):
         skill: NestedKey = "skill"
         reward: NestedKey = "reward"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = ["loss_skill_prior", "skill_prior_entropy", "num_effective_skills"]
 
     mean_reward: Tensor  # [Z] running mean of the reward, without -log p(z)

@@ -276,8 +276,6 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
     class _AcceptedKeys(DiscreteSACLoss._AcceptedKeys):
         skill: NestedKey = "skill"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     # The parent has a list, with which select_out_keys fails in every class derived from it.
     out_keys = TensorDictModuleBase.out_keys
 
@@ -425,8 +423,6 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
     class _AcceptedKeys(SACLoss._AcceptedKeys):
         skill: NestedKey = "skill"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     _value_name = "state_action_value"
 
     def __init__(
