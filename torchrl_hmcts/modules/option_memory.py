@@ -21,8 +21,8 @@ from torchrl_hmcts.modules.skill_mlp import check_sizes, key_list
 class OptionMemory:
     r"""Replaces a prediction by what the same option did from nearly the same state.
 
-    With :math:`\phi` the entries ``keys`` side by side and :math:`(s_i, o_i)` the options carried
-    out in the same context, a prediction for :math:`(s, o)` gives way to outcome :math:`i` if
+    With :math:`\phi` the entries ``keys`` side by side and :math:`(s_i, o_i)` the options executed
+    in the same context, a prediction for :math:`(s, o)` gives way to outcome :math:`i` if
 
     .. math:: o_i = o, \qquad i = \arg\min_j \lVert \phi(s) - \phi(s_j) \rVert, \qquad
         \lVert \phi(s) - \phi(s_i) \rVert \le r

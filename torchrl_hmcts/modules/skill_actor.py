@@ -249,9 +249,8 @@ def _kind_of_action(spec: TensorSpec, action_key: NestedKey) -> _Choice | _Squas
 class SkillPolicy(TensorDictModuleBase):
     """Acts like a skill actor at a fraction of its cost, sharing its parameters.
 
-    No distribution objects, no spec checks, no gradients: it reads the features and the skill and
-    writes the action. That makes it the worker to run inside options and the collection policy of
-    the trainer, for discrete and for continuous actions.
+    No distribution objects, no spec checks, no gradients: the worker to run inside options and the
+    collection policy of the trainer.
 
     Args:
         actor (SkillActor): the actor whose parameters are used; later updates are seen.

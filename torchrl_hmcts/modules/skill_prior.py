@@ -24,9 +24,8 @@ class SkillPrior(nn.Module, ABC):
         num_skills (int): number of skills ``Z``, those that are switched off included.
 
     Reference:
-        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, section 3 (a fixed
-        p(z)); Gregor et al., "Variational Intrinsic Control", 2016, arXiv 1611.07507 (a learned
-        one).
+        Fixed: Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, section 3.
+        Learned: Gregor et al., "Variational Intrinsic Control", 2016, arXiv 1611.07507.
 
     Examples:
         >>> import torch

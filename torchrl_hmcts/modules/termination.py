@@ -189,7 +189,7 @@ class LearnedTermination:
         \text{or, deterministic,} \quad \text{ends} \iff \beta(s, o) \ge 1/2
 
     Deterministic is the choice for planning: a plan is executed as it was simulated. The network
-    is called in the mode it is in, without gradients, and never becomes part of an env.
+    is called as it is, without gradients, and never becomes part of an env.
 
     Args:
         network (TensorDictModuleBase): writes logits ``[*B, 1]``, e.g. a

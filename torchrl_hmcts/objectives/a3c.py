@@ -60,9 +60,9 @@ class NStepReturn(TD1Estimator):
 
     for steps that take :math:`k_t` base steps, and the advantage :math:`G_t - V(s_t)`, both without
     gradients.
-    TorchRL's ``TD1Estimator`` computes the same from the values of all next states; here it is
-    those where an episode is truncated or the segment ends. What else a ``TD1Estimator`` can do
-    (critics with a memory, ``differentiable``, ``average_rewards``, ``shifted``) is left to it.
+    TorchRL's ``TD1Estimator`` computes the same from the values of all next states. What else it
+    can do (critics with a memory, ``differentiable``, ``average_rewards``, ``shifted``) is left to
+    it.
 
     In an ``OnPolicyTrainer``, which shuffles steps before the loss sees them, it goes where GAE
     goes: ``A2CTrainer(..., gae=NStepReturn(gamma=0.99, value_network=critic))``.
@@ -149,9 +149,9 @@ class NStepReturn(TD1Estimator):
     @property
     def _usual(self) -> bool:
         """Whether nothing is asked for that only TorchRL's own estimator does."""
-        network = self.value_network
         asked = self.shifted, self.differentiable, self.average_rewards, self.skip_existing
-        memory = network is None or any("is_init" in _flat(key) for key in network.in_keys)
+        read = getattr(self.value_network, "in_keys", ["is_init"])
+        memory = any(key == "is_init" or "is_init" in tuple(key) for key in read)
         return not (any(asked) or memory)
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
@@ -281,7 +281,3 @@ class A3CLoss(A2CLoss):
         super()._forward_value_estimator_keys(**kwargs)
         if self._value_estimator is not None:
             self._value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)
-
-
-def _flat(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)

@@ -25,16 +25,13 @@ class SkillPriorLoss(Loss):
         \bar r(z) = \mathbb{E}\bigl[\log q(z \mid s') \,\big|\, z\bigr]
 
     With :math:`\beta = 1` that is minus the mutual information of skill and state, the objective of
-    variational intrinsic control. The gradient is exact: skills are few, so the sum over them is
-    written out, and :math:`\bar r(z)` is a running mean over the transitions of each skill. (It is
-    the expectation of the score-function gradient of that paper, without its variance, and
-    right as well for transitions whose skill an earlier p(z) drew.) The minimum is
+    variational intrinsic control. The gradient is exact: the sum over the few skills is written
+    out, and :math:`\bar r(z)` is a running mean over the transitions of each skill. The minimum is
+    :math:`p(z) \propto \exp(\bar r(z) / \beta)`.
 
-    .. math:: p(z) \propto \exp\bigl(\bar r(z) / \beta\bigr)
-
-    Why not always learn it: a skill that is drawn more often is trained more, becomes easier to
-    tell and is drawn more often still, until one or a few are left. The authors of DIAYN fix p(z)
-    for that reason. :math:`\beta > 1` pulls towards uniform; :math:`\beta \to \infty` is DIAYN.
+    A skill that is drawn more often is trained more, becomes easier to tell and is drawn more often
+    still, until one or a few are left; so the authors of DIAYN fix p(z). :math:`\beta > 1` pulls
+    towards uniform; :math:`\beta \to \infty` is DIAYN.
 
     Args:
         prior (SkillPrior): the prior to train, e.g. a
@@ -62,8 +59,7 @@ class SkillPriorLoss(Loss):
 
     Reference:
         Gregor, Rezende and Wierstra, "Variational Intrinsic Control", 2016, arXiv 1611.07507,
-        algorithm 1; Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070 (why p(z)
-        is fixed there).
+        algorithm 1. Why p(z) is fixed: Eysenbach et al., "Diversity is All You Need", 2018.
 
     Examples:
         >>> import torch
@@ -112,10 +108,10 @@ class SkillPriorLoss(Loss):
             )
         self.prior = prior
         self.num_skills = prior.num_skills
-        coeff = real_number("SkillPriorLoss", "entropy_coeff", entropy_coeff, least=0.0)
-        self.entropy_coeff = coeff
+        owner = "SkillPriorLoss"
+        self.entropy_coeff = real_number(owner, "entropy_coeff", entropy_coeff, least=0.0)
         self.prior_in_reward = bool(prior_in_reward)
-        self.decay = real_number("SkillPriorLoss", "decay", decay, least=0.0, most=1.0)
+        self.decay = real_number(owner, "decay", decay, least=0.0, most=1.0)
         self.register_buffer("mean_reward", torch.zeros(self.num_skills))
         self.register_buffer("seen", torch.zeros(self.num_skills, dtype=torch.bool))
 

@@ -18,7 +18,7 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import DiscreteSACLoss, SACLoss
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
-from torchrl_hmcts.checks import instance, real_number
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.modules.skill_actor import SkillActor
 from torchrl_hmcts.objectives.loss import (
     DISTANCES,
@@ -69,6 +69,7 @@ class _TrainsObjective(Reduction):
             )
         real_number(owner, "gamma", gamma, least=0.0, most=1.0)
         real_number(owner, "alpha_init", alpha_init, above=0.0)  # its logarithm is kept
+        whole_number(owner, "num_qvalue_nets", num_qvalue_nets, least=1)
         one_of(owner, "loss_function", loss_function, DISTANCES)
         bounds = {"min_alpha": min_alpha, "max_alpha": max_alpha, "target_entropy": target_entropy}
         for name, value in bounds.items():
@@ -294,19 +295,24 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
         policy_prior: TensorDictModuleBase | None = None,
         **sac: Any,
     ) -> None:
-        real_number(type(self).__name__, "target_entropy_weight", target_entropy_weight, least=0.0)
+        owner = type(self).__name__
+        real_number(owner, "target_entropy_weight", target_entropy_weight, least=0.0)
+        if num_actions is None:
+            num_actions = getattr(actor_network, "num_actions", None)
+        else:
+            whole_number(owner, "num_actions", num_actions, least=1)
         super().__init__(
             actor_network,
             qvalue_network,
             objective,
             action_space=action_space,
-            num_actions=num_actions or getattr(actor_network, "num_actions", None),
+            num_actions=num_actions,
             target_entropy_weight=target_entropy_weight,
             **sac,
         )
         if policy_prior is not None and "logits" not in policy_prior.out_keys:
             raise ValueError(
-                f"{type(self).__name__} reads the entry 'logits' of its policy_prior, which "
+                f"{owner} reads the entry 'logits' of its policy_prior, which "
                 f"{type(policy_prior).__name__} does not write. Use e.g. TensorDictModule(network, "
                 f"['observation', 'skill'], ['logits'])."
             )
