@@ -6,7 +6,7 @@ What they share with all losses (keys, reductions, gradients, ...) is in test_co
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import SACTrainer
@@ -43,6 +43,7 @@ from torchrl_hmcts.objectives import (
     SkillSACLoss,
 )
 from torchrl_hmcts.testing import PointMassEnv
+from torchrl_hmcts.trainers import DIAYNTrainer
 from torchrl_hmcts.transforms import DisplacementTransform, SkillReward, SkillTransform
 
 LOSSES = {
@@ -471,41 +472,19 @@ def displacements(loss: DiscreteSkillSACLoss, per_skill: int = 64) -> torch.Tens
     return end["displacement"].view(4, per_skill, 2).mean(1)
 
 
-def train(loss: DiscreteSkillSACLoss, make: Callable[[int], EnvBase], batches: int) -> None:
-    """Trains a loss the plain way: 64 base steps, then two updates."""
-    env = make(32)
-    env.set_seed(0)
-    torch.manual_seed(0)
-    reward = SkillReward(loss.objective, intrinsic_coeff=2.0)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(20_000), transform=reward, batch_size=128)
-    policy, updater = SkillPolicy(loss.actor_network), SoftUpdate(loss, tau=0.05)
-    parts = (loss.actor_network_params, loss.qvalue_network_params, loss.objective)
-    optimizer = torch.optim.Adam(
-        [
-            {"params": list(part.parameters()), "lr": lr}
-            for part, lr in zip(parts, (2e-3, 3e-3, 1e-2), strict=True)
-        ],
-        fused=True,
-    )
-    td = env.reset()
-    for _ in range(batches):
-        for _ in range(2):
-            with torch.no_grad():
-                stepped, td = env.step_and_maybe_reset(policy(td))
-            buffer.extend(stepped.select(*loss.in_keys, strict=False))
-        for _ in range(2):
-            out = loss(buffer.sample())
-            optimizer.zero_grad()
-            sum(value for key, value in out.items() if key.startswith("loss")).backward()
-            optimizer.step()
-            updater.step()
-
-
 def test_metra_makes_skills_travel_apart_within_a_short_run() -> None:
     torch.manual_seed(0)
     loss = make_loss(METRAEncoderLoss(SkillEncoder(2, 4)))
     before = displacements(loss)
-    train(loss, make_env, batches=100)
+    DIAYNTrainer(
+        make_env(32),
+        loss,
+        total_frames=6_400,
+        updates_per_batch=2,
+        batch_size=128,
+        reward=SkillReward(loss.objective, intrinsic_coeff=2.0),
+        seed=0,
+    ).train()
     after = displacements(loss)
     spread = (after - after.mean(0)).norm(dim=-1).mean()
     assert spread > 3.0 * (before - before.mean(0)).norm(dim=-1).mean()

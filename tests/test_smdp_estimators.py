@@ -71,10 +71,10 @@ def critic():
     return ValueOperator(Table(1), in_keys=["state"])
 
 
-def smdp_targets(td, next_value, power=None):
+def smdp_targets(td, next_value):
     """R + gamma**k V(s'), [B, T, 1]; V of a terminal state is 0."""
-    power = td["next", "duration"] if power is None else power
-    return td["next", "reward"] + GAMMA**power * next_value * ~td["next", "terminated"]
+    discount = GAMMA ** td["next", "duration"]
+    return td["next", "reward"] + discount * next_value * ~td["next", "terminated"]
 
 
 def values(td, critic):
@@ -82,21 +82,16 @@ def values(td, critic):
     return table[td["state"]], table[td["next", "state"]]
 
 
-def advantages_by_loop(td, value, next_value):
+def advantages_by_loop(td, value, next_value, lmbda):
     """GAE of an SMDP, backwards over the macro-steps."""
     delta = smdp_targets(td, next_value) - value
     advantage, out = torch.zeros_like(value[:, 0]), []
     for t in reversed(range(td.shape[1])):
         goes_on = ~td["next", "done"][:, t]
-        carry = LMBDA * GAMMA ** td["next", "duration"][:, t] * goes_on
+        carry = lmbda * GAMMA ** td["next", "duration"][:, t] * goes_on
         advantage = delta[:, t] + carry * advantage
         out.insert(0, advantage)
     return torch.stack(out, 1)
-
-
-def use_durations(estimator):
-    estimator.set_keys(steps_to_next_obs=("next", "duration"))
-    return estimator
 
 
 class TestEstimators:
@@ -107,28 +102,22 @@ class TestEstimators:
         expected += GAMMA ** (k - 1) * rollout["next", "terminated"]
         torch.testing.assert_close(rollout["next", "reward"], expected)
 
-    def test_td0_is_the_reward_plus_the_value_discounted_by_the_duration(self, rollout, critic):
-        estimator = use_durations(TD0Estimator(gamma=GAMMA, value_network=critic))
+    @pytest.mark.parametrize("kind", ["TD(0)", "GAE", "GAE, vectorized"])
+    def test_advantages_are_discounted_by_the_duration(self, rollout, critic, kind):
+        settings = {"gamma": GAMMA, "value_network": critic}
+        if kind == "TD(0)":  # which is GAE with a lambda of 0
+            estimator, lmbda = TD0Estimator(**settings), 0.0
+        else:
+            estimator, lmbda = GAE(lmbda=LMBDA, vectorized="," in kind, **settings), LMBDA
         value, next_value = values(rollout, critic)
-        expected = smdp_targets(rollout, next_value)
-        out = estimator(rollout.clone())
-        torch.testing.assert_close(out["value_target"], expected)
-        torch.testing.assert_close(out["advantage"], expected - value)
-
-    @pytest.mark.parametrize("vectorized", [True, False])
-    def test_gae_discounts_by_the_duration(self, rollout, critic, vectorized):
-        estimator = use_durations(
-            GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=vectorized)
-        )
-        value, next_value = values(rollout, critic)
-        expected = advantages_by_loop(rollout, value, next_value)
-        out = estimator(rollout.clone())
+        expected = advantages_by_loop(rollout, value, next_value, lmbda)
+        out = durations(estimator)(rollout.clone())
         torch.testing.assert_close(out["advantage"], expected, atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(out["value_target"], expected + value, atol=1e-5, rtol=1e-4)
 
     def test_td_lambda_discounts_by_the_duration(self, rollout, critic):
         """The lambda return is the value plus the same sum of deltas."""
-        estimator = use_durations(
+        estimator = durations(
             TDLambdaEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=False)
         )
         value, next_value = values(rollout, critic)
@@ -154,11 +143,11 @@ class TestEstimators:
     )
     def test_without_the_key_every_macro_step_counts_as_one(self, rollout, critic, make):
         plain = make(critic)(rollout.clone())["advantage"]
-        smdp = use_durations(make(critic))(rollout.clone())["advantage"]
+        smdp = durations(make(critic))(rollout.clone())["advantage"]
         assert (plain - smdp).abs().max() > 0.1
         ones = rollout.clone()
         ones["next", "duration"].fill_(1)
-        torch.testing.assert_close(use_durations(make(critic))(ones)["advantage"], plain)
+        torch.testing.assert_close(durations(make(critic))(ones)["advantage"], plain)
 
 
 class TestAChainOfKnownValue:
