@@ -48,7 +48,6 @@ class SkillDiscriminator(SkillNetwork):
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillDiscriminator
         >>> discriminator = SkillDiscriminator(2, num_skills=4)
@@ -99,7 +98,6 @@ class SkillEncoder(SkillNetwork):
         2310.08887.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillEncoder
         >>> encoder = SkillEncoder(2, num_skills=4)
@@ -145,7 +143,6 @@ class SpectralLinear(nn.Linear):
         1802.05957.
 
     Examples:
-        >>> import torch
         >>> from torchrl_hmcts.modules import SpectralLinear
         >>> layer = SpectralLinear(3, 5)
         >>> bool(torch.linalg.matrix_norm(layer.normalized_weight(), 2) < 1.01)
@@ -210,7 +207,6 @@ class SkillDynamics(TensorDictModuleBase):
         (with a mixture of experts of fixed variance on normalised changes).
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillDynamics
         >>> dynamics = SkillDynamics(2, 2, num_skills=4)

@@ -47,8 +47,6 @@ class OptionMemory:
         Contributions to Control: The Third Way", 2007.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillMLP
         >>> model = OptionModel(lambda n: SkillMLP(1, n, num_skills=2), ["place", "option"],
         ...                     {"place": 1}, max_duration=9)

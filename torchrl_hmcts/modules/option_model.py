@@ -65,8 +65,6 @@ class OptionModel(TensorDictModuleBase):
         Probabilistic Dynamics Models", 2018, arXiv 1805.12114.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import OptionModel, SkillMLP
         >>> model = OptionModel(lambda n: SkillMLP(2, n, num_skills=4), ["position", "option"],
         ...                     {"position": 2}, max_duration=25, num_models=3)

@@ -73,7 +73,6 @@ class OptionModelEnv(ModelBasedEnvBase):
         Paying for it: Yu et al., "MOPO", 2020, arXiv 2005.13239.
 
     Examples:
-        >>> import torch
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.envs import TransformedEnv
         >>> from torchrl_hmcts.modules import OptionModel, OptionModelEnv

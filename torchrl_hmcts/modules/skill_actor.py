@@ -168,7 +168,6 @@ class SkillActor(ProbabilisticActor):
         Squashing: Haarnoja et al., "Soft Actor-Critic", 2018, arXiv 1801.01290, appendix C.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded, Categorical
         >>> from torchrl_hmcts.modules import SkillActor
@@ -272,7 +271,6 @@ class SkillPolicy(TensorDictModuleBase):
         This project's.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical
         >>> from torchrl_hmcts.modules import SkillActor, SkillPolicy

@@ -49,7 +49,6 @@ class SkillMLP(nn.Module):
         Rewards", 2023, chapter 4.
 
     Examples:
-        >>> import torch
         >>> from torchrl_hmcts.modules import SkillMLP
         >>> net = SkillMLP(in_features=3, out_features=2, num_skills=4)
         >>> net(torch.randn(5, 3), torch.tensor([0, 1, 2, 3, 0])).shape
@@ -326,7 +325,7 @@ def key_list(owner: str, keys: Sequence[NestedKey] | NestedKey) -> list[NestedKe
     listed = [keys] if isinstance(keys, str) else list(keys)
     if not listed:
         raise ValueError(
-            f"{owner} needs at least one in_key to read its features from; got none. "
+            f"{owner} needs at least one in_key to read its features from; got {keys!r}. "
             "Pass e.g. in_keys=['velocity']."
         )
     return [unravel_key(key) for key in listed]

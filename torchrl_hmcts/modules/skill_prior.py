@@ -28,7 +28,6 @@ class SkillPrior(nn.Module, ABC):
         Learned: Gregor et al., "Variational Intrinsic Control", 2016, arXiv 1611.07507.
 
     Examples:
-        >>> import torch
         >>> from torchrl_hmcts.modules import SkillPrior
         >>> class OnlyEvenSkills(SkillPrior):
         ...     def probs(self):

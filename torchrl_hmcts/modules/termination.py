@@ -47,7 +47,6 @@ class StallTermination:
         semi-MDPs", 1999.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import StallTermination
         >>> td = TensorDict(stalled_steps=torch.tensor([[1], [3], [3]]),
@@ -96,7 +95,6 @@ class AnyTermination:
         As :class:`StallTermination`.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import AnyTermination, StallTermination
         >>> late = lambda td: td["duration"] >= 9
@@ -146,7 +144,6 @@ class TerminationNetwork(SkillNetwork):
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import TerminationNetwork
         >>> network = TerminationNetwork(2, num_options=4, in_keys=["velocity"])
@@ -212,7 +209,6 @@ class LearnedTermination:
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import LearnedTermination, TerminationNetwork
         >>> network = TerminationNetwork(2, num_options=4, in_keys=["velocity"])

@@ -204,7 +204,6 @@ class A3CLoss(A2CLoss):
         Bartley, dissertation, 2023, Algorithm 2.
 
     Examples:
-        >>> import torch
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.modules import ProbabilisticActor, ValueOperator
         >>> from torchrl_hmcts.objectives import A3CLoss

@@ -214,7 +214,6 @@ class IntraOptionQLoss(_OptionLoss):
         Precup, "The option-critic architecture", 2017, arXiv 1609.05140, algorithm 1.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.objectives import IntraOptionQLoss

@@ -66,7 +66,6 @@ class ExpertIterationLoss(Loss):
         arXiv 1705.08439; Silver et al., "Mastering the game of Go without human knowledge", 2017.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.objectives import ExpertIterationLoss

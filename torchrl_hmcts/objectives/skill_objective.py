@@ -59,7 +59,6 @@ class SkillObjective(Loss):
         This project's: the common form of DIAYN, DADS, METRA and LSD.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.objectives import SkillObjective
         >>> class GoWhereTheSkillSays(SkillObjective):

@@ -62,8 +62,6 @@ class SkillPriorLoss(Loss):
         algorithm 1. Why p(z) is fixed: Eysenbach et al., "Diversity is All You Need", 2018.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import LearnedSkillPrior
         >>> from torchrl_hmcts.objectives import SkillPriorLoss
         >>> prior = LearnedSkillPrior(2)
