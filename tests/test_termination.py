@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Compose, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SoftUpdate
 
@@ -98,12 +98,6 @@ class TestStallTransform:
         td = TensorDict(state=torch.tensor([0, 2]), batch_size=[2])
         assert walk(env, [[LEFT, LEFT]] * 2, td) == [[1, 0], [2, 0]]
 
-    def test_nested_keys(self):
-        stall = StallTransform(("agent", "place"), 0.5, ("agent", "count"))
-        before = TensorDict(agent=TensorDict(place=torch.zeros(1, 2)), batch_size=[1])
-        after = stall._step(before, before.clone())
-        assert after["agent", "count"].tolist() == [[1]]
-
     @pytest.mark.parametrize(
         "make",
         [
@@ -118,16 +112,6 @@ class TestStallTransform:
     )
     def test_specs_are_right(self, make):
         check_env_specs(make())
-
-    @pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
-    def test_inside_batched_envs_it_counts_as_outside(self, batched):
-        inside = batched(2, stall_chain)
-        try:
-            policy = TensorDictModule(lambda s: torch.zeros_like(s), ["state"], ["action"])
-            counts = inside.rollout(4, policy)["next", "stalled_steps"].squeeze(-1)
-        finally:
-            inside.close()
-        assert counts.tolist() == [[1, 2, 3, 4]] * 2
 
     def test_an_observation_that_is_no_state_becomes_one_for_planners(self):
         env = TransformedEnv(GymEnv("CartPole-v1"), StallTransform("observation"))

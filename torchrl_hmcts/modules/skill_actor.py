@@ -214,18 +214,12 @@ class SkillActor(ProbabilisticActor):
             self.num_actions = kind.num_actions
         self.skill_key = unravel_key(skill_key)
         self.action_key = action_key
-        self._kind = kind
+        self.choose = kind.choose  # actions for the network's outputs: the best ones, or samples
 
     @property
     def network(self) -> nn.Module:
         """The network that computes the logits or the raw parameters of the Gaussian."""
         return self.module[0].network
-
-    def choose(
-        self, outputs: Tensor, deterministic: bool, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """Returns actions for the network's outputs: the best ones, or samples."""
-        return self._kind.choose(outputs, deterministic, generator)
 
 
 def _kind_of_action(spec: TensorSpec, action_key: NestedKey) -> _Choice | _Squashed:
@@ -234,7 +228,8 @@ def _kind_of_action(spec: TensorSpec, action_key: NestedKey) -> _Choice | _Squas
         spec = spec[action_key]
     if type(spec) in (Categorical, OneHot):  # and not of several choices, which are subclasses
         return _Choice(spec)
-    if isinstance(spec, Bounded) and spec.dtype.is_floating_point and spec.shape:
+    has_size = isinstance(spec, Bounded) and spec.shape and spec.shape.numel()
+    if has_size and spec.dtype.is_floating_point:
         return _Squashed(spec)
     raise ValueError(
         "SkillActor chooses among a fixed number of actions or within bounds, so it needs a "
