@@ -259,9 +259,6 @@ class SkillPolicy(TensorDictModuleBase):
         From ``forward(tensordict)``: the same, with the action of each row: int64 ``[*B]``
         (one-hot: ``[*B, A]``; continuous: ``[*B, D]``).
 
-    Raises:
-        TypeError: if ``actor`` is no :class:`SkillActor`.
-
     Reference:
         This project's.
 

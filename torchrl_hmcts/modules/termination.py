@@ -23,7 +23,7 @@ Condition = Callable[[TensorDictBase], Tensor]
 
 
 class StallTermination:
-    r"""Ends an option in which nothing has changed for some base steps.
+    r"""Ends an option in which nothing has changed for some base steps; a call gives bool ``[*B]``.
 
     .. math:: \text{ends} \iff \min(n, k) \ge N
 
@@ -34,9 +34,6 @@ class StallTermination:
         num_steps (int): base steps :math:`N` in a row without a change, at least 1.
         stalled_key (NestedKey): the count, int64 ``[*B, 1]``. Default ``"stalled_steps"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
-
-    Returns:
-        From a call: bool ``[*B]``.
 
     Raises:
         ValueError: if ``num_steps`` is below 1; when an ``OptionTransform`` is attached to an env
@@ -75,7 +72,7 @@ class StallTermination:
 
 
 class AnyTermination:
-    r"""Ends an option as soon as one of several conditions does.
+    r"""Ends an option as soon as one of several conditions does; a call gives bool ``[*B]``.
 
     .. math:: \text{ends} \iff c_1 \lor c_2 \lor \dots
 
@@ -84,9 +81,6 @@ class AnyTermination:
 
     Args:
         *conditions: callables ``condition(td) -> bool [*B]`` or ``[*B, 1]``, at least one.
-
-    Returns:
-        From a call: bool ``[*B]``.
 
     Raises:
         TypeError: if there is no condition, or one cannot be called.
@@ -182,6 +176,8 @@ class TerminationNetwork(SkillNetwork):
 class LearnedTermination:
     r"""Ends an option with the probability a network says, or where it says at least one half.
 
+    A call gives bool ``[*B]``.
+
     .. math:: \text{ends} \sim \mathrm{Bernoulli}(\beta(s, o)), \qquad
         \text{or, deterministic,} \quad \text{ends} \iff \beta(s, o) \ge 1/2
 
@@ -198,9 +194,6 @@ class LearnedTermination:
             twice that many and so on; asking costs a call of the network. Default 1.
         termination_logits_key (NestedKey): Default ``"termination_logits"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
-
-    Returns:
-        From a call: bool ``[*B]``.
 
     Raises:
         ValueError: if ``every`` is below 1, or the network does not write the logits.
