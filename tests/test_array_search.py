@@ -15,9 +15,7 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     NodeStatistics,
     Root,
     Search,
@@ -110,7 +108,7 @@ def test_the_value_of_a_loop_is_its_geometric_series() -> None:
 
     root = Root(np.ones((1, 1), F32), np.zeros(1, F32), np.zeros(1, np.int64))
     for n in (1, 2, 5, 20):
-        search = tree_search(root, transition, n, backup=MaxBackup())
+        search = tree_search(root, transition, n, backup="max")
         assert search.tree.nodes["value"][0, 0] == pytest.approx(2 - 2 ** (1 - n), rel=1e-6)
         assert search.tree.nodes["depth"][0, n] == n
         assert search.tree.nodes["base_steps"][0, n] == n
@@ -176,7 +174,7 @@ POLICIES = [UCT(0.7), PUCT(1.0), PUCT.mctx(), PUCT(normalize="tree"), Gumbel(max
 
 
 @pytest.mark.parametrize("policy", POLICIES, ids=str)
-@pytest.mark.parametrize("backup", [MeanBackup(), MaxBackup()])
+@pytest.mark.parametrize("backup", ["mean", "max"])
 def test_the_tree_is_that_of_the_planner_on_the_same_mdp(policy: Any, backup: Any) -> None:
     table, states = Table(seed=1), [0, 3, 7]
     engine = tree_search(table.root(states), table, 60, tree_policy=policy, backup=backup, seed=5)

@@ -17,7 +17,6 @@ from torchrl_hmcts.planners import (
     UCT,
     Gumbel,
     HighestValue,
-    MaxBackup,
     MCTSPlanner,
     MostVisited,
     Root,
@@ -26,6 +25,7 @@ from torchrl_hmcts.planners import (
     Transition,
     tree_search,
 )
+from torchrl_hmcts.planners.root_options import gumbel_choice
 from torchrl_hmcts.testing import TableEnv
 
 NUM_SMDPS, NUM_STATES, NUM_OPTIONS, GAMMA = 20, 5, 3, 0.7
@@ -105,7 +105,7 @@ def test_the_mean_backup_of_uct_converges_as_simulations_grow(
 def test_the_max_backup_converges_under_every_tree_policy(
     smdps: SMDPs, policy: Any, exhausted: Any
 ) -> None:
-    search = smdps.search(5000, tree_policy=policy, backup=MaxBackup(), exhausted=exhausted)
+    search = smdps.search(5000, tree_policy=policy, backup="max", exhausted=exhausted)
     assert smdps.errors(search).max() < 0.05, smdps.errors(search)
 
 
@@ -125,7 +125,7 @@ def test_gumbel_chooses_the_optimal_option_with_few_simulations_and_a_poor_criti
 ) -> None:
     # The critic is the value of choosing at random; 48 simulations look three options ahead.
     search = smdps.search(48, tree_policy=Gumbel(scale=scale), critic=True)
-    regrets = smdps.regrets(search.gumbel_choice())
+    regrets = smdps.regrets(gumbel_choice(search))
     at_random = (smdps.q[smdps.starts].max(-1) - smdps.q[smdps.starts].mean(-1)).mean()
     assert regrets.mean() < 0.1 * at_random, regrets
     assert (regrets < 0.03).mean() >= 0.8, regrets
@@ -164,7 +164,7 @@ def test_max_backup_is_exact_once_nothing_is_left(
     planner = MCTSPlanner(
         env,
         gamma=GAMMA,
-        backup=MaxBackup(),
+        backup="max",
         leaves_per_wave=leaves_per_wave,
         waves_in_flight=waves_in_flight,
         final_choice=HighestValue(),

@@ -14,7 +14,6 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_hmcts.planners import (
     PUCT,
-    MaxBackup,
     MCTSPlanner,
     MixedEvaluator,
     ModulePrior,
@@ -527,7 +526,7 @@ def test_rollouts_show_the_value_of_a_plan_before_it_is_in_the_tree() -> None:
         planner = MCTSPlanner(
             env,
             gamma=0.9,
-            backup=MaxBackup(),
+            backup="max",
             leaf_evaluator=policy and RolloutEvaluator(policy),
             budget=SearchBudget(expansions=1),
         )

@@ -119,8 +119,6 @@ GOOD: dict[str, Good] = {
         PUCT={},
         UCT={},
         BestPlan={},
-        MaxBackup={},
-        MeanBackup={},
         MostVisited={},
         DirichletNoise={},
         Gumbel={},
@@ -153,8 +151,6 @@ GOOD: dict[str, Good] = {
         Search={
             "num_roots": 2,
             "num_options": 3,
-            "tree_policy": lambda: planners.UCT(),
-            "backup": lambda: planners.MaxBackup(),
         },
     ),
     **everything(

@@ -23,7 +23,6 @@ from torchrl_hmcts.planners import (
     Gumbel,
     HierarchicalPolicy,
     HighestValue,
-    MaxBackup,
     MCTSPlanner,
     MostVisited,
     NodeStatistics,
@@ -260,7 +259,7 @@ def test_truncation_bootstraps_and_termination_does_not() -> None:
         planner = MCTSPlanner(
             env,
             gamma=0.5,
-            backup=MaxBackup(),
+            backup="max",
             leaf_evaluator=lambda td: torch.full((len(td), 1), 8.0),
             budget=FOREVER,
         )
@@ -351,7 +350,7 @@ def test_a_root_without_an_option_is_refused() -> None:
 @pytest.mark.parametrize("expand", ["one", "all"])
 def test_several_leaves_per_wave_find_the_same_exhausted_tree(expand: Any) -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    kwargs = {"expand": expand, "backup": MaxBackup(), "budget": FOREVER}
+    kwargs = {"expand": expand, "backup": "max", "budget": FOREVER}
     one = MCTSPlanner(env, **kwargs).search(env.reset()).tree
     many = MCTSPlanner(env, leaves_per_wave=5, **kwargs).search(env.reset()).tree
     for tree in (one, many):
@@ -1110,9 +1109,7 @@ def test_a_discretised_pendulum_with_a_time_limit_is_planned_in(categorical: boo
     discretizer = ActionDiscretizer(num_intervals=3, categorical=categorical)
     env = TransformedEnv(PendulumEnv(), Compose(discretizer, StepCounter(max_steps=4)))
     env.set_seed(0)
-    planner = MCTSPlanner(
-        env, backup=MaxBackup(), budget=SearchBudget(expansions=200, until_plan=False)
-    )
+    planner = MCTSPlanner(env, backup="max", budget=SearchBudget(expansions=200, until_plan=False))
     assert planner.num_options == 3
     search = planner.search(env.reset())
     # 1 + 3 + 9 + 27 states are expanded, the 81 of the fourth step are truncated.
@@ -1183,7 +1180,7 @@ def test_elements_that_a_rollout_no_longer_steps_are_not_planned_for() -> None:
 WITHOUT_NUMBA = """
 import sys
 import numpy as np
-from torchrl_hmcts.planners import PUCT, UCT, MaxBackup, MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.planners import PUCT, UCT, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 
 env = ChainEnv(6)
@@ -1191,7 +1188,7 @@ out = {}
 for i, policy in enumerate((UCT(), PUCT())):
     for j, expand in enumerate(("one", "all")):
         planner = MCTSPlanner(
-            env, tree_policy=policy, expand=expand, leaves_per_wave=2, backup=MaxBackup(),
+            env, tree_policy=policy, expand=expand, leaves_per_wave=2, backup="max",
             novelty=RadiusNovelty("state", 1.5), budget=SearchBudget(expansions=30),
         )
         tree = planner.search(env.reset()).tree

@@ -24,9 +24,7 @@ import torch
 from torchrl_hmcts.planners import (
     PUCT,
     UCT,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     Search,
     SearchBudget,
 )
@@ -165,7 +163,7 @@ UCT_ONE_MAX = [
 
 @pytest.mark.parametrize("simulations", range(1, 7))
 def test_uct_with_max_backup_grows_the_tree_worked_out_by_hand(simulations: int) -> None:
-    search = search_for(simulations, tree_policy=UCT(c=1.0), backup=MaxBackup(), expand="one")
+    search = search_for(simulations, tree_policy=UCT(c=1.0), backup="max", expand="one")
     check_nodes(search, *UCT_ONE_MAX[simulations - 1])
 
 
@@ -213,7 +211,7 @@ PUCT_ALL_MAX = [
 
 @pytest.mark.parametrize("waves", range(1, 5))
 def test_puct_with_max_backup_and_all_options_grows_the_tree_worked_out_by_hand(waves: int) -> None:
-    search = search_for(waves, tree_policy=PUCT(c=8.0), option_prior=prior, backup=MaxBackup())
+    search = search_for(waves, tree_policy=PUCT(c=8.0), option_prior=prior, backup="max")
     check_nodes(search, *PUCT_ALL_MAX[waves - 1])
 
 
@@ -241,7 +239,7 @@ def test_the_leaf_evaluator_counts_at_live_states_and_not_at_terminal_ones() -> 
 
 
 @pytest.mark.parametrize("expand", ["one", "all"])
-@pytest.mark.parametrize("backup", [MeanBackup(), MaxBackup()])
+@pytest.mark.parametrize("backup", ["mean", "max"])
 @pytest.mark.parametrize(("gamma", "best"), [(0.9, 1), (0.99, 0), (1.0, 0)])
 def test_the_planner_trades_the_length_of_an_option_for_its_reward(
     gamma: float, best: int, backup: Any, expand: Any
@@ -261,7 +259,7 @@ def test_the_planner_trades_the_length_of_an_option_for_its_reward(
     assert plan.returns.item() == pytest.approx(closed_form[best], rel=1e-6)
     assert plan.durations.item() == (9, 2)[best]
     assert planner(td)["action"].item() == best
-    if isinstance(backup, MaxBackup):
+    if backup == "max":
         assert td["root_value"].item() == pytest.approx(max(closed_form), rel=1e-6)
 
 
@@ -302,7 +300,7 @@ def test_max_backup_over_an_exhausted_tree_is_the_optimal_value(seed: int, expan
     planner = MCTSPlanner(
         env,
         gamma=gamma,
-        backup=MaxBackup(),
+        backup="max",
         expand=expand,
         budget=SearchBudget(expansions=10_000, until_plan=False),
     )
@@ -314,7 +312,7 @@ def test_max_backup_over_an_exhausted_tree_is_the_optimal_value(seed: int, expan
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize(("backup", "tolerance"), [(MaxBackup(), 0.05), (MeanBackup(), 0.15)])
+@pytest.mark.parametrize(("backup", "tolerance"), [("max", 0.05), ("mean", 0.15)])
 def test_the_value_of_the_root_approaches_value_iteration_where_episodes_never_end(
     seed: int, backup: Any, tolerance: float
 ) -> None:

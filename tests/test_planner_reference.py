@@ -23,9 +23,7 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     NodeStatistics,
     Search,
     SearchBudget,
@@ -330,8 +328,6 @@ class ReferenceSearch:
 
 # ---------------------------------------------------------------------- comparison
 
-BACKUPS = {"mean": MeanBackup, "max": MaxBackup}
-
 
 def tree_policy_of(config: dict[str, Any]) -> Any:
     c = config["c"]
@@ -359,7 +355,7 @@ def planner_for(smdp: SMDP, config: dict[str, Any], **budget: int) -> MCTSPlanne
         TableEnv(smdp.table, terminal=smdp.terminal, start=0),
         gamma=smdp.gamma,
         tree_policy=tree_policy_of(config),
-        backup=BACKUPS[config["backup"]](),
+        backup=config["backup"],
         expand=config["expand"],
         exhausted=config["exhausted"],
         leaf_evaluator=(lambda td: values[td["state"]]) if config["evaluate"] else None,

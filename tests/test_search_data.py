@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_hmcts.planners import (
-    MaxBackup,
     MCTSPlanner,
     SearchBudget,
     best_plans_below,
@@ -131,7 +130,7 @@ def test_a_search_without_a_plan_teaches_no_value_unless_asked() -> None:
     env = ChainEnv(length=9)
     budget = SearchBudget(expansions=2)
     search = MCTSPlanner(env, budget=budget, leaf_evaluator=lambda td: torch.full((len(td),), 0.5),
-                         backup=MaxBackup(), gamma=0.5).search(env.reset())  # fmt: skip
+                         backup="max", gamma=0.5).search(env.reset())  # fmt: skip
     silent = search_examples(search)
     assert silent["value_weight"].tolist() == [0.0]
     assert silent["policy_weight"].tolist() == [1.0]

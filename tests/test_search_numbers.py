@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -19,9 +20,7 @@ from torchrl_hmcts.planners import (
     DirichletNoise,
     Gumbel,
     HierarchicalPolicy,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     MostVisited,
     NodeStatistics,
     ProgressiveWidening,
@@ -117,7 +116,7 @@ def test_every_node_has_priors_that_sum_to_one(
         env, option_prior=None if weights is None else prior, expand=expand, budget=simulations(9)
     )
     search = planner.search(env.reset())
-    nodes = {0: 0, 1: 1, 2: search.outcomes_of(0, 0, 1)[0]}
+    nodes = {0: 0, 1: 1, 2: search.tree.outcomes(0, 0, 1)[0]}
     for state, node in nodes.items():
         assert search.tree.edges["prior"][0, node].tolist() == pytest.approx(expected[state])
     after = env.step(env.reset().set("action", torch.tensor(0)))["next"]
@@ -336,11 +335,11 @@ def test_outcomes_that_do_not_fit_a_wave_are_refused(
     field: str, wrong: np.ndarray, message: str
 ) -> None:
     from torchrl_hmcts.planners.search import Outcomes, RootStates
+    from torchrl_hmcts.planners.subtree import reroot
 
-    search = Search(1, 2, tree_policy=UCT(), backup=MeanBackup())
+    search = Search(1, 2)
     nothing, no_masks = np.zeros((0, 2), F32), np.zeros((0, 2), np.bool_)
-    search.start(RootStates(np.zeros(1, F32), np.zeros(1, np.bool_), nothing, no_masks))
-    search.begin()
+    search.plant(RootStates(np.zeros(1, F32), np.zeros(1, np.bool_), nothing, no_masks))
     wave = search.select()
     ones = np.ones(2, F32)
     good = Outcomes(
@@ -350,7 +349,7 @@ def test_outcomes_that_do_not_fit_a_wave_are_refused(
         search.insert(wave, good._replace(**{field: wrong}))
     assert search.insert(wave, good).tolist() == [1, 2]  # nothing was written before
     with pytest.raises(ValueError, match="has no node 3"):
-        search.reroot(0, 3)
+        reroot(search, 0, 3)
 
 
 def test_a_novelty_test_that_answers_in_indices_is_refused() -> None:
@@ -373,7 +372,7 @@ class Loop(TableEnv):
         super().__init__({(0, 0): (0, pay, duration), (0, 1): (0, pay, duration)})
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"backup": MaxBackup()}, {"chance": ProgressiveWidening()}])
+@pytest.mark.parametrize("kwargs", [{}, {"backup": "max"}, {"chance": ProgressiveWidening()}])
 @pytest.mark.parametrize("pay", [3e38, -3e38, 1e31])
 def test_a_reward_whose_sums_would_overflow_is_named(pay: float, kwargs: dict[str, Any]) -> None:
     env = Loop(pay)
@@ -496,8 +495,8 @@ def test_a_huge_number_of_expansions_improves_to_the_end(huge: int) -> None:
         (lambda n: MCTSPlanner(ChainEnv(4), waves_in_flight=n), "waves_in_flight"),
         (lambda n: Gumbel(max_considered=n), "max_considered"),
         (lambda n: tree_search(root_of(), walk, n), "num_simulations"),
-        (lambda n: Search(1, 2, tree_policy=UCT(), backup=MeanBackup(), capacity=n), "capacity"),
-        (lambda n: Search(1, n, tree_policy=UCT(), backup=MeanBackup()), "num_options"),
+        (lambda n: Search(1, 2, capacity=n), "capacity"),
+        (lambda n: Search(1, n), "num_options"),
     ],
 )
 def test_a_count_that_is_none_is_refused_by_name(
@@ -611,7 +610,7 @@ def test_a_kept_search_follows_the_tree_policy_of_its_planner(
     search = planner.plant(env.reset())
     planner.tree_policy = then
     planner.resume(search)
-    assert [search.settings[name][0] for name in names] == [getattr(then, name) for name in names]
+    assert [search.record[name][0] for name in names] == [getattr(then, name) for name in names]
     planted = MCTSPlanner(env, tree_policy=then, seed=0).search(env.reset())
     assert search.tree.edges.tobytes() == planted.tree.edges.tobytes()
 
@@ -620,7 +619,7 @@ def test_a_kept_search_follows_the_tree_policy_of_its_planner(
     ("name", "value"),
     [
         ("tree_policy", PUCT()),
-        ("backup", MaxBackup()),
+        ("backup", "max"),
         ("novelty", RadiusNovelty("state", 0.5)),
         ("transpositions", Transpositions("state")),
         ("chance", ProgressiveWidening()),
@@ -656,12 +655,35 @@ def test_a_kept_search_follows_the_waves_of_its_planner(tree_policy: Any) -> Non
     assert not search.tree.edges["in_flight"].any()
 
 
-def test_a_part_that_makes_no_search_is_refused_after_assignment_too() -> None:
+def test_a_planner_and_its_search_hold_the_same_settings_which_cannot_be_changed() -> None:
     env = ChainEnv(length=6)
     planner = MCTSPlanner(env, seed=0)
-    planner.tree_policy = Gumbel()
-    with pytest.raises(ValueError, match="Gumbel halves a known number"):
-        planner.plan(env.reset())
+    search = planner.plant(env.reset())
+    assert search.settings is planner.settings
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        planner.settings.tree_policy = UCT(c=5.0)  # type: ignore[misc]
+    planner.tree_policy = UCT(c=5.0)
+    assert planner.settings.tree_policy == planner.tree_policy == UCT(c=5.0)
+    assert planner.resume(search).settings is planner.settings
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("tree_policy", Gumbel(), "Gumbel halves a known number"),
+        ("leaves_per_wave", 0, "leaves_per_wave from 1 to 255; got 0"),
+        ("expand", "some", "expand is 'all' or 'one'; got 'some'"),
+        ("settings", UCT(), "SearchSettings for settings"),
+    ],
+)
+def test_a_part_that_makes_no_search_is_refused_where_it_is_assigned(
+    name: str, value: Any, error: str
+) -> None:
+    planner = MCTSPlanner(ChainEnv(length=6), seed=0)
+    before = planner.settings
+    with pytest.raises((ValueError, TypeError), match=error):
+        setattr(planner, name, value)
+    assert planner.settings is before
 
 
 def test_a_copy_of_a_search_is_resumed() -> None:

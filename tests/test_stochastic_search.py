@@ -15,7 +15,6 @@ from torchrl.envs import EnvBase, check_env_specs
 from torchrl_hmcts.planners import (
     PUCT,
     UCT,
-    MaxBackup,
     MCTSPlanner,
     MostVisited,
     NodeStatistics,
@@ -277,7 +276,7 @@ def bandit_with(**kwargs: Any) -> Search:
 def test_a_root_that_wants_no_more_outcomes_ends_without_a_limit_of_simulations(
     policy: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchrl_hmcts.planners.growth._MAX_FRUITLESS_REVISITS", 200)
+    monkeypatch.setattr("torchrl_hmcts.planners.search_loop._MAX_FRUITLESS_REVISITS", 200)
     # k = 1, alpha = 0: no second outcome is ever drawn, so 50 expansions are never reached.
     search = bandit_with(chance=ProgressiveWidening(k=1, alpha=0), tree_policy=policy, expand="one")
     assert search.num_expansions.tolist() == [2]
@@ -401,7 +400,7 @@ def test_the_value_of_the_root_approaches_value_iteration(backup: str) -> None:
         table = random_table(seed)
         best = optimal_value(table, [4], 0.6)
         for simulations in errors:
-            kwargs: dict[str, Any] = {"backup": MaxBackup()} if backup == "max" else {}
+            kwargs: dict[str, Any] = {"backup": "max"} if backup == "max" else {}
             planner = planner_in(
                 DiceEnv(table, [4], seed=seed),
                 simulations,

@@ -18,7 +18,6 @@ from torchrl_hmcts.planners import (
     PUCT,
     DirichletNoise,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
     ProgressiveWidening,
     RadiusNovelty,
@@ -95,7 +94,7 @@ def walk(search: Search, b: int, n: int = 0) -> Node:
         edge_values=edges["value"].tolist(),
         closed=edges["closed"].tolist(),
         children=[
-            [walk(search, b, child) for child in search.outcomes_of(b, option, n)]
+            [walk(search, b, child) for child in search.tree.outcomes(b, option, n)]
             for option in range(len(edges))
         ],
     )
@@ -134,7 +133,7 @@ def returns_in_tree(search: Search, b: int, n: int = 0) -> list[float]:
     children = [
         value
         for option in range(search.num_options)
-        for child in search.outcomes_of(b, option, n)
+        for child in search.tree.outcomes(b, option, n)
         for value in returns_in_tree(search, b, child)
     ]
     return [float(search.tree.nodes["path_return"][b, n]), *children]
@@ -144,13 +143,13 @@ def returns_in_tree(search: Search, b: int, n: int = 0) -> list[float]:
 
 
 @pytest.mark.parametrize("expand", ["all", "one"])
-@pytest.mark.parametrize("backup", [None, MaxBackup()])
+@pytest.mark.parametrize("backup", ["mean", "max"])
 def test_a_kept_subtree_is_what_it_was_below_its_new_root(expand: Any, backup: Any) -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
     budget = SearchBudget(simulations=11, until_plan=False)
     planner = MCTSPlanner(env, gamma=0.9, expand=expand, backup=backup, budget=budget, seed=0)
     search = planner.search(at(env, [0]))
-    (child,) = search.outcomes_of(0, 1)
+    (child,) = search.tree.outcomes(0, 1)
     before = walk(search, 0, child)
     assert count(before) > 1
     assert planner.advance(search, torch.tensor([1]), at(env, [2])).tolist() == [True]
@@ -182,7 +181,7 @@ def test_the_best_plan_is_that_of_the_kept_subtree() -> None:
 def test_a_search_goes_on_below_the_kept_root_and_comes_to_the_values_of_a_new_one() -> None:
     env = CountingEnv(BINARY_TREE, terminal=LEAVES)
     budget = SearchBudget(expansions=2, until_plan=False)
-    planner = MCTSPlanner(env, gamma=0.9, backup=MaxBackup(), budget=budget, seed=0)
+    planner = MCTSPlanner(env, gamma=0.9, backup="max", budget=budget, seed=0)
     search = planner.search(at(env, [0]))  # expands 0 and one of its children
     expanded = int(search.tree.nodes["parent"][0, 3])
     option = int(search.tree.nodes["option"][0, expanded])
@@ -238,7 +237,7 @@ def test_each_root_of_a_batch_keeps_its_tree_or_gets_a_new_one() -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
     planner = MCTSPlanner(env, gamma=0.9, budget=FOREVER)
     search = planner.search(at(env, [[0, 0], [0, 0]]))
-    before = walk(search, 3, search.outcomes_of(3, 0)[0])
+    before = walk(search, 3, search.tree.outcomes(3, 0)[0])
     options = torch.tensor([[1, -1], [1, 0]])
     kept = planner.advance(search, options, at(env, [[2, 2], [1, 1]]))
     assert kept.tolist() == [[True, False], [False, True]]
@@ -270,8 +269,8 @@ def test_several_options_are_followed_at_once() -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
     planner = MCTSPlanner(env, gamma=0.9, budget=FOREVER)
     search = planner.search(at(env, [0, 0, 0]))
-    (child,) = search.outcomes_of(0, 1)
-    (grandchild,) = search.outcomes_of(0, 0, child)
+    (child,) = search.tree.outcomes(0, 1)
+    (grandchild,) = search.tree.outcomes(0, 0, child)
     before = walk(search, 0, grandchild)
     options = torch.tensor([[1, 0], [1, -1], [1, 0]])
     kept = planner.advance(search, options, at(env, [5, 2, 6]))
@@ -349,7 +348,7 @@ def test_a_root_is_never_refused() -> None:
     novelty = RadiusNovelty("state", radius=1.5, max_relaxations=0)
     planner = MCTSPlanner(env, novelty=novelty, budget=FOREVER)
     search = planner.search(at(env, [3]))
-    (right,) = search.outcomes_of(0, 1)
+    (right,) = search.tree.outcomes(0, 1)
     assert search.tree.nodes["flags"][0, right] & PRUNED  # 4 lies within 1.5 of 3
     assert search.exhausted(np.array([0])).all()
     assert planner.advance(search, torch.tensor([1]), at(env, [4])).tolist() == [True]
@@ -364,7 +363,7 @@ def test_a_state_whose_twin_is_searched_elsewhere_keeps_the_twins_subtree() -> N
     table |= {(3, 0): (4, 0.0, 1), (4, 0): (5, 1.0, 1)}
     env = TableEnv(table, terminal=[5])
     planner = MCTSPlanner(
-        env, gamma=0.5, transpositions=Transpositions("state"), backup=MaxBackup(), budget=FOREVER
+        env, gamma=0.5, transpositions=Transpositions("state"), backup="max", budget=FOREVER
     )
     for first in (0, 1):
         search = planner.search(at(env, [0]))
@@ -380,7 +379,7 @@ def test_a_subtree_that_leant_on_a_twin_outside_is_opened_again() -> None:
     table |= {(3, 0): (4, 0.0, 1), (4, 0): (5, 1.0, 1)}
     env = TableEnv(table, terminal=[5])
     planner = MCTSPlanner(
-        env, gamma=0.5, transpositions=Transpositions("state"), backup=MaxBackup(), budget=FOREVER
+        env, gamma=0.5, transpositions=Transpositions("state"), backup="max", budget=FOREVER
     )
     search = planner.search(at(env, [0]))
     leaning = int(np.flatnonzero(search.tree.nodes["twin"][0, : search.tree.num_nodes[0]] >= 0)[0])
@@ -413,7 +412,7 @@ def test_the_outcome_that_came_about_is_kept_out_of_several() -> None:
     )
     for state in (1, 3):
         search = planner.search(at(env, [2]))
-        outcomes = search.outcomes_of(0, 1)
+        outcomes = search.tree.outcomes(0, 1)
         assert len(outcomes) == 2
         assert search.tree.states is not None
         (node,) = (n for n in outcomes if search.tree.states["state"][0, n] == state)
@@ -540,7 +539,7 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
         expand=str(rng.choice(["all", "one"])),
         exhausted=exhausted,
         novelty=novelty,
-        backup=MaxBackup() if rng.random() < 0.5 else None,
+        backup="max" if rng.random() < 0.5 else "mean",
         leaves_per_wave=int(rng.integers(1, 4)),
         budget=SearchBudget(simulations=int(rng.integers(4, 40)), until_plan=False),
         seed=int(seed),
@@ -553,11 +552,11 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
         td = env.step(td.set("action", options))["next"]
         known = [
             any(int(search.tree.states["state"][b, n]) == int(td["state"][b])
-                for n in search.outcomes_of(b, int(options[b])))
+                for n in search.tree.outcomes(b, int(options[b])))
             for b in range(2)
         ]  # fmt: skip
         subtrees = [
-            walk(search, b, search.outcomes_of(b, int(options[b]))[0]) if known[b] else None
+            walk(search, b, search.tree.outcomes(b, int(options[b]))[0]) if known[b] else None
             for b in range(2)
         ]
         kept = planner.advance(search, options, td)

@@ -14,7 +14,6 @@ from tensordict import TensorDict
 
 from torchrl_hmcts.envs import GridworldMazeEnv, generate_mazes
 from torchrl_hmcts.planners import (
-    MaxBackup,
     MCTSPlanner,
     RadiusNovelty,
     Search,
@@ -209,7 +208,7 @@ def test_an_exhausted_search_has_the_values_of_value_iteration(
     planner = MCTSPlanner(
         env,
         gamma=gamma,
-        backup=MaxBackup(),
+        backup="max",
         transpositions=Transpositions("state"),
         expand=expand,
         leaves_per_wave=leaves,
@@ -257,7 +256,7 @@ def test_after_the_roots_move_the_kept_values_stay_and_the_search_ends_exact(
     planner = MCTSPlanner(
         env,
         gamma=gamma,
-        backup=MaxBackup(),
+        backup="max",
         transpositions=Transpositions("state"),
         budget=SearchBudget(expansions=expansions, until_plan=False),
     )
@@ -294,7 +293,7 @@ def test_a_twin_whose_searched_node_is_dropped_is_searched_itself() -> None:
     planner = MCTSPlanner(
         env,
         gamma=0.5,
-        backup=MaxBackup(),
+        backup="max",
         transpositions=Transpositions("state"),
         budget=ENOUGH,
     )
@@ -347,7 +346,7 @@ def test_a_maze_is_expanded_tile_by_tile_and_every_value_is_right() -> None:
     planner = MCTSPlanner(
         env,
         gamma=0.9,
-        backup=MaxBackup(),
+        backup="max",
         transpositions=Transpositions(["player_tile", "target_tile", "maze_index"]),
         budget=ENOUGH,
     )

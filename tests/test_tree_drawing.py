@@ -19,7 +19,6 @@ from torchrl.data import Composite, Unbounded
 
 from torchrl_hmcts.planners import (
     UCT,
-    MaxBackup,
     MCTSPlanner,
     ProgressiveWidening,
     Root,
@@ -109,7 +108,7 @@ def transposed_search() -> Search:
     planner = MCTSPlanner(
         ChainEnv(6),
         gamma=0.9,
-        backup=MaxBackup(),
+        backup="max",
         transpositions=Transpositions("state"),
         budget=SearchBudget(until_plan=False),
     )

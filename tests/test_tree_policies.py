@@ -27,9 +27,7 @@ from torchrl_hmcts.planners import (
     UCT,
     Gumbel,
     HighestValue,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     NodeStatistics,
     Search,
     SearchBudget,
@@ -118,7 +116,7 @@ SIMULATIONS = SearchBudget(simulations=40, until_plan=False)
 
 @pytest.mark.parametrize("expand", ["one", "all"])
 @pytest.mark.parametrize("leaves_per_wave", [1, 4])
-@pytest.mark.parametrize("backup", [MeanBackup(), MaxBackup()])
+@pytest.mark.parametrize("backup", ["mean", "max"])
 def test_torchrls_puct_grows_the_trees_of_the_compiled_one(
     expand: Any, leaves_per_wave: int, backup: Any
 ) -> None:

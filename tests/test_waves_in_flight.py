@@ -16,7 +16,6 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
     NodeStatistics,
     ProgressiveWidening,
@@ -94,7 +93,7 @@ SEARCHES: dict[str, dict[str, Any]] = {
     "rollouts": {"expand": "one", "rollout": TreeRollout(4), "leaves_per_wave": 2},
     "revisits": {"expand": "one", "exhausted": "revisit"},
     "novelty": {"novelty": WidthNovelty("state"), "expand": "one"},
-    "transpositions": {"transpositions": Transpositions("state"), "backup": MaxBackup()},
+    "transpositions": {"transpositions": Transpositions("state"), "backup": "max"},
     "chance": {"chance": ProgressiveWidening(), "expand": "one"},
     "python": {"tree_policy": fewest_visits, "expand": "one", "leaves_per_wave": 2},
 }

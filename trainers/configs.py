@@ -88,7 +88,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
             "uct": "UCT",
         },
         "novelty": {"radius": "RadiusNovelty", "width": "WidthNovelty"},
-        "backup": {"max": "MaxBackup", "mean": "MeanBackup"},
         "final_choice": {
             "best_plan": "BestPlan",
             "highest_value": "HighestValue",

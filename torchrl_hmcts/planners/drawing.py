@@ -21,7 +21,7 @@ from torchrl_hmcts.planners.export import (
     plural,
     shown_nodes,
 )
-from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, SearchTree
+from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, TreeArrays
 
 Axes = Any  # matplotlib.axes.Axes; matplotlib is loaded by the first picture only
 Color = tuple[float, float, float]
@@ -65,7 +65,7 @@ class _Shown(NamedTuple):
     left_out: int
 
 
-def _shown(tree: SearchTree, root: int, max_nodes: int | None) -> _Shown:
+def _shown(tree: TreeArrays, root: int, max_nodes: int | None) -> _Shown:
     count = check_root(tree, root)
     ids = shown_nodes(tree, root, max_nodes)
     nodes = tree.nodes[root, ids]
@@ -83,7 +83,7 @@ def _shown(tree: SearchTree, root: int, max_nodes: int | None) -> _Shown:
 
 
 def plot_tree(
-    tree: SearchTree,
+    tree: TreeArrays,
     root: int = 0,
     *,
     ax: Axes | None = None,
@@ -176,7 +176,7 @@ def plot_tree(
 
 
 def plot_positions(
-    tree: SearchTree,
+    tree: TreeArrays,
     root: int = 0,
     key: NestedKey | Callable[[TensorDictBase], Tensor] = "position",
     *,
@@ -395,7 +395,7 @@ def _draw_nodes(
 _HOLLOW = {"facecolors": "white", "edgecolors": [(0.6, 0.6, 0.6)]}
 
 
-def _title(tree: SearchTree, root: int, shown: _Shown) -> list[str]:
+def _title(tree: TreeArrays, root: int, shown: _Shown) -> list[str]:
     nodes = tree.nodes[root, : tree.num_nodes[root]]
     lines = [
         f"{plural(len(nodes), 'node')}, depth {int(nodes['depth'].max()):,}, "
@@ -506,7 +506,7 @@ def _curves(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def _positions(
-    tree: SearchTree,
+    tree: TreeArrays,
     root: int,
     key: NestedKey | Callable[[TensorDictBase], Tensor],
     ids: np.ndarray,

@@ -21,7 +21,7 @@ from torchrl_hmcts.planners.tree import (
     PRUNED,
     REWARDED,
     TERMINAL,
-    SearchTree,
+    TreeArrays,
 )
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ _BAR = 12
 _NAME_WIDTH = 18
 
 
-def check_root(tree: SearchTree, root: int) -> int:
+def check_root(tree: TreeArrays, root: int) -> int:
     """Return the number of nodes of a root, or say why there is none."""
     if not 0 <= root < tree.num_roots:
         raise IndexError(
@@ -51,7 +51,7 @@ def check_root(tree: SearchTree, root: int) -> int:
     return int(tree.num_nodes[root])
 
 
-def children(tree: SearchTree, root: int, node: int) -> Iterator[int]:
+def children(tree: TreeArrays, root: int, node: int) -> Iterator[int]:
     """Yield the nodes that the options of a node led to, by option, in the order of their draw."""
     for first in tree.edges["child"][root, node].tolist():
         child = first
@@ -60,13 +60,13 @@ def children(tree: SearchTree, root: int, node: int) -> Iterator[int]:
             child = int(tree.nodes["sibling"][root, child])
 
 
-def best_plan(tree: SearchTree, root: int) -> list[int]:
+def best_plan(tree: TreeArrays, root: int) -> list[int]:
     """Return the nodes of the best plan from the root on, or none."""
     best = int(tree.roots["best_node"][root])
     return tree.path(root, best) if best > 0 else []
 
 
-def most_visited_path(tree: SearchTree, root: int) -> list[int]:
+def most_visited_path(tree: TreeArrays, root: int) -> list[int]:
     """Return the nodes from the root on along the options with most visits, then highest Q."""
     path, node = [0], 0
     while True:
@@ -85,7 +85,7 @@ def most_visited_path(tree: SearchTree, root: int) -> list[int]:
         path.append(node)
 
 
-def shown_nodes(tree: SearchTree, root: int, max_nodes: int | None) -> np.ndarray:
+def shown_nodes(tree: TreeArrays, root: int, max_nodes: int | None) -> np.ndarray:
     """Return the most visited nodes, in ascending order, each with the node above it.
 
     The best plan is among them whatever its visits, as far as ``max_nodes`` allows.
@@ -114,7 +114,7 @@ def shown_nodes(tree: SearchTree, root: int, max_nodes: int | None) -> np.ndarra
 
 
 def to_networkx(
-    tree: SearchTree, root: int = 0, *, max_nodes: int | None = None, states: bool = False
+    tree: TreeArrays, root: int = 0, *, max_nodes: int | None = None, states: bool = False
 ) -> Any:
     """Return the tree of one root as a directed graph of networkx, its nodes numbered as here.
 
@@ -192,7 +192,7 @@ def to_networkx(
     return graph
 
 
-def to_torchrl(tree: SearchTree, root: int = 0) -> Tree:
+def to_torchrl(tree: TreeArrays, root: int = 0) -> Tree:
     """Return the tree of one root as TorchRL's ``Tree``; nothing is shared with this one.
 
     A vertex is a node of this tree, and its fields hold:
@@ -272,7 +272,7 @@ def to_torchrl(tree: SearchTree, root: int = 0) -> Tree:
     return vertices[0]
 
 
-def summary(tree: SearchTree, root: int = 0, option_names: Sequence[str] | None = None) -> str:
+def summary(tree: TreeArrays, root: int = 0, option_names: Sequence[str] | None = None) -> str:
     """Return what a search found as text: its size, the root's options, and the principal plan.
 
     The plan is the best one found, or else the path of most visits. Of its columns, ``steps`` and
@@ -360,7 +360,7 @@ def option_labels(
     return [_clip(label, width or len(label)) for label in labels]
 
 
-def _table_of_options(tree: SearchTree, root: int, names: list[str]) -> list[str]:
+def _table_of_options(tree: TreeArrays, root: int, names: list[str]) -> list[str]:
     edges = tree.edges[root, 0]
     order = sorted(
         range(tree.num_options),
@@ -395,7 +395,7 @@ def _table_of_options(tree: SearchTree, root: int, names: list[str]) -> list[str
     return lines
 
 
-def _table_of_steps(tree: SearchTree, root: int, plan: list[int], names: list[str]) -> list[str]:
+def _table_of_steps(tree: TreeArrays, root: int, plan: list[int], names: list[str]) -> list[str]:
     nodes = tree.nodes[root, plan[1:]]
     edges = tree.edges[root, nodes["parent"], nodes["option"]]
     columns = {

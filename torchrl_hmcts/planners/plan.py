@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
-from torchrl_hmcts.planners.docstrings import KeepsDocstring
 from torchrl_hmcts.planners.search import Search
+from torchrl_hmcts.planners.tree import KeepsDocstring
 
 
 class Plan(TensorClass, metaclass=KeepsDocstring):
