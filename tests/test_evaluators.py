@@ -458,7 +458,7 @@ def test_a_mixture_hands_on_what_its_parts_need() -> None:
 
 def test_a_mixture_out_of_range_or_of_misfits_is_refused() -> None:
     for weight in (-0.1, 1.5, float("nan")):
-        with pytest.raises(ValueError, match=rf"in \[0, 1\]; got {weight}"):
+        with pytest.raises(ValueError, match=f"weight >= 0.0 and <= 1.0; got {weight}"):
             MixedEvaluator(constant(0.0), constant(0.0), weight)
     mixed = MixedEvaluator(constant(0.0), lambda td: torch.zeros(len(td), 2))
     with pytest.raises(ValueError, match=r"second evaluator returned a Tensor \[3, 2\].*\[3, 1\]"):

@@ -147,6 +147,7 @@ GOOD: dict[str, Good] = {
         HierarchicalPolicy={"planner": lambda: planner()},
         ModelBasedControl={"planner": lambda: planner()},
         GoalPlanner={"planner": lambda: planner(), "to_macro": abs, "goal_key": "state"},
+        ReferenceSearch={"root": 0, "model": max, "options": lambda: lambda state: [0, 1]},
         SearchTree={"num_roots": 2, "num_options": 3},
         Search={
             "num_roots": 2,

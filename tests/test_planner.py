@@ -779,11 +779,11 @@ def test_root_noise_leaves_masked_options_at_zero() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: DirichletNoise(alpha=0.0), "alpha > 0; got 0.0"),
-        (lambda: DirichletNoise(alpha=float("inf")), "alpha > 0; got inf"),
-        (lambda: DirichletNoise(fraction=1.1), r"fraction in \[0, 1\]; got 1.1"),
-        (lambda: SampledVisits(temperature=0.0), r"temperature > 0; got 0.0.*MostVisited\(\)"),
-        (lambda: SampledVisits(temperature=float("nan")), "temperature > 0; got nan"),
+        (lambda: DirichletNoise(alpha=0.0), "alpha > 0.0.*got 0.0"),
+        (lambda: DirichletNoise(alpha=float("inf")), "alpha > 0.0.*got inf"),
+        (lambda: DirichletNoise(fraction=1.1), r"fraction >= 0.0 and <= 1.0; got 1.1"),
+        (lambda: SampledVisits(temperature=0.0), r"temperature > 0.0.*got 0.0"),
+        (lambda: SampledVisits(temperature=float("nan")), "temperature > 0.0.*got nan"),
     ],
 )
 def test_noise_and_temperature_out_of_range_are_refused(make: Any, message: str) -> None:
@@ -1054,9 +1054,9 @@ def test_a_continuous_action_is_refused_with_two_ways_out() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"gamma": 0.0}, r"gamma in \(0, 1\]; got 0.0"),
-        ({"gamma": 1.01}, r"gamma in \(0, 1\]; got 1.01"),
-        ({"gamma": float("nan")}, r"gamma in \(0, 1\]; got nan"),
+        ({"gamma": 0.0}, r"gamma > 0.0 and <= 1.0; got 0.0"),
+        ({"gamma": 1.01}, r"gamma > 0.0 and <= 1.0; got 1.01"),
+        ({"gamma": float("nan")}, r"gamma > 0.0 and <= 1.0; got nan"),
         ({"leaves_per_wave": 0}, "leaves_per_wave from 1 to 255; got 0"),
         ({"leaves_per_wave": 256}, "leaves_per_wave from 1 to 255; got 256"),
         ({"exhausted": "stop"}, "'skip' or 'revisit'; got 'stop'"),
@@ -1073,7 +1073,7 @@ def test_a_number_out_of_range_is_refused_at_construction(
 @pytest.mark.parametrize("policy", [UCT, PUCT])
 @pytest.mark.parametrize("c", [-1.0, float("nan"), float("inf")])
 def test_a_negative_or_infinite_exploration_constant_is_refused(policy: Any, c: float) -> None:
-    with pytest.raises(ValueError, match=f"c >= 0 that is finite; got {c}"):
+    with pytest.raises(ValueError, match=f"c >= 0.0 and finite; got {c}"):
         policy(c=c)
 
 
@@ -1097,7 +1097,7 @@ def test_a_state_that_is_not_finite_is_refused(key: Any) -> None:
 
 def test_a_reward_that_is_not_finite_is_refused() -> None:
     env = TableEnv({(0, 0): (1, float("nan"), 1)}, terminal=[1])
-    with pytest.raises(ValueError, match="reward of nan"):
+    with pytest.raises(ValueError, match="reward nan"):
         MCTSPlanner(env)(env.reset())
 
 

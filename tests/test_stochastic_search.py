@@ -429,10 +429,10 @@ def test_with_chance_the_most_visited_option_is_chosen() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"k": 0.0}, "k > 0 that is finite; got 0.0"),
-        ({"k": float("nan")}, "k > 0 that is finite; got nan"),
-        ({"alpha": -0.1}, r"alpha in \[0, 1\]; got -0.1"),
-        ({"alpha": 1.5}, r"alpha in \[0, 1\]; got 1.5"),
+        ({"k": 0.0}, "k > 0.0 and finite; got 0.0"),
+        ({"k": float("nan")}, "k > 0.0 and finite; got nan"),
+        ({"alpha": -0.1}, "alpha >= 0.0 and <= 1.0; got -0.1"),
+        ({"alpha": 1.5}, "alpha >= 0.0 and <= 1.0; got 1.5"),
     ],
 )
 def test_a_widening_out_of_range_is_refused(kwargs: dict[str, float], message: str) -> None:

@@ -117,7 +117,7 @@ def test_states_of_another_size_are_refused() -> None:
 
 
 def test_transpositions_of_nothing_are_refused() -> None:
-    with pytest.raises(ValueError, match="entries that make up a state; got none"):
+    with pytest.raises(ValueError, match="entries it compares; got none"):
         Transpositions([])
 
 

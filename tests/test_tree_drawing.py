@@ -365,12 +365,12 @@ def test_the_summary_says_which_options_are_not_allowed() -> None:
 def test_the_summary_counts_known_states_and_says_where_they_go_on() -> None:
     search = transposed_search()
     assert "5 of known states" in search.tree.summary()
-    assert "It goes on" not in search.tree.summary()
+    assert "It continues" not in search.tree.summary()
     twin = search.tree.nodes["twin"][0, : search.tree.num_nodes[0]]
     search.roots["best_node"] = known = np.flatnonzero(twin >= 0)[-1]
     last = search.tree.summary().splitlines()[-1]
     behind = ", ".join(map(str, search.tree.options(0, int(twin[known]))))
-    assert last == f"It goes on from the same state behind: {behind}"
+    assert last == f"It continues from the same state behind: {behind}"
 
 
 def test_a_root_without_children_has_a_summary() -> None:

@@ -530,12 +530,12 @@ def test_gumbel_says_what_it_needs(kwargs: dict[str, Any]) -> None:
     ("make", "message"),
     [
         (lambda: Gumbel(max_considered=0), "max_considered >= 1; got 0"),
-        (lambda: Gumbel(c_visit=-1.0), "c_visit >= 0 that is finite; got -1.0"),
-        (lambda: Gumbel(c_scale=math.inf), "c_scale >= 0 that is finite; got inf"),
-        (lambda: Gumbel(scale=math.nan), "scale >= 0 that is finite; got nan"),
+        (lambda: Gumbel(c_visit=-1.0), "c_visit >= 0.0.*got -1.0"),
+        (lambda: Gumbel(c_scale=math.inf), "c_scale >= 0.0.*got inf"),
+        (lambda: Gumbel(scale=math.nan), "scale >= 0.0.*got nan"),
         (lambda: PUCT(normalize="all"), "'siblings' or 'tree'; got 'all'"),  # type: ignore[arg-type]
         (lambda: PUCT(c_base=0.0), "c_base > 0.*got 0.0"),
-        (lambda: PUCT(unvisited_value=math.nan), "unvisited_value that is finite; got nan"),
+        (lambda: PUCT(unvisited_value=math.nan), "unvisited_value finite; got nan"),
     ],
 )
 def test_numbers_out_of_range_are_refused(make: Callable[[], Any], message: str) -> None:

@@ -145,7 +145,7 @@ def test_an_error_in_the_simulator_leaves_nothing_in_flight() -> None:
     "kwargs", [{"expand": "all"}, {"tree_policy": Gumbel(), "expand": "one"}], ids=str
 )
 def test_what_does_not_go_with_a_rollout_is_refused(kwargs) -> None:
-    with pytest.raises(ValueError, match="TreeRollout goes on from the one option"):
+    with pytest.raises(ValueError, match="TreeRollout continues from the one option"):
         MCTSPlanner(
             ChainEnv(length=3),
             rollout=TreeRollout(),

@@ -232,7 +232,7 @@ def test_a_search_that_was_interrupted_while_it_inserted_does_not_go_on() -> Non
     with pytest.raises(KeyboardInterrupt):
         planner.resume(search)
     search.tree.set_states = whole  # type: ignore[method-assign]
-    with pytest.raises(RuntimeError, match=r"interrupted while outcomes were inserted.*anew"):
+    with pytest.raises(RuntimeError, match=r"interrupted while outcomes were inserted.*again"):
         planner.resume(search)
 
 

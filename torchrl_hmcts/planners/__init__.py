@@ -15,6 +15,7 @@ from torchrl_hmcts.planners.mcts import MCTSPlanner
 from torchrl_hmcts.planners.model_control import GoalPlanner, ModelBasedControl
 from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.planners.plan import Plan, extract_plans
+from torchrl_hmcts.planners.reference import ReferenceSearch
 from torchrl_hmcts.planners.root_options import (
     BestPlan,
     DirichletNoise,
@@ -23,7 +24,7 @@ from torchrl_hmcts.planners.root_options import (
     SampledVisits,
 )
 from torchrl_hmcts.planners.search import Search
-from torchrl_hmcts.planners.search_data import best_plans_below, search_examples
+from torchrl_hmcts.planners.search_data import search_examples
 from torchrl_hmcts.planners.search_loop import SearchProgress
 from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.transpositions import Transpositions
@@ -51,6 +52,7 @@ __all__ = [
     "PolicyValueEvaluator",
     "ProgressiveWidening",
     "RadiusNovelty",
+    "ReferenceSearch",
     "RolloutEvaluator",
     "Root",
     "SampledVisits",
@@ -66,7 +68,6 @@ __all__ = [
     "TreeView",
     "ValueEvaluator",
     "WidthNovelty",
-    "best_plans_below",
     "extract_plans",
     "search_examples",
     "tree_search",

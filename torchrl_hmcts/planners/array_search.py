@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -224,17 +223,18 @@ class _Loop:
             self.buffer,
             self.given,
         )
-        advance: Any
-        if batch_kernels.COMPILED:
-            advance = partial(batch_kernels.advance_at, batch_kernels.handle(*arrays))
-        else:
-            advance = partial(batch_kernels.advance, *arrays)
+        at, advance = batch_kernels.handle(*arrays), batch_kernels.advance_at
+        if not batch_kernels.COMPILED:
+
+            def advance(at: Any, *outcomes: Any) -> Any:
+                return batch_kernels.advance(*arrays, *outcomes)
+
         # As bytes, any dtype and shape runs the same code; indices are spared the conversion.
         as_bytes = not batch_kernels.COMPILED or self.dtype != np.int64 or self.shape != ()
         none, no_prior = np.zeros(0, np.float32), np.zeros((0, search.num_options), np.float32)
         nothing = _bytes(self.nothing) if as_bytes else self.nothing
-        count = advance(0, none, none, none, no_prior, nothing)
-        dtype, shape, first = self.dtype, self.shape, True
+        count = advance(at, 0, none, none, none, no_prior, nothing)
+        dtype, shape, is_tensor, first = self.dtype, self.shape, self.is_tensor, True
         while count:
             if count == size:
                 answer = transition(states, options)
@@ -245,7 +245,7 @@ class _Loop:
                     self._check(answer, count)
                     first = False
                 reward, discount, prior, value, embedding = answer
-                if self.is_tensor:
+                if is_tensor:
                     reward, discount, prior, value, embedding = (
                         x.detach().numpy() for x in (reward, discount, prior, value, embedding)
                     )
@@ -255,7 +255,7 @@ class _Loop:
                     if embedding.shape[1:] != shape:
                         self._check(answer, count)
                     embedding = _bytes(embedding)
-                count = advance(count, reward, discount, value, prior, embedding)
+                count = advance(at, count, reward, discount, value, prior, embedding)
             except Exception:
                 self._check(answer, count)
                 raise
@@ -311,13 +311,14 @@ class _Loop:
                     f"The transition function returned {name} as {type(array).__name__}; return "
                     f"what the embedding is, a {'tensor' if self.is_tensor else 'NumPy array'}."
                 )
-            got = str(array.dtype).removeprefix("torch.")  # NumPy has no bfloat16
             if isinstance(array, Tensor):
                 contiguous = array.is_contiguous() and not array.is_neg()
+                same = array.dtype == torch.from_numpy(np.empty(0, dtype)).dtype
             else:
-                contiguous = array.flags.c_contiguous
-            if tuple(array.shape) != shape or got != str(dtype) or not contiguous:
+                contiguous, same = array.flags.c_contiguous, array.dtype == dtype
+            if tuple(array.shape) != shape or not same or not contiguous:
                 order = "" if contiguous else " (not contiguous)"
+                got = str(array.dtype).removeprefix("torch.")  # NumPy has no bfloat16
                 raise ValueError(
                     f"The transition function returned {name} as {got} {list(array.shape)}"
                     f"{order}; it must be {dtype} {list(shape)} and contiguous."
@@ -330,10 +331,9 @@ class _Loop:
 def _check_range(found: str, name: str, array: np.ndarray) -> None:
     """Refuse numbers that no search can use; ``found`` says of which array, with its {number}."""
     low, high, rule = _RANGES[name]
-    exact = array.astype(np.float64)
-    good = (exact >= low) & (exact <= high)
-    if not good.all():
-        raise ValueError(f"{found.format(number=array[~good][0])}; {rule}.")
+    if array.size and not (low <= float(array.min()) and float(array.max()) <= high):
+        bad = array[~((array >= np.float64(low)) & (array <= np.float64(high)))][0]
+        raise ValueError(f"{found.format(number=bad)}; {rule}.")
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:

@@ -198,7 +198,7 @@ def handle(nodes, edges, roots, record, gumbel, wave, masks, stored, states, opt
     arrays = (nodes, edges, roots, record, gumbel, wave, masks, stored, states, options)
     sizes = (*edges.shape, gumbel.shape[0], gumbel.shape[1], len(wave), len(masks))
     sizes += (stored.shape[2], len(states))
-    addresses = (array.__array_interface__["data"][0] for array in arrays)
+    addresses = (array.ctypes.data for array in arrays)
     return np.array([*addresses, *sizes], np.int64)
 
 

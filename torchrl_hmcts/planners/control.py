@@ -1,21 +1,22 @@
-"""Carrying plans out: a policy over options that plans, follows its plan and plans again.
+"""Executing plans: a policy over options that plans, follows its plan and plans again.
 
 Letters: *B batch of the tensordict, L ``max_plan_length``, f numbers of the divergence entries.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.planners.mcts import MCTSPlanner
+from torchrl_hmcts.planners.novelty import entry_keys
 from torchrl_hmcts.planners.plan import Plan, extract_plans
 from torchrl_hmcts.planners.search import Search
 
@@ -30,7 +31,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
     .. math:: \lVert \phi(s_i) - \phi(\hat s_i) \rVert > \text{divergence}
 
     with :math:`\phi` the entries ``divergence_key`` side by side. Where no plan is found, the
-    planner's choice is taken and planning starts anew after it.
+    planner's choice is taken, and a new plan is made after it.
 
     The plan lives in the tensordict, as a recurrent policy's state does: ``"plan"`` (int64
     ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made so far, or
@@ -40,7 +41,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
     is to act in, the plan is out of date. Where it cannot see that, as in a tensordict that was
     copied before the step, append TorchRL's ``InitTracker`` or ``StepCounter`` to the env.
 
-    With ``reuse`` the trees are kept from one decision to the next: where the options carried out
+    With ``reuse`` the trees are kept from one decision to the next: where the options executed
     led to a state that the tree holds, its subtree is searched further
     (:meth:`MCTSPlanner.advance`), elsewhere a new tree is planted. The trees live in the policy,
     so it serves one rollout at a time; another rollout gets right plans too, but nothing to reuse.
@@ -48,7 +49,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
     Args:
         planner (MCTSPlanner): the manager.
         max_plan_length (int): options of a plan that are kept, L. Default 64.
-        replan_every (int, optional): options after which to plan again though the plan goes on; 1
+        replan_every (int, optional): options after which to plan again though the plan continues; 1
             for every option. Default: at the plan's end.
         divergence (float, optional): distance from the predicted state, in units of the entries,
             above which to plan again. Default: the prediction is not looked at.
@@ -61,7 +62,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
             the other way round, or the planner's env has no such entry.
 
     Reference:
-        Dissertation, sections 3.2.1 and 4.2: the worker carries the manager's plan out.
+        Dissertation, sections 3.2.1 and 4.2: the worker executes the manager's plan.
 
     Example:
         >>> from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner
@@ -86,36 +87,23 @@ class HierarchicalPolicy(TensorDictModuleBase):
         reuse: bool = False,
     ) -> None:
         super().__init__()
-        if max_plan_length < 1:
-            raise ValueError(
-                f"HierarchicalPolicy needs max_plan_length >= 1; got {max_plan_length}."
-            )
-        if replan_every is not None and replan_every < 1:
-            raise ValueError(
-                f"HierarchicalPolicy needs replan_every >= 1, in options; got {replan_every}. Use "
-                f"None to plan again at the plan's end only."
-            )
+        instance("HierarchicalPolicy", "planner", planner, MCTSPlanner)
+        owner = "HierarchicalPolicy"
+        self.max_plan_length = whole_number(owner, "max_plan_length", max_plan_length, least=1)
+        if replan_every is not None:
+            whole_number(owner, "replan_every", replan_every, least=1)
         if (divergence is None) != (divergence_key is None):
             raise ValueError(
                 f"HierarchicalPolicy compares divergence_key with the plan and plans again above "
                 f"divergence; got divergence={divergence} and divergence_key={divergence_key!r}. "
                 f"Pass both or neither."
             )
-        if divergence is not None and not (math.isfinite(divergence) and divergence >= 0.0):
-            raise ValueError(
-                f"HierarchicalPolicy needs a divergence >= 0, a distance; got {divergence}."
-            )
-        self.planner = planner
-        self.max_plan_length = max_plan_length
-        self.replan_every = replan_every
-        self.divergence = divergence
-        self.reuse = reuse
-        keys: list[NestedKey] = []
-        if isinstance(divergence_key, (str, tuple)):
-            keys = [divergence_key]
-        elif divergence_key is not None:
-            keys = list(divergence_key)
-        self.divergence_keys = [unravel_key(k) for k in keys]
+        self.divergence_keys: list[NestedKey] = []
+        if divergence is not None and divergence_key is not None:
+            real_number(owner, "divergence", divergence, least=0.0)
+            self.divergence_keys = entry_keys(divergence_key, owner)
+        self.planner, self.replan_every = planner, replan_every
+        self.divergence, self.reuse = divergence, reuse
         planner.simulator.keep(self.divergence_keys)
         self.in_keys = list(dict.fromkeys([*planner.in_keys, *self.divergence_keys]))
         self._plan_keys = ["plan", "plan_length", "plan_step", "num_plans"]
@@ -132,7 +120,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         self._shape: torch.Size | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the next option of each row's plan, after planning where one is due."""
+        """Write the next option of each row's plan, after planning where one is due."""
         shape = tensordict.batch_size
         done, stepped = tensordict.get("done", None), tensordict.get("_step", None)
         kept = {key: tensordict.get(key, None) for key in self._plan_keys}
@@ -153,7 +141,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
             needs = needs | self._diverged(tensordict, kept["plan_states"], step)
         if done is not None:
             needs = needs & ~done.reshape(shape)
-        if stepped is not None:  # False where a rollout goes on without the element
+        if stepped is not None:  # False where a rollout continues without the element
             needs = needs & stepped.reshape(shape)
         if needs.any():
             behind = torch.arange(self.max_plan_length, device=plan.device) >= step

@@ -439,16 +439,14 @@ class _Network:
     def __init__(self, owner: str, module: TensorDictModuleBase, *keys: NestedKey) -> None:
         if not isinstance(module, TensorDictModuleBase):
             raise TypeError(
-                f"{owner} needs a TensorDictModule for module; got {type(module).__name__}. Wrap a "
-                f'network: TensorDictModule(net, in_keys=["observation"], out_keys={list(keys)!r}).'
+                f"{owner} needs a TensorDictModule; got {type(module).__name__}. Wrap a network: "
+                f'TensorDictModule(net, in_keys=["observation"], out_keys={list(keys)!r}).'
             )
         writes = [unravel_key(k) for k in module.out_keys]
         self.keys = [unravel_key(k) for k in keys]
         for key in self.keys:
             if key not in writes:
-                raise ValueError(
-                    f"{owner} reads {key!r}, which its module does not write: it writes {writes}."
-                )
+                raise ValueError(f"{owner} reads {key!r}; its module writes {writes}.")
         self.in_keys = [unravel_key(k) for k in module.in_keys]
         self.module = module
         if type(module) is TensorDictSequential and len(module) == 1:

@@ -431,7 +431,7 @@ def _table_of_steps(tree: TreeArrays, root: int, plan: list[int], names: list[st
     twin = int(nodes["twin"][-1])
     if twin >= 0:
         where = ", ".join(names[a] for a in tree.options(root, twin))
-        lines.append(f"It goes on from the same state behind: {_clip(where, 48) or 'the root'}")
+        lines.append(f"It continues from the same state behind: {_clip(where, 48) or 'the root'}")
     return lines
 
 

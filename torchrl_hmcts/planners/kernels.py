@@ -436,8 +436,11 @@ def first_bad(rewards, discounts, values, priors):
         if values.shape[0]:
             good &= abs(values[i]) < LARGEST
         if priors.shape[0]:
-            for a in range(priors.shape[1]):
-                good &= (0.0 <= priors[i, a]) & (priors[i, a] < LARGEST)
+            least, total = priors[i, 0], priors[i, 0]
+            for a in range(1, priors.shape[1]):
+                least = min(least, priors[i, a])
+                total += priors[i, a]
+            good &= (0.0 <= least) & (total < LARGEST)
         if not good:
             return i
     return GOOD
@@ -578,7 +581,7 @@ def limit(roots, simulations):
 def still_active(
     nodes, roots, active, expansions, base_steps, num_nodes, until_plan, improve, kept, stuck
 ):
-    """Split the roots ``active`` into those that go on and those that are exhausted.
+    """Split the roots ``active`` into those that continue and those that are exhausted.
 
     Writes them to ``kept`` and ``stuck``; returns how many there are. A root whose budget is spent
     is neither.

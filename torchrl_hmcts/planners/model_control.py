@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.nesting import env_name
 from torchrl_hmcts.planners.control import EpisodeStarts, HierarchicalPolicy
 from torchrl_hmcts.planners.mcts import MCTSPlanner
@@ -29,7 +30,7 @@ class ModelBasedControl(TensorDictModuleBase):
 
     .. math:: \hat s = \mathrm{map}(o), \qquad \text{option} = \mathrm{plan}(\hat s),
 
-    and the option is carried out in the real env, which is under an
+    and the option is executed in the real env, which is under an
     :class:`~torchrl_hmcts.transforms.OptionTransform` with the same worker. The plan's first option
     ends somewhere else than the model predicted, so that by default a new plan is made after every
     option.
@@ -51,7 +52,7 @@ class ModelBasedControl(TensorDictModuleBase):
             lacks an entry, or has another batch size.
 
     Reference:
-        Dissertation, section 4.2 (plan in a simulation, carry out in the environment).
+        Dissertation, section 4.2 (plan in a simulation, act in the environment).
 
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner, ModelBasedControl
@@ -73,6 +74,8 @@ class ModelBasedControl(TensorDictModuleBase):
         max_plan_length: int = 64,
     ) -> None:
         super().__init__()
+        if state_map is not None and not callable(state_map):
+            raise TypeError(f"state_map must be callable on a tensordict; got {state_map!r}.")
         self.policy = HierarchicalPolicy(
             planner, replan_every=replan_every, max_plan_length=max_plan_length
         )
@@ -82,6 +85,7 @@ class ModelBasedControl(TensorDictModuleBase):
         self.in_keys = [unravel_key(key) for key in read]
         self._starts = EpisodeStarts(self.in_keys, self.policy._plan_keys[:4])
         if env is not None:
+            instance("ModelBasedControl", "env", env, EnvBase)
             self._check(env, planner)
 
     def _check(self, env: EnvBase, planner: MCTSPlanner) -> None:
@@ -193,8 +197,10 @@ class GoalPlanner:
         goal_key: NestedKey = "position",
         in_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        self.planner = planner
-        self.to_macro = to_macro
+        instance("GoalPlanner", "planner", planner, MCTSPlanner)
+        if not callable(to_macro):
+            raise TypeError(f"to_macro must be callable on a tensordict; got {to_macro!r}.")
+        self.planner, self.to_macro = planner, to_macro
         self.goal_key = unravel_key(goal_key)
         planner.simulator.keep([self.goal_key])
         if in_keys is not None:

@@ -124,7 +124,8 @@ class Search:
         self._set(settings)
         self.tree = SearchTree(num_roots, num_options, capacity=capacity)
         self.gumbel = np.zeros((0, 0), np.float32)  # [B, A + N], see root_options.halve
-        self.seed(0)
+        self.seeds = np.arange(self.num_roots)  # [B]
+        self.rollouts: dict[int, np.random.Generator] = {}
         self._room = 1  # nodes of the largest tree, at most
         self._kernels.limit(self.tree.roots, NO_LIMIT)
 
@@ -390,8 +391,8 @@ class Search:
         """Let root ``b`` draw its random numbers from ``seed + b``, modulo 2 ** 63."""
         whole_number("A search", "seed", seed)
         seeds = np.arange(self.num_roots, dtype=np.uint64) + np.uint64(int(seed) & NO_LIMIT)
-        self.seeds = (seeds & np.uint64(NO_LIMIT)).astype(np.int64)  # [B]
-        self.rollouts: dict[int, np.random.Generator] = {}
+        self.seeds = (seeds & np.uint64(NO_LIMIT)).astype(np.int64)
+        self.rollouts = {}
 
     def generator(self, root: int, purpose: str) -> np.random.Generator:
         """Return random numbers that depend on the root's seed and on what they are for."""

@@ -119,12 +119,12 @@ class Simulator:
         return flat
 
     def state(self, td: TensorDictBase) -> TensorDictBase:
-        """Return what is stored of a state: that from which the simulator can go on, and more."""
+        """Return what is stored of a state: all that the simulator continues from, and more."""
         return td.select(*self.kept_keys)
 
     def keep(self, keys: Sequence[NestedKey]) -> None:
         """Store further entries of the observation with every node, before a search begins."""
-        self._check_available(keys, "The policy that carries plans out")
+        self._check_available(keys, "The policy that executes plans")
         self.kept_keys = list(dict.fromkeys([*self.kept_keys, *keys]))
         self.root_keys = list(dict.fromkeys([*self.root_keys, *keys]))
 

@@ -113,7 +113,7 @@ class UCT(CompiledPolicy):
     c: float = 1.0
 
     def __post_init__(self) -> None:
-        real_number("UCT", "exploration constant c", self.c, least=0.0)
+        real_number("UCT", "c", self.c, least=0.0)
 
     def record(self) -> dict[str, float]:
         """Return what the kernels read."""
@@ -161,7 +161,7 @@ class PUCT(CompiledPolicy):
     c_base: float | None = None
 
     def __post_init__(self) -> None:
-        real_number("PUCT", "exploration constant c", self.c, least=0.0)
+        real_number("PUCT", "c", self.c, least=0.0)
         if self.normalize not in (None, "siblings", "tree"):
             raise ValueError(
                 f"PUCT: normalize is None, 'siblings' or 'tree'; got {self.normalize!r}."

@@ -38,7 +38,7 @@ class TreeView(TensorClass, metaclass=KeepsDocstring):
         children_values (Tensor): ``[B, N, A]`` value Q = R + D V of an option.
         children_priors (Tensor): ``[B, N, A]`` prior probability of an option, 0 if forbidden.
         children_closed (Tensor): ``[B, N, A]`` 0 open, SOLVED or FORBIDDEN.
-        states (TensorDictBase): ``[B, N]`` what the simulator needs to go on from a node.
+        states (TensorDictBase): ``[B, N]`` what the simulator needs to continue from a node.
 
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner

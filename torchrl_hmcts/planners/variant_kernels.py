@@ -98,7 +98,7 @@ def completed_values(nodes, edges, record, b, n, out):
 
 @numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def outcome(nodes, first):
-    """The outcome of an option to go on from: visits follow how often each was drawn."""
+    """The outcome of an option to continue from: visits follow how often each was drawn."""
     best, best_share = first, -1.0
     node = first
     while node >= 0:
