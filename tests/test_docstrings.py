@@ -131,8 +131,8 @@ LITERATURE = {
 # In them: data, forms that a user's object has, and tools.
 NOTHING_TO_CITE = set(
     "NodeStatistics NoveltyTest Plan PlansGoals Root Search SearchProgress SearchTree Transition "
-    "TreeView best_plans_below extract_plans OptionWorker TorchRLGymnasiumEnv check_mazes "
-    "free_tiles maze_from_text maze_to_text register_envs replay_recording shortest_path "
+    "TreeView Evaluation SearchSettings extract_plans OptionWorker TorchRLGymnasiumEnv "
+    "check_mazes free_tiles maze_from_text maze_to_text register_envs replay_recording shortest_path "
     "shortest_path_lengths wall_centers Snapshot AttributeSnapshot ReplaySnapshot "
     "SnapshotError".split()
 )

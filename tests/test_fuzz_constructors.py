@@ -147,7 +147,7 @@ GOOD: dict[str, Good] = {
         HierarchicalPolicy={"planner": lambda: planner()},
         ModelBasedControl={"planner": lambda: planner()},
         GoalPlanner={"planner": lambda: planner(), "to_macro": abs, "goal_key": "state"},
-        ReferenceSearch={"root": 0, "model": max, "options": lambda: lambda state: [0, 1]},
+        SearchSettings={},
         SearchTree={"num_roots": 2, "num_options": 3},
         Search={
             "num_roots": 2,
@@ -308,7 +308,7 @@ COSTLY = {  # milliseconds each; the others take microseconds
 }
 EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(
-        ["NodeStatistics", "Plan", "TreeView", "Root", "SearchProgress", "Transition"],
+        "NodeStatistics Plan TreeView Root SearchProgress Transition Evaluation".split(),
         "a record that the search fills",
     ),
     **dict.fromkeys(["GoalEpisodes", "GoalTrack", "TerminationResult"], "a record of results"),
@@ -320,6 +320,7 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
         ["AttributeSnapshot", "ReplaySnapshot", "SettableGymEnv", "Snapshot", "SnapshotError"],
         "takes a Gymnasium env: test_settable_gym.py",
     ),
+    "ReferenceSearch": "searches from any object",
     "SkillRewardHook": "hands its arguments to SkillReward",
     **dict.fromkeys(
         ["ByteGoal", "FollowGoals", "JoinedWorkers", "OccasionalAction"], "belongs to an Atari game"

@@ -10,10 +10,10 @@ from tensordict import TensorDict
 from torchrl_hmcts.planners import (
     MCTSPlanner,
     SearchBudget,
-    best_plans_below,
     extract_plans,
     search_examples,
 )
+from torchrl_hmcts.planners.search_data import best_plans_below
 from torchrl_hmcts.planners.tree import TERMINAL
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 

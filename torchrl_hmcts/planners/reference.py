@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.planners.tree_policies import PUCT, UCT
 
 
@@ -89,6 +90,7 @@ class ReferenceSearch:
     ) -> None:
         self.model, self.options, self.evaluate, self.gamma = model, options, evaluate, gamma
         self.tree_policy = UCT() if tree_policy is None else tree_policy
+        instance("ReferenceSearch", "tree_policy", self.tree_policy, UCT, PUCT)
         self.backup, self.expand, self.revisit = backup, expand, exhausted == "revisit"
         self.nodes: list[Node] = []
         self.root = self._node(root, terminal=not options(root))
