@@ -82,7 +82,7 @@ def test_the_yaml_explains_every_key_in_the_words_of_the_docstring(
 NOT_CONFIGURED = {
     "torchrl_hmcts.planners": {
         "NodeStatistics", "NoveltyTest", "Plan", "Root", "Search", "SearchProgress", "SearchTree",
-        "Transition", "TreeView",
+        "Transition", "TreeView", "Evaluation", "ReferenceSearch", "SearchSettings",
     },
     "torchrl_hmcts.objectives": {"NStepReturn", "SkillObjective"},
     "torchrl_hmcts.transforms": {"PlansGoals"},

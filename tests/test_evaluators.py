@@ -229,19 +229,6 @@ def test_a_rollout_evaluator_serves_planners_of_one_env_and_discount_only() -> N
             bound(other, rollout, gamma)
 
 
-@pytest.mark.parametrize("name", ["max_options", "num_rollouts"])
-def test_rollouts_of_nothing_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name} >= 1; got 0"):
-        RolloutEvaluator(**{name: 0})
-
-
-def test_rollouts_as_bootstrap_of_rollouts_are_longer_rollouts() -> None:
-    env = ChainEnv(5)
-    inner = RolloutEvaluator(right, max_options=2)
-    rollout = bound(env, RolloutEvaluator(right, max_options=2, bootstrap=inner))
-    assert rollout(at(env, [0])).item() == pytest.approx(0.9**3)
-
-
 # ---------------------------------------------------------------------- networks
 
 
@@ -489,23 +476,6 @@ def trees(search: Search) -> list[tuple[bytes, bytes]]:
     tree = search.tree
     used = enumerate(tree.num_nodes)
     return [(tree.nodes[b, :n].tobytes(), tree.edges[b, :n].tobytes()) for b, n in used]
-
-
-@pytest.mark.parametrize("name", ["network", "rollouts", "guided", "mixed"])
-@pytest.mark.parametrize("expand", ["one", "all"])
-def test_a_planner_finds_its_way_with_every_evaluator(name: str, expand: Any) -> None:
-    env = ChainEnv(6)
-    planner = MCTSPlanner(
-        env,
-        expand=expand,
-        leaf_evaluator=evaluators()[name],
-        budget=SearchBudget(expansions=60, until_plan=False),
-        seed=0,
-    )
-    search = planner.search(at(env, [0, 3]))
-    assert np.isfinite(search.tree.nodes["value"]).all()
-    assert planner.choose(search).tolist() == [1, 1]
-    assert search.best_return[1] == pytest.approx(planner.gamma)
 
 
 @pytest.mark.parametrize("name", ["rollouts", "guided", "mixed"])

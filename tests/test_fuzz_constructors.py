@@ -145,7 +145,6 @@ GOOD: dict[str, Good] = {
         },
         MCTSPlanner={"env": lambda: chain()},
         HierarchicalPolicy={"planner": lambda: planner()},
-        ModelBasedControl={"planner": lambda: planner()},
         GoalPlanner={"planner": lambda: planner(), "to_macro": abs, "goal_key": "state"},
         SearchSettings={},
         SearchTree={"num_roots": 2, "num_options": 3},

@@ -25,7 +25,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
     Transpositions,
 )
-from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PRUNED, REWARDED, TERMINAL
+from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PRUNED, TERMINAL
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
 # A binary tree of depth 3: the children of s are 2 s + 1 and 2 s + 2 after 1 and 2 base steps, the
@@ -142,23 +142,6 @@ def returns_in_tree(search: Search, b: int, n: int = 0) -> list[float]:
 # ---------------------------------------------------------------------- what is kept
 
 
-@pytest.mark.parametrize("expand", ["all", "one"])
-@pytest.mark.parametrize("backup", ["mean", "max"])
-def test_a_kept_subtree_is_what_it_was_below_its_new_root(expand: Any, backup: Any) -> None:
-    env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    budget = SearchBudget(simulations=11, until_plan=False)
-    planner = MCTSPlanner(env, gamma=0.9, expand=expand, backup=backup, budget=budget, seed=0)
-    search = planner.search(at(env, [0]))
-    (child,) = search.tree.outcomes(0, 1)
-    before = walk(search, 0, child)
-    assert count(before) > 1
-    assert planner.advance(search, torch.tensor([1]), at(env, [2])).tolist() == [True]
-    # Option 1 took 2 base steps.
-    assert walk(search, 0) == rebased(before, depth=1, base_steps=2)
-    assert search.tree.num_nodes.tolist() == [count(before)]
-    np.testing.assert_allclose(returns_in_tree(search, 0), path_returns(before), rtol=1e-6)
-
-
 def test_the_best_plan_is_that_of_the_kept_subtree() -> None:
     # Option 0 leads to 1, which pays 8 at once; option 1 to 2, which pays 1 in two steps.
     table = {
@@ -196,17 +179,6 @@ def test_a_search_goes_on_below_the_kept_root_and_comes_to_the_values_of_a_new_o
     new = planner.search(at(env, [child_state]))
     planner.resume(new)
     assert search.tree.nodes["value"][0, 0] == new.tree.nodes["value"][0, 0]
-
-
-def test_a_plan_that_is_kept_needs_no_further_search() -> None:
-    env = ChainEnv(6)
-    planner = MCTSPlanner(env)
-    search = planner.search(at(env, [0]))
-    planner.advance(search, torch.tensor([1]), at(env, [1]))
-    planner.resume(search)
-    assert search.num_simulations.tolist() == [0]
-    assert search.expansions_to_plan.tolist() == [0]
-    assert search.tree.options(0, int(search.best_node[0])) == [1] * 4
 
 
 # ---------------------------------------------------------------------- what is not
@@ -574,30 +546,3 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
 
 
 # ---------------------------------------------------------------------- what is behind the nodes
-
-
-def test_what_was_dropped_is_not_counted() -> None:
-    env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    planner = MCTSPlanner(env, budget=FOREVER)
-    search = planner.search(env.reset())
-    counts = search.statistics()
-    assert (counts["nodes"], counts["rewarded"]) == (15, 4)  # leaves 11 to 14 pay 1 to 4
-    # Below state 1 are 3 and 4, and their leaves 7 to 10, which pay -3 to 0.
-    assert planner.advance(search, torch.tensor([0]).reshape(()), at(env, 1)).item()
-    assert search.tree.num_nodes.tolist() == [7]
-    search.tree.nodes["flags"][0, 7:] |= REWARDED
-    counts = search.statistics()
-    assert (counts["nodes"], counts["rewarded"]) == (7, 0)
-
-
-def test_options_that_come_by_the_root_again_are_followed_through_it() -> None:
-    # 0 -> 1 -> 0 -> 1 by option 0: the second node of state 0 is the twin of the root.
-    table = {(0, 0): (1, 0.0, 1), (0, 1): (2, 0.0, 1), (1, 0): (0, 0.0, 1), (1, 1): (2, 1.0, 1)}
-    env = TableEnv(table, terminal=[2])
-    planner = MCTSPlanner(env, transpositions=Transpositions("state"), budget=FOREVER)
-    search = planner.search(env.reset())
-    below = int(search.tree.edges["child"][0, 0, 0])
-    again = int(search.tree.edges["child"][0, below, 0])
-    assert search.tree.nodes["twin"][0, again] == 0
-    assert planner.advance(search, torch.tensor([0, 0, 0]), at(env, 1)).item()
-    assert search.tree.nodes["visits"][0, 0] > 1  # it is the tree that was searched, not a new one

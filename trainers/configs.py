@@ -109,7 +109,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
         "control": {
             "goals": "GoalPlanner",
             "hierarchical": "HierarchicalPolicy",
-            "model_based": "ModelBasedControl",
         },
     },
     "torchrl_hmcts.modules": {

@@ -2,7 +2,7 @@
 
 from torchrl_hmcts.planners.array_search import Root, Transition, tree_search
 from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
-from torchrl_hmcts.planners.control import HierarchicalPolicy
+from torchrl_hmcts.planners.control import GoalPlanner, HierarchicalPolicy
 from torchrl_hmcts.planners.evaluation import Evaluation
 from torchrl_hmcts.planners.evaluators import (
     MixedEvaluator,
@@ -12,7 +12,6 @@ from torchrl_hmcts.planners.evaluators import (
     ValueEvaluator,
 )
 from torchrl_hmcts.planners.mcts import MCTSPlanner
-from torchrl_hmcts.planners.model_control import GoalPlanner, ModelBasedControl
 from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.planners.plan import Plan, extract_plans
 from torchrl_hmcts.planners.reference import ReferenceSearch
@@ -43,7 +42,6 @@ __all__ = [
     "HighestValue",
     "MCTSPlanner",
     "MixedEvaluator",
-    "ModelBasedControl",
     "ModulePrior",
     "MostVisited",
     "NodeStatistics",

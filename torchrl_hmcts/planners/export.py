@@ -362,77 +362,66 @@ def option_labels(
 
 def _table_of_options(tree: TreeArrays, root: int, names: list[str]) -> list[str]:
     edges = tree.edges[root, 0]
-    order = sorted(
-        range(tree.num_options),
-        key=lambda a: (
-            int(edges["closed"][a]) == FORBIDDEN,
-            -int(edges["visits"][a]),
-            -float(edges["value"][a]),
-        ),
-    )
-    values, total = _numbers(edges["value"]), max(int(edges["visits"].sum()), 1)
-    width = max(len("option"), *(len(names[a]) for a in order[:_MAX_OPTIONS]))
-    visits_width = max(len("visits"), len(f"{int(edges['visits'].max()):,}"))
-    value_width = max(map(len, values))
-    gap = " " * (_BAR + 11)
-    lines = [f"{'option':{width}}  {'visits':>{visits_width}}{gap}  {'Q':>{value_width}}  prior"]
-    for a in order[:_MAX_OPTIONS]:
-        visits = int(edges["visits"][a])
-        if int(edges["closed"][a]) == FORBIDDEN:
-            lines.append(f"{names[a]:{width}}  {'not allowed':>{visits_width}}")
-            continue
-        bar = "#" * round(_BAR * visits / total)
-        simulated = int(edges["child"][a]) >= 0
-        lines.append(
-            f"{names[a]:{width}}  {visits:>{visits_width},} {100 * visits / total:5.1f} % "
-            f"|{bar:{_BAR}}|  {values[a] if simulated else '-':>{value_width}}  "
-            f"{float(edges['prior'][a]):.3f}"
-        )
-    left_out = order[_MAX_OPTIONS:]
-    if left_out:
-        visits = int(edges["visits"][left_out].sum())
-        lines.append(f"... and {plural(len(left_out), 'option')} with {plural(visits, 'visit')}")
+    forbidden, visits = edges["closed"] == FORBIDDEN, edges["visits"].astype(np.int64)
+    order = np.lexsort((-edges["value"], -visits, forbidden))
+    shown, left_out = order[:_MAX_OPTIONS], order[_MAX_OPTIONS:]
+    shares, values = visits / max(int(visits.sum()), 1), _numbers(edges["value"])
+    columns: dict[str, list[str]] = {"option": [], "visits": [], "": [], "Q": [], "prior": []}
+    for a in shown:
+        bar = f"{100 * shares[a]:.1f} % |{'#' * round(_BAR * shares[a]):{_BAR}}|"
+        q = values[a] if edges["child"][a] >= 0 else "-"
+        cells = [names[a], f"{visits[a]:,}", bar, q, f"{edges['prior'][a]:.3f}"]
+        if forbidden[a]:
+            cells[1:] = ["not allowed", "", "", ""]
+        for column, cell in zip(columns.values(), cells, strict=True):
+            column.append(cell)
+    lines = _table(columns)
+    if len(left_out):
+        number = int(visits[left_out].sum())
+        lines.append(f"... and {plural(len(left_out), 'option')} with {plural(number, 'visit')}")
     return lines
 
 
 def _table_of_steps(tree: TreeArrays, root: int, plan: list[int], names: list[str]) -> list[str]:
     nodes = tree.nodes[root, plan[1:]]
     edges = tree.edges[root, nodes["parent"], nodes["option"]]
-    columns = {
-        "option": [names[a] for a in nodes["option"]],
-        "steps": [f"{int(n):,}" for n in nodes["base_steps"]],
-        "R": _numbers(nodes["reward"]),
-        "return": _numbers(nodes["path_return"]),
-        "Q": _numbers(edges["value"]),
-        "V": _numbers(nodes["value"]),
-        "visits": [f"{int(n):,}" for n in nodes["visits"]],
-    }
-    widths = {name: max(len(name), *map(len, column)) for name, column in columns.items()}
-    number_width = max(3, len(str(len(nodes))))
-    room = _LINE_WIDTH - number_width - sum(width + 2 for width in widths.values())
-    if room < 0:
-        widths["option"] = max(widths["option"] + room, len("option"))
-        columns["option"] = [_clip(name, widths["option"]) for name in columns["option"]]
-
-    def row(number: str, cells: Sequence[str]) -> str:
-        texts = [
-            f"{cell:{width}}" if name == "option" else f"{cell:>{width}}"
-            for (name, width), cell in zip(widths.items(), cells, strict=True)
-        ]
-        return "  ".join([f"{number:>{number_width}}", *texts])
-
-    lines = [row("#", list(columns))]
-    rows = [row(str(i + 1), cells) for i, cells in enumerate(zip(*columns.values(), strict=True))]
-    if len(rows) > _MAX_STEPS:
-        head, tail = rows[: _MAX_STEPS // 2], rows[-_MAX_STEPS // 2 + 1 :]
-        gap = f"... {plural(len(rows) - len(head) - len(tail), 'option')} left out ..."
-        rows = [*head, f"{'':{number_width}}  {gap}", *tail]
-    lines += rows
+    lines = _table(
+        {
+            "#": [f"{i + 1:>3}" for i in range(len(nodes))],
+            "option": [names[a] for a in nodes["option"]],
+            "steps": [f"{int(n):,}" for n in nodes["base_steps"]],
+            "R": _numbers(nodes["reward"]),
+            "return": _numbers(nodes["path_return"]),
+            "Q": _numbers(edges["value"]),
+            "V": _numbers(nodes["value"]),
+            "visits": [f"{int(n):,}" for n in nodes["visits"]],
+        }
+    )
+    if len(nodes) > _MAX_STEPS:
+        head, tail = lines[: 1 + _MAX_STEPS // 2], lines[-_MAX_STEPS // 2 + 1 :]
+        gap = f"... {plural(len(lines) - len(head) - len(tail), 'option')} left out ..."
+        lines = [*head, f"     {gap}", *tail]
     twin = int(nodes["twin"][-1])
     if twin >= 0:
         where = ", ".join(names[a] for a in tree.options(root, twin))
         lines.append(f"It continues from the same state behind: {_clip(where, 48) or 'the root'}")
     return lines
+
+
+def _table(columns: dict[str, list[str]]) -> list[str]:
+    """Lines of a table, its header first; options are cut where it would be too wide."""
+    widths = {name: max(len(name), *map(len, cells)) for name, cells in columns.items()}
+    room = _LINE_WIDTH - sum(widths.values()) - 2 * (len(widths) - 1)
+    widths["option"] = max(widths["option"] + min(room, 0), len("option"))
+    columns = {**columns, "option": [_clip(name, widths["option"]) for name in columns["option"]]}
+    rows = [list(columns), *zip(*columns.values(), strict=True)]
+    return [
+        "  ".join(
+            f"{cell:{'<' if name == 'option' else '>'}{width}}"
+            for (name, width), cell in zip(widths.items(), row, strict=True)
+        )
+        for row in rows
+    ]
 
 
 def _numbers(values: Any) -> list[str]:

@@ -70,9 +70,10 @@ class MCTSPlanner(TensorDictModuleBase):
             none of those of the env that is acted in.
         gamma (float, optional): discount per base step. Default: that of the env's
             ``OptionTransform``, through any nesting of envs; 0.99 for an env without durations.
-        tree_policy, backup, novelty, transpositions, chance, rollout, expand, leaves_per_wave,
-            waves_in_flight, exhausted: the parts of the search, see :class:`SearchSettings`.
-            ``planner.settings`` holds them; each can be read and assigned as an attribute.
+        tree_policy, backup, novelty, transpositions, chance: parts of the search, see
+            :class:`SearchSettings`. ``planner.settings`` holds them; each can be read and assigned
+            as an attribute.
+        rollout, expand, leaves_per_wave, waves_in_flight, exhausted: parts of the search, too.
         leaf_evaluator (callable, optional): ``leaf_evaluator(td) -> values [m]`` or ``[m, 1]`` of
             new nodes, from their state and observation, or an :class:`Evaluation` of values and
             priors: :class:`ValueEvaluator`, :class:`RolloutEvaluator`, :class:`MixedEvaluator`,
