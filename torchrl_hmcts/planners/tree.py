@@ -88,7 +88,7 @@ FACTORS = 256  # visits of a node up to which its exploration factor is looked u
 # 0.1 us each a call.
 RECORD = np.dtype(
     [
-        ("score", np.int64),  # UCT_SCORE ... GUMBEL_SCORE
+        ("score", np.int64),  # UCT_SCORE ... PYTHON_SCORE
         ("c", np.float64),
         ("c_base", np.float64),  # 0: a constant c
         ("c_scale", np.float64),
@@ -106,7 +106,7 @@ RECORD = np.dtype(
     ],
     align=True,
 )
-UCT_SCORE, PUCT_SCORE, GUMBEL_SCORE = 0, 1, 2
+UCT_SCORE, PUCT_SCORE, GUMBEL_SCORE, PYTHON_SCORE = 0, 1, 2, 3
 RAW_VALUES, SIBLINGS, WHOLE_TREE = 0, 1, 2
 MEAN_BACKUP, MAX_BACKUP = 0, 1
 
