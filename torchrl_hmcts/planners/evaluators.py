@@ -25,6 +25,7 @@ from torchrl_hmcts.planners.evaluation import (
     check_priors,
     check_values,
 )
+from torchrl_hmcts.planners.keys import entry_key
 from torchrl_hmcts.planners.simulator import Simulator
 
 
@@ -436,7 +437,7 @@ class _Network:
                 f'TensorDictModule(net, in_keys=["observation"], out_keys={list(keys)!r}).'
             )
         writes = [unravel_key(k) for k in module.out_keys]
-        self.keys = [unravel_key(k) for k in keys]
+        self.keys = [entry_key(owner, "its outputs", k) for k in keys]
         for key in self.keys:
             if key not in writes:
                 raise ValueError(f"{owner} reads {key!r}; its module writes {writes}.")

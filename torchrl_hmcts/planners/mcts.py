@@ -177,6 +177,12 @@ class MCTSPlanner(TensorDictModuleBase):
         self._gumbel_choice = final_choice is None and self.settings.is_gumbel
         if final_choice is None:
             final_choice = BestPlan() if chance is None else MostVisited()
+        if not hasattr(final_choice, "choose"):
+            raise TypeError(
+                f"final_choice needs choose(search), e.g. BestPlan(); got {final_choice}."
+            )
+        if progress is not None and not callable(progress):
+            raise TypeError(f"progress must be callable; got {progress!r}.")
         self.final_choice = final_choice
         self.progress = progress
         if seed is not None:
