@@ -75,6 +75,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         ValueError: if a number is out of range, ``divergence`` comes without ``divergence_key`` or
             the other way round, the planner's env has no such entry, or ``env`` has other options;
             at a call if the mapped state lacks an entry or has another batch size.
+        TypeError: if an argument is of another kind.
 
     Reference:
         Dissertation, sections 3.2.1 and 4.2: plan in a simulation, execute in the environment.
@@ -93,7 +94,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         [1, 2, 3]
         >>> policy = HierarchicalPolicy(  # a model that has another name for its state
         ...     MCTSPlanner(env), state_map=lambda td: TensorDict({"state": td["place"]}, []))
-        >>> policy(TensorDict({"place": torch.tensor([2])}, []))["action"]
+        >>> policy(TensorDict({"place": torch.tensor(2)}, []))["action"]
         tensor(1)
     """
 
@@ -312,6 +313,7 @@ class GoalPlanner:
     Raises:
         ValueError: if the macro environment has no entry ``goal_key``; when planning, if a search
             ends without a plan.
+        TypeError: if ``to_macro`` cannot be called.
 
     Reference:
         Dissertation, section 3.2.1 and figure 3.3.

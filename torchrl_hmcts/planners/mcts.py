@@ -102,6 +102,7 @@ class MCTSPlanner(TensorDictModuleBase):
         ValueError: at construction if the env cannot be set to a state or its action is not
             discrete; at the call if an entry of the state is missing or not finite, or no option
             may be taken.
+        TypeError: if a part is of another kind.
 
     Reference:
         Dissertation, sections 2.4.2, 3.2.1 and 4.2; Kocsis and Szepesvari 2006.
