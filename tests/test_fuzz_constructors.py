@@ -121,8 +121,6 @@ GOOD: dict[str, Good] = {
         PUCT={},
         UCT={},
         BestPlan={},
-        MaxBackup={},
-        MeanBackup={},
         MostVisited={},
         DirichletNoise={},
         Gumbel={},
@@ -149,14 +147,12 @@ GOOD: dict[str, Good] = {
         },
         MCTSPlanner={"env": lambda: chain()},
         HierarchicalPolicy={"planner": lambda: planner()},
-        ModelBasedControl={"planner": lambda: planner()},
         GoalPlanner={"planner": lambda: planner(), "to_macro": abs, "goal_key": "state"},
+        SearchSettings={},
         SearchTree={"num_roots": 2, "num_options": 3},
         Search={
             "num_roots": 2,
             "num_options": 3,
-            "tree_policy": lambda: planners.UCT(),
-            "backup": lambda: planners.MaxBackup(),
         },
     ),
     **everything(
@@ -294,9 +290,9 @@ COSTLY = {  # milliseconds each; the others take microseconds
     *("IntraOptionQLoss", "OptionTerminationLoss", "ExpertIterationLoss", "SkillDynamicsLoss"),
 }
 EXCLUDED = {  # why public names are not fuzzed here
-    "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
+    "a record that is filled": "Evaluation NodeStatistics Plan TreeView Root SearchProgress Transition "
     "GoalEpisodes GoalTrack TerminationResult AtariProgress Candidate Options Controllability",
-    "a protocol": "NoveltyTest PlansGoals OptionWorker WorkerSource",
+    "a protocol, or searches from any object": "ReferenceSearch NoveltyTest PlansGoals OptionWorker WorkerSource",
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
