@@ -290,9 +290,11 @@ COSTLY = {  # milliseconds each; the others take microseconds
     *("IntraOptionQLoss", "OptionTerminationLoss", "ExpertIterationLoss", "SkillDynamicsLoss"),
 }
 EXCLUDED = {  # why public names are not fuzzed here
-    "a record that is filled": "Evaluation NodeStatistics Plan TreeView Root SearchProgress Transition "
-    "GoalEpisodes GoalTrack TerminationResult AtariProgress Candidate Options Controllability",
-    "a protocol, or searches from any object": "ReferenceSearch NoveltyTest PlansGoals OptionWorker WorkerSource",
+    "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
+    "Evaluation GoalEpisodes GoalTrack TerminationResult AtariProgress Candidate Options "
+    "Controllability",
+    "a protocol": "NoveltyTest PlansGoals OptionWorker WorkerSource",
+    "searches from any object": "ReferenceSearch",
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
