@@ -88,7 +88,7 @@ class Section:
 
     @property
     def filled(self) -> bool:
-        """Whether anything stands below the heading."""
+        """Is true if anything stands below the heading."""
         return any(
             (self.link, self.code, self.pictures, self.panels, self.columns, self.tables)
         ) or bool(self.inside or (self.words and not self.title))

@@ -1,4 +1,4 @@
-"""What a run leaves in its folder, and how it is read again.
+"""Files that a run leaves in its folder, and reading them again.
 
 ========================  ======================================================================
 ``run.json``              experiment, config, commands, versions, machine, status; written first
@@ -104,7 +104,7 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether it came to its end; one that is being extended has not yet."""
+        """True once it came to its end; one that is being extended has not yet."""
         return bool(self.metrics) and self.status in ("", "finished")
 
     @property

@@ -66,7 +66,7 @@ class RunningEpisodes:
 
     @property
     def complete(self) -> bool:
-        """Whether the env's whole state is in the tensordict."""
+        """True if the env's whole state is in the tensordict."""
         env = self.collector.env
         return bool(env._supports_set_state or not env.batch_locked)
 
