@@ -125,9 +125,8 @@ class ResumableTrainer(Trainer):
         if isinstance(collector, Collector):
             self._episodes = RunningEpisodes(collector)
             self.register_module("running_episodes", self._episodes)
-            self.register_module(
-                "generators", GeneratorStates(env=collector.env, policy=collector._wrapped_policy)
-            )
+            policy = collector._wrapped_policy  # the one that acts
+            self.register_module("generators", GeneratorStates(env=collector.env, policy=policy))
 
     @property
     def history(self) -> dict[str, list[float]]:
