@@ -261,7 +261,7 @@ GOOD: dict[str, Good] = {
         SearchGuide={"num_options": 3, "hidden": (4,), "buffer_size": 8},
         OptionGoals={"goals": [0, 2]},
         AtariSearch={},
-        GoalSearch={},
+        RuleSource={},
         DemoConfig={},
         TerminationConfig={},
         StateCoverage={},
@@ -330,23 +330,14 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(
         [
             "AtariAgent",
-            "GoalFinder",
-            "ActionSetSource",
-            "ActionSource",
-            "BestSource",
-            "RepeatSource",
-            "GoalSource",
-            "DIAYNSource",
-            "DistilledSource",
-            "FineTunedSource",
-            "RetrainedSource",
+            "AtariKit",
+            "TrainedSource",
         ],
         "plays an Atari game: test_atari_agent.py, test_atari_sources.py",
     ),
     **dict.fromkeys(
-        ["AtariProgress", "Candidate", "Options", "Controllability"], "a record of results"
+        ["Options", "Controllability"], "a record of results"
     ),
-    **dict.fromkeys(["WorkerSource"], "a protocol"),
     **dict.fromkeys(["ContinuousDIAYNLoss"], "SkillSACLoss with a discriminator"),
     **dict.fromkeys(["NStepReturn"], "the arguments of TorchRL's ValueEstimatorBase"),
     **dict.fromkeys(["OptionModelEnv", "TorchRLGymnasiumEnv"], "reads another env's specs first"),
