@@ -43,10 +43,10 @@ class Once:
     found: Options | None = None
     seconds: float = 0.0
 
-    def find(self, kit: AtariKit, *, log: Any = print) -> Options:
+    def find(self, kit: AtariKit) -> Options:
         if self.found is None:
             begin = time.process_time()
-            self.found = self.source.find(kit, log=log)
+            self.found = self.source.find(kit)
             self.seconds = time.process_time() - begin
         copy = Options.from_plain(self.found.plain())
         return replace(copy, teacher=self.found.teacher, training=self.found.training)

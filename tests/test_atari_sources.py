@@ -36,16 +36,16 @@ from torchrl_hmcts.trainers import (  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari import rules  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.fine_tuning import option_transitions  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari.memory import Trial, TrialMemory  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.options import (  # noqa: E402
     load_worker,
     plain_worker,
 )
 from torchrl_hmcts.trainers.experiments.atari.rules import RuleSearch  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.sources import make_source  # noqa: E402
-from torchrl_hmcts.trainers.experiments.atari.trials import Trial, TrialMemory  # noqa: E402
 
 TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)])
-KIT = AtariKit("Breakout", num_processes=0)
+KIT = AtariKit("Breakout", num_processes=0, log=lambda text: None)
 SMALL_SKILLS = {"skill_steps": 8, "num_envs": 2}
 
 
@@ -55,17 +55,13 @@ class Given:
     def __init__(self, worker) -> None:
         self.worker = worker
 
-    def find(self, kit, *, log) -> Options:
+    def find(self, kit) -> Options:
         names = [f"option {z}" for z in range(self.worker.num_options)]
         return Options(self.worker, names, num_frames=7)
 
 
-def quiet(text: str) -> None:
-    """Says nothing."""
-
-
-def find(source, kit=KIT) -> Options:
-    return source.find(kit, log=quiet)
+def train(*args, **settings) -> Options:
+    return TrainedSource(*args, **settings).find(KIT)
 
 
 def network_weights(options: Options) -> torch.Tensor:
@@ -118,56 +114,26 @@ def test_joined_and_interrupted_workers_keep_their_options_and_ends() -> None:
     assert not OccasionalAction(RepeatActions(2), 1).ends(None, 0, 9)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: FollowGoals([]), "a goal for each option; got none"),
-        (lambda: FollowGoals([ByteGoal(128, 0, 0, 1, 2)]), "bytes 0 to 127; got .*controlled=128"),
-        (
-            lambda: FollowGoals([ByteGoal(0, 1, 0, 1, 2)], fire=1, fire_probability=1.5),
-            "from 0 to 1; got 1.5",
-        ),
-        (lambda: JoinedWorkers([]), "at least one worker; got none"),
-        (lambda: OccasionalAction(RepeatActions(2), 1, 1.5), "from 0 to 1; got 1.5"),
-        (lambda: OptionGoals([]), "got none"),
-        (lambda: OptionGoals([3], scale=0.0), "scale > 0.0.*; got 0.0"),
-        (lambda: RuleSource("luck"), "one of best, goals, .*got 'luck'"),
-        (lambda: RuleSource(repetitions=0), "repetitions >= 1; got 0"),
-        (lambda: TrainedSource("by hand"), "one of diayn, distilled, .*got 'by hand'"),
-        (lambda: SearchGuide(3, min_visits=0), "min_visits >= 1; got 0"),
-    ],
-)
-def test_what_cannot_be_is_refused(make, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
-@pytest.mark.parametrize("kind", ["repeat", "goals", "network", "occasional", "nested", "joined"])
-def test_options_are_built_again_from_what_was_saved(kind) -> None:
+def test_options_are_built_again_from_what_was_saved() -> None:
     network = SharedMLP(2, 4, hidden=(8,))
     network.weights.normal_(generator=torch.Generator().manual_seed(0))
-    workers = {"repeat": RepeatActions([3, 1]), "goals": TRACKERS, "network": network}
-    workers["occasional"] = OccasionalAction(network, 2, 0.5)
-    workers["nested"] = OccasionalAction(JoinedWorkers([TRACKERS, network]), 1)
-    workers["joined"] = JoinedWorkers(list(workers.values()))
-    before = workers[kind]
+    nested = OccasionalAction(JoinedWorkers([TRACKERS, network]), 1)
+    parts = [RepeatActions([3, 1]), TRACKERS, network, OccasionalAction(network, 2, 0.5), nested]
+    before = JoinedWorkers(parts)
     plain = Options(before, ["a"], 7, {"c": 1}).plain()
-    parts = [plain_worker(w) for w in before.workers] if kind == "joined" else None
-    older = {**plain, "saved": {"parts": parts or plain["saved"]["parts"], "teacher": []}}
+    older = {**plain, "saved": {"parts": [plain_worker(part) for part in parts], "teacher": []}}
+    ram = np.arange(128, dtype=np.uint8)[::-1].copy()
     for again in (Options.from_plain(plain), Options.from_plain(older)):
         assert (again.names, again.num_frames, again.report) == (["a"], 7, {"c": 1})
-        assert again.worker.num_options == before.num_options
-        ram = np.arange(128, dtype=np.uint8)[::-1].copy()
-        for option in range(before.num_options):
-            drawn = [
-                [w.act(ram, option, draws) for _ in range(20)]
-                for w, draws in ((w, np.random.default_rng(1)) for w in (again.worker, before))
-            ]
-            assert drawn[0] == drawn[1]
-    with pytest.raises(ValueError, match="kind 'magic' are not known"):
-        load_worker({"kind": "magic"})
-    with pytest.raises(TypeError, match="Given cannot be saved as plain data"):
-        plain_worker(Given(None))
+        assert again.worker.num_options == before.num_options == 14
+        for option in range(14):
+            draws = [np.random.default_rng(1) for _ in range(2)]
+            for _ in range(20):
+                acts = [
+                    w.act(ram, option, d)
+                    for w, d in zip((again.worker, before), draws, strict=True)
+                ]
+                assert acts[0] == acts[1]
 
 
 def test_weights_are_written_back_into_the_network_they_came_from() -> None:
@@ -212,14 +178,14 @@ def test_every_source_of_a_config_is_made_of_rules_and_trainings() -> None:
 
 
 def test_repeated_actions_are_an_option_each() -> None:
-    options = find(RuleSource("repeat"))
+    options = RuleSource("repeat").find(KIT)
     assert options.names == ["NOOP", "FIRE", "RIGHT", "LEFT"]
     assert [options.worker.act(None, z, None) for z in range(4)] == [0, 1, 2, 3]
     assert options.num_frames == 0
 
 
 def test_the_goals_of_breakout_are_found_without_being_told() -> None:
-    search = RuleSearch(RuleSource("goals", probe_states=150, screen_steps=300), KIT, quiet)
+    search = RuleSearch(RuleSource("goals", probe_states=150, screen_steps=300), KIT)
     report: dict = {}
     candidates, states = search.probe(report)
     assert report["controllable"] == [72]  # the paddle
@@ -256,8 +222,8 @@ def test_of_all_actions_those_are_taken_with_which_trials_score_best(trials, bes
     fires = {1, 4, 5}  # NOOP, FIRE, RIGHT, LEFT, RIGHTFIRE, LEFTFIRE
     wanted = fires if best == "firing" else {0, 2, 3}
     asked = trials(lambda actions: 10.0 * len(wanted & set(actions)) / len(actions))
-    pong = AtariKit("Pong", num_processes=0, seed=3)
-    found = find(RuleSource("action_sets"), pong)
+    pong = replace(KIT, game="Pong", seed=3)
+    found = RuleSource("action_sets").find(pong)
     assert found.names[0] == name
     assert len(found.names) == 3
     assert found.report["action_sets"] == {
@@ -267,19 +233,14 @@ def test_of_all_actions_those_are_taken_with_which_trials_score_best(trials, bes
     }
     assert [row[-1] for row in asked] == [30_000, 30_001] * 3
     assert found.num_frames == 6 * 100
-
-
-def test_sets_of_one_action_are_not_tried(trials) -> None:
-    trials(lambda actions: 0.0)
-    found = find(RuleSource("action_sets"))
-    assert list(found.report["action_sets"]) == ["all", "not firing"]  # FIRE alone fires
-    assert found.names == ["NOOP", "FIRE", "RIGHT", "LEFT"]  # of equal sets the first
+    equal = RuleSource("action_sets").find(KIT)  # in Breakout FIRE alone fires
+    assert list(equal.report["action_sets"]) == ["all", "not firing"]
 
 
 def test_options_are_added_one_by_one_until_the_score_falls(trials) -> None:
     worth = {0: 1.0, 1: 0.0, 2: 4.0, 3: 2.0}
     trials(lambda actions: sum(worth[a] for a in actions) - max(0, len(actions) - 2) ** 2 * 2.0)
-    found = find(RuleSource("actions", min_options=1))
+    found = RuleSource("actions", min_options=1).find(KIT)
     # RIGHT alone 4, LEFT too 6, NOOP too 7 - 2: it falls, and the two are left.
     assert found.names == found.report["chosen"] == ["RIGHT", "LEFT"]
     assert [row["options"] for row in found.report["trials"]][4:7] == [
@@ -289,19 +250,20 @@ def test_options_are_added_one_by_one_until_the_score_falls(trials) -> None:
 
 
 def test_the_candidates_whose_options_score_best_in_trials_are_taken(trials, monkeypatch) -> None:
-    def found(self, name) -> Options:
-        self.num_frames += 7
-        chosen = self.repeats()[: {"action_sets": 2, "actions": 3, "goals": 4}[name]]
-        names = [rule.name for rule in chosen]
-        return Options(rules.joined(chosen), names, self.num_frames, {"of": name})
+    sizes = {"action_sets": 2, "actions": 3, "goals": 4}
+    real = RuleSearch.choose
 
-    real = RuleSearch.find
+    def choose(self, name, report):
+        if name == "best":
+            return real(self, name, report)
+        self.num_frames += 7
+        report["of"] = name
+        return self.repeats()[: sizes[name]]
+
+    monkeypatch.setattr(RuleSearch, "choose", choose)
     asked = trials(lambda actions: {2: 3.0, 3: 5.0, 4: 4.0}[len(actions)])
-    monkeypatch.setattr(
-        RuleSearch, "find", lambda self, n: (real if n == "best" else found)(self, n)
-    )
-    best = find(RuleSource("best"), replace(KIT, seed=1))
-    assert best.worker.num_options == 3
+    best = RuleSource("best").find(replace(KIT, seed=1))
+    assert best.names == ["NOOP", "FIRE", "RIGHT"]
     assert (best.report["source"], best.report["of"]) == ("actions", "actions")
     scores = {name: row["score"] for name, row in best.report["sources"].items()}
     assert scores == {"action_sets": 3.5, "actions": 5.5, "goals": 4.5}
@@ -317,8 +279,7 @@ def test_trials_of_other_settings_or_a_damaged_file_are_played_again(tmp_path, c
     assert TrialMemory(path, {"game": "Pong"}).recall("key") == Trial(1.0, 2, 3)
     assert TrialMemory(path, {"game": "Breakout"}).recall("key") is None
     assert capsys.readouterr().err == ""
-    whole = path.read_text()
-    changed = whole.replace("1.0", "9.0")
+    changed = path.read_text().replace("1.0", "9.0")
     for text in ("[]", "{", '{"settings": {"game": "Pong"}}', changed, "\udcff"):
         path.write_bytes(text.encode(errors="surrogateescape"))
         assert TrialMemory(path, {"game": "Pong"}).recall("key") is None
@@ -336,7 +297,7 @@ def test_trials_of_other_settings_or_a_damaged_file_are_played_again(tmp_path, c
 @pytest.mark.parametrize("discriminator", ["state", "displacement"])
 def test_skills_learned_on_the_ram_become_options(discriminator) -> None:
     sizes = {"num_skills": 2, "base_steps": 128, "hidden": (16,), **SMALL_SKILLS}
-    options = find(TrainedSource("diayn", discriminator=discriminator, **sizes))
+    options = train("diayn", discriminator=discriminator, **sizes)
     assert options.worker.num_options == 2
     assert options.num_frames == 4 * 128
     again = Options.from_plain(options.plain())
@@ -348,7 +309,7 @@ def test_skills_learned_on_the_ram_become_options(discriminator) -> None:
 
 
 def test_a_network_learns_the_goals_that_rules_follow() -> None:
-    options = find(distilled(samples=900, epochs=30, hidden=(32,), batch_size=32, lr=3e-3))
+    options = distilled(samples=900, epochs=30, hidden=(32,), batch_size=32, lr=3e-3).find(KIT)
     assert options.names == ["option 0", "option 1", "option 2"]
     assert options.num_frames > 7
     assert options.report["distilled_agreement"] > 0.8  # of 4 actions
@@ -363,20 +324,17 @@ def test_a_network_learns_the_goals_that_rules_follow() -> None:
 
 def test_goals_pay_for_being_near_and_actions_for_being_repeated() -> None:
     goals = OptionGoals([ByteGoal(5, 9, -4, 2, 3), 3], scale=10.0)
-    ram = torch.zeros(4, 128)
+    ram = torch.zeros(5, 128)
     ram[:, 9] = 50
-    ram[:, 5] = torch.tensor([46.0, 41.0, 60.0, 46.0])  # 0, 5 and 14 away from 50 - 4
+    ram[:, 5] = torch.tensor([46.0, 41.0, 60.0, 46.0, 46.0])  # 0, 5 and 14 away from 50 - 4
     td = TensorDict(
-        skill=torch.tensor([0, 0, 0, 1]),
-        action=torch.tensor([0, 1, 2, 3]),
-        next=TensorDict(observation=ram / 255.0, batch_size=[4]),
-        batch_size=[4],
+        skill=torch.tensor([0, 0, 0, 1, 1]),
+        action=torch.tensor([0, 1, 2, 3, 0]),
+        next=TensorDict(observation=ram / 255.0, batch_size=[5]),
+        batch_size=[5],
     )
-    torch.testing.assert_close(
-        goals.reward(td).flatten(), torch.tensor([1.0, 0.5, 0.0, 1.0]), atol=1e-4, rtol=0
-    )
-    td["action"][3] = 0
-    assert goals.reward(td)[3].item() == 0.0
+    expected = torch.tensor([[1.0], [0.5], [0.0], [1.0], [0.0]])
+    torch.testing.assert_close(goals.reward(td), expected, atol=1e-4, rtol=0)
     assert list(goals.parameters()) == []
 
 
@@ -413,52 +371,60 @@ def test_recorded_options_become_the_transitions_that_an_env_makes_of_their_acti
 
 
 def test_while_the_critics_warm_up_the_actor_stays_and_then_it_learns() -> None:
-    before = find(distilled())
+    before = distilled().find(KIT)
     small = {"base_steps": 96, "updates_per_batch": 1, **SMALL_SKILLS}
-    same = find(TrainedSource("fine_tuned", distilled(), warm_up=0.99, **small))
-    other = find(TrainedSource("fine_tuned", distilled(), warm_up=0.5, lr=1e-2, **small))
+    same = train("fine_tuned", distilled(), warm_up=0.99, **small)
+    other = train("fine_tuned", distilled(), warm_up=0.5, lr=1e-2, **small)
     torch.testing.assert_close(network_weights(same), network_weights(before))
     assert not network_weights(other).allclose(network_weights(before), atol=1e-3)
     assert other.num_frames == before.num_frames + 4 * 96
     assert 0.0 <= other.report["fine_tuned_goal_reward"] <= 1.0
     assert network_weights(Options.from_plain(other.plain())).equal(network_weights(other))
     assert len(other.training.data) == 96  # those of the warm-up too
+    rounds = {"search": AtariSearch(ratio=2), "rounds": 1, "round_steps": 5, "option_steps": 5}
+    waiting = train("retrained", distilled(), warm_up=1.0, **rounds)
+    torch.testing.assert_close(network_weights(waiting), network_weights(before))
 
 
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (
-            lambda: TrainedSource("fine_tuned", Given(TRACKERS)),
-            TypeError,
-            "executed by FollowGoals",
-        ),
-        (
-            lambda: TrainedSource("retrained", Given(SharedMLP(2, 4))),
-            TypeError,
-            "What these options are for is not known",
-        ),
-        (lambda: TrainedSource("diayn", discriminator="ram"), ValueError, "'controllable'.*'ram'"),
-        (lambda: TrainedSource("retrained", distilled(), rounds=0), ValueError, "rounds >= 1; got"),
-        (lambda: TrainedSource("retrained", distilled(), warm_up=2.0), ValueError, "warm_up .*2.0"),
-        (lambda: TrainedSource("fine_tuned", distilled(), warm_up=-1), ValueError, "warm_up .*-1"),
+        (lambda: FollowGoals([]), ValueError, "a goal for each option; got none"),
+        (lambda: FollowGoals([ByteGoal(128, 0, 0, 1, 2)]), ValueError, "0 to 127; got .*=128"),
+        (lambda: FollowGoals(TRACKERS.goals, fire=1, fire_probability=2.0), ValueError, "got 2.0"),
+        (lambda: JoinedWorkers([]), ValueError, "at least one worker; got none"),
+        (lambda: OccasionalAction(RepeatActions(2), 1, 1.5), ValueError, "from 0 to 1; got 1.5"),
+        (lambda: load_worker({"kind": "magic"}), ValueError, "kind 'magic' are not known"),
+        (lambda: plain_worker(Given(None)), TypeError, "Given cannot be saved as plain data"),
+        (lambda: OptionGoals([]), ValueError, "got none"),
+        (lambda: OptionGoals([3], scale=0.0), ValueError, "scale > 0.0.*; got 0.0"),
+        (lambda: RuleSource("luck"), ValueError, "one of best, goals, .*got 'luck'"),
+        (lambda: RuleSource(repetitions=0), ValueError, "repetitions >= 1; got 0"),
+        (lambda: SearchGuide(3, min_visits=0), ValueError, "min_visits >= 1; got 0"),
+        (lambda: TrainedSource("by hand"), ValueError, "one of diayn, .*got 'by hand'"),
         (lambda: TrainedSource("distilled"), TypeError, "needs another source; got None"),
         (lambda: TrainedSource("diayn", distilled()), TypeError, "begins with no other; got"),
         (lambda: TrainedSource("diayn", base_step=3), TypeError, "'base_step'"),
+        (lambda: train("diayn", discriminator="ram"), ValueError, "'controllable'.*'ram'"),
+        (lambda: train("fine_tuned", Given(TRACKERS)), TypeError, "executed by FollowGoals"),
+        (lambda: train("retrained", Given(SharedMLP(2, 4))), TypeError, "for is not known"),
+        (lambda: train("retrained", distilled(), rounds=0), ValueError, "rounds >= 1; got 0"),
+        (lambda: train("retrained", distilled(), warm_up=2.0), ValueError, "warm_up .*2.0"),
+        (lambda: train("fine_tuned", distilled(), warm_up=-1), ValueError, "warm_up .*-1"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(make, error, message) -> None:
+def test_what_cannot_be_is_refused(make, error, message) -> None:
     with pytest.raises(error, match=message):
-        find(make())
+        make()
 
 
 @pytest.mark.parametrize("kind", ["goals", "state", "displacement"])
 def test_a_worker_is_retrained_on_what_searches_simulated(kind) -> None:
     sizes = {"num_skills": 2, "base_steps": 64, "hidden": (8,), **SMALL_SKILLS}
     source = distilled() if kind == "goals" else TrainedSource("diayn", discriminator=kind, **sizes)
-    before = find(source)
+    before = source.find(KIT)
     rounds = {"search": AtariSearch(ratio=2), "rounds": 2, "round_steps": 10, "option_steps": 5}
-    after = find(TrainedSource("retrained", source, lr=1e-2, **rounds))
+    after = train("retrained", source, lr=1e-2, **rounds)
     rows = after.report["rounds"]
     assert [row["real_steps"] for row in rows] == [10, 10]
     # Simulated and executed base steps; nothing ends here, so all options are whole.
@@ -466,12 +432,6 @@ def test_a_worker_is_retrained_on_what_searches_simulated(kind) -> None:
     assert after.num_frames - before.num_frames >= 4 * sum(row["samples"] for row in rows)
     assert not network_weights(before).allclose(network_weights(after), atol=1e-3)
     assert torch.isfinite(network_weights(after)).all()
-
-
-def test_new_critics_learn_alone_before_a_worker_is_retrained() -> None:
-    rounds = {"search": AtariSearch(ratio=2), "rounds": 1, "round_steps": 5, "option_steps": 5}
-    after = find(TrainedSource("retrained", distilled(), warm_up=1.0, **rounds))
-    torch.testing.assert_close(network_weights(after), network_weights(find(distilled())))
 
 
 # ------------------------------------------------------------------------------ guide

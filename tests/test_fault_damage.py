@@ -212,7 +212,7 @@ def atari_run_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_trials(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.trials import Trial, TrialMemory
+    from torchrl_hmcts.trainers.experiments.atari.memory import Trial, TrialMemory
 
     folder.mkdir(parents=True)
     path = folder / "trials.json"

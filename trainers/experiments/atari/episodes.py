@@ -18,9 +18,10 @@ from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSear
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
 from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP, AtariKit
+from torchrl_hmcts.trainers.experiments.atari.memory import TrialMemory
 from torchrl_hmcts.trainers.experiments.atari.options import Options
 from torchrl_hmcts.trainers.experiments.atari.sources import make_source
-from torchrl_hmcts.trainers.experiments.atari.trials import TrialMemory, Tuned, tune_search
+from torchrl_hmcts.trainers.experiments.atari.trials import Tuned, tune_search
 from torchrl_hmcts.trainers.experiments.registry import ExperimentError
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, read_state
 
@@ -86,8 +87,9 @@ class AtariRun:
             self.take_over(Path(config.options_from), "options_from")
             return
         memory = TrialMemory(trials_file(Path(config.out)), self.settings())
-        self.options = make_source(config, self.search, memory).find(self.kit)
-        self.tuned = tune_search(self.options.worker, self.kit, self.search, config, memory=memory)
+        kit = dataclasses.replace(self.kit, memory=memory)
+        self.options = make_source(config, self.search).find(kit)
+        self.tuned = tune_search(self.options.worker, kit, self.search, config)
         self._frames_before += self.options.num_frames + self.tuned.num_frames
         self._found = True
 

@@ -23,12 +23,12 @@ from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch
 from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP, AtariKit
 from torchrl_hmcts.trainers.experiments.atari.options import (
-    Log,
     Options,
     Training,
     goals_of,
     network_of,
 )
+from torchrl_hmcts.trainers.experiments.atari.skills import SLOW
 from torchrl_hmcts.transforms import SkillReward
 
 
@@ -132,7 +132,6 @@ def _goal_training(found: Options, kit: AtariKit) -> Training:
 def fine_tune(
     found: Options,
     kit: AtariKit,
-    log: Log,
     *,
     base_steps: int = 20_000,
     warm_up: float = 0.25,
@@ -153,7 +152,6 @@ def fine_tune(
     Args:
         found: options of a network, distilled from goals or repeated actions.
         kit: of the game.
-        log: told the goals' reward.
         base_steps: of training in all.
         warm_up: share of them in which only the critics learn.
         skill_steps: base steps for which an option is kept.
@@ -184,9 +182,7 @@ def fine_tune(
         frames_per_batch=batch,
         updates_per_batch=updates_per_batch,
         actor_lr=0.0,
-        critic_lr=3e-4,
-        objective_lr=3e-4,
-        target_tau=0.01,
+        **SLOW,
         reward=SkillReward(loss.objective, extrinsic_coeff=1.0),
         seed=kit.seed,
     )
@@ -200,7 +196,7 @@ def fine_tune(
     trainer.train()
     training.data = data = trainer.replay_buffer.storage.get(slice(None))
     share = loss.objective.reward(data).mean().item()
-    log(f"fine-tuned: goals' reward {share:.2f} per base step, over the last {len(data):,}")
+    kit.log(f"fine-tuned: goals' reward {share:.2f} per base step, over the last {len(data):,}")
     network_of(found.worker).load(loss.actor_network_params.parameters())
     report = {**found.report, "fine_tuned_goal_reward": share}
     num_frames = found.num_frames + FRAMES_PER_STEP * batch * batches
@@ -210,7 +206,6 @@ def fine_tune(
 def retrain(
     found: Options,
     kit: AtariKit,
-    log: Log,
     *,
     search: AtariSearch | None = None,
     rounds: int = 3,
@@ -231,7 +226,6 @@ def retrain(
     Args:
         found: options of a network: skills, or distilled from goals or repeated actions.
         kit: of the game.
-        log: told of every round.
         search: the planner of the rounds. Default: with a ratio of 10.
         rounds: of planning and retraining.
         round_steps: real base steps of a round.
@@ -288,7 +282,7 @@ def retrain(
         network_of(found.worker).load(loss.actor_network_params.parameters())
         row = {"score": agent.score, "real_steps": agent.real_steps, "samples": len(samples)}
         rows.append(row)
-        log(f"round {number + 1} of planning and retraining: {row}")
+        kit.log(f"round {number + 1} of planning and retraining: {row}")
     report = {**found.report, "rounds": rows}
     return replace(found, num_frames=num_frames, report=report, training=training)
 

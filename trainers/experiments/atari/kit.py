@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -13,6 +13,7 @@ from torchrl.envs import Compose, SerialEnv, SignTransform, TransformedEnv, Unar
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv, OptionWorker
 from torchrl_hmcts.envs.atari.emulator import AtariEmulator
+from torchrl_hmcts.trainers.experiments.atari.memory import TrialMemory
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 FRAMES_PER_STEP = 4
@@ -29,6 +30,8 @@ class AtariKit:
         max_frames: real frames after which an episode ends.
         num_processes: that emulate; 0: the calling one. Default: one for each core.
         seed: of starts, searches and networks.
+        log: told what was found, a line at a time.
+        memory: of trials that are not played again. Default: none.
 
     Example:
         >>> from torchrl_hmcts.envs import RepeatActions
@@ -45,6 +48,8 @@ class AtariKit:
     max_frames: int = 108_000
     num_processes: int | None = None
     seed: int = 0
+    log: Callable[[str], object] = field(default=print, repr=False, compare=False)
+    memory: TrialMemory | None = field(default=None, repr=False, compare=False)
 
     @property
     def action_names(self) -> list[str]:

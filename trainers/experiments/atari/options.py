@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
@@ -19,9 +18,6 @@ from torchrl_hmcts.envs import (
 )
 from torchrl_hmcts.objectives import DiscreteSkillSACLoss
 from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
-
-Log = Callable[[str], object]
-"""Told what was found, a line at a time."""
 
 
 @dataclass
@@ -88,7 +84,7 @@ class Options:
 class OptionSource(Protocol):
     """What gives a game its options, e.g. a :class:`RuleSource` or one of your own."""
 
-    def find(self, kit: AtariKit, *, log: Log = print) -> Options:
+    def find(self, kit: AtariKit) -> Options:
         """Return the options of a game."""
         ...
 

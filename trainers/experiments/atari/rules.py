@@ -5,7 +5,7 @@ Letters: S states, F = 128 bytes of RAM.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -17,8 +17,8 @@ from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs import ByteGoal, FollowGoals, JoinedWorkers, OptionWorker, RepeatActions
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariSearch
 from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit, random_states
-from torchrl_hmcts.trainers.experiments.atari.options import Log, Options
-from torchrl_hmcts.trainers.experiments.atari.trials import TrialMemory, play_trial
+from torchrl_hmcts.trainers.experiments.atari.options import Options
+from torchrl_hmcts.trainers.experiments.atari.trials import play_trial
 from torchrl_hmcts.trainers.skills.controllability import Controllability, probe_controllability
 
 CANDIDATES = ("best", "goals", "actions", "action_sets", "repeat")
@@ -38,6 +38,10 @@ class Rule(NamedTuple):
 def joined(rules: Sequence[Rule]) -> JoinedWorkers:
     """Return the worker of some rules, in their order."""
     return JoinedWorkers([rule.worker for rule in rules])
+
+
+def _names(rules: Sequence[Rule]) -> list[str]:
+    return [rule.name for rule in rules]
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,6 @@ class RuleSource:
         trial_steps: real base steps of a planner's trial.
         trial_ratio: simulated base steps per real one in a trial.
         repetitions: starts and searches over which the score of a whole set is averaged; n.
-        memory: of trials that are not played again. Default: none.
 
     Raises:
         TypeError: if a number is none.
@@ -89,11 +92,11 @@ class RuleSource:
 
     Example:
         >>> from torchrl_hmcts.trainers import AtariKit, RuleSource
-        >>> kit = AtariKit("Pong", num_processes=0)
+        >>> kit = AtariKit("Pong", num_processes=0, log=lambda text: None)
         >>> RuleSource("repeat").find(kit).names[:3]
         ['NOOP', 'FIRE', 'RIGHT']
         >>> small = {"trial_steps": 4, "trial_ratio": 1.0, "repetitions": 1}
-        >>> found = RuleSource("action_sets", **small).find(kit, log=lambda text: None)
+        >>> found = RuleSource("action_sets", **small).find(kit)
         >>> list(found.report["action_sets"])
         ['all', 'firing', 'not firing']
     """
@@ -108,7 +111,6 @@ class RuleSource:
     trial_steps: int = 300
     trial_ratio: float = 5.0
     repetitions: int = 2
-    memory: TrialMemory | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.candidates not in CANDIDATES:
@@ -123,42 +125,45 @@ class RuleSource:
             whole_number("RuleSource", name, getattr(self, name), least=1)
         real_number("RuleSource", "trial_ratio", self.trial_ratio, above=0.0)
 
-    def find(self, kit: AtariKit, *, log: Log = print) -> Options:
-        """Return the options of a game.
-
-        Args:
-            kit: of the game.
-            log: told what was found.
-        """
-        return RuleSearch(self, kit, log).find(self.candidates)
+    def find(self, kit: AtariKit) -> Options:
+        """Return the options of a game."""
+        search, report = RuleSearch(self, kit), dict[str, Any]()
+        rules = search.choose(self.candidates, report)
+        return Options(joined(rules), _names(rules), search.num_frames, report)
 
 
 class RuleSearch:
-    """One search for rules: :class:`RuleSource` at work on a game.
+    """One search for rules: a :class:`RuleSource` at work on a game."""
 
-    Attributes:
-        num_frames: frames emulated so far.
-    """
+    def __init__(self, settings: RuleSource, kit: AtariKit) -> None:
+        self.settings, self.kit, self.log = settings, kit, kit.log
+        self.num_frames = 0  # emulated so far
 
-    def __init__(self, settings: RuleSource, kit: AtariKit, log: Log) -> None:
-        self.settings, self.kit, self.log = settings, kit, log
-        self.num_frames = 0
-
-    def find(self, candidates: str) -> Options:
-        """Return the options found in a candidate set."""
-        report: dict[str, Any] = {}
-        if candidates == "best":
-            return self._best()
+    def choose(self, candidates: str, report: dict[str, Any]) -> list[Rule]:
+        """Return the rules that are chosen from a candidate set."""
         if candidates == "goals":
             ranked, states = self.probe(report)
-            chosen = self.grow(self.screen(ranked, states[:1], report), report)
-        else:
-            chosen = self.repeats()
-            if candidates == "actions":
-                chosen = self.grow(chosen, report)
-            elif candidates == "action_sets":
-                chosen = self._best_action_set(chosen, report)
-        return Options(joined(chosen), [rule.name for rule in chosen], self.num_frames, report)
+            return self.grow(self.screen(ranked, states[:1], report), report)
+        if candidates == "best":
+            reports: dict[str, dict[str, Any]] = {"action_sets": {}, "actions": {}, "goals": {}}
+            sets = {name: self.choose(name, reports[name]) for name in reports}
+            best, scores = self.best_set(sets)
+            tried = {n: {"score": scores[n], "options": _names(s)} for n, s in sets.items()}
+            report.update(reports[best], source=best, sources=tried)
+            return sets[best]
+        rules = self.repeats()
+        if candidates == "actions":
+            return self.grow(rules, report)
+        if candidates == "action_sets":
+            firing = [rule for rule in rules if "FIRE" in rule.name]
+            others = [rule for rule in rules if rule not in firing]
+            sets = {"all": rules}
+            if min(len(firing), len(others)) > 0:
+                parts = {"firing": firing, "not firing": others}
+                sets |= {name: part for name, part in parts.items() if len(part) > 1}
+            best, report["action_sets"] = self.best_set(sets)
+            return sets[best]
+        return rules
 
     def repeats(self) -> list[Rule]:
         """Return an option for each action of the game: to repeat it."""
@@ -173,7 +178,7 @@ class RuleSearch:
         pool = self.kit.make_pool(RepeatActions(len(repeats)), _HOLD_STEPS)
         states = random_states(pool, settings.probe_states, self.kit.seed)
         found = probe_controllability(pool, states, "ram")
-        goals = make_goals(found, [rule.name for rule in repeats], settings)
+        goals = make_goals(found, _names(repeats), settings)
         self.num_frames += pool.num_frames
         pool.close()
         report["controllable"] = found.controllable.tolist()
@@ -218,15 +223,18 @@ class RuleSearch:
             real_steps=settings.trial_steps,
             seed=self.kit.seed if seed is None else seed,
             start=seed,
-            memory=settings.memory,
         )
         self.num_frames += trial.num_frames
         return trial.rank
 
-    def mean_score(self, rules: Sequence[Rule]) -> float:
-        """Return the mean score over some starts and searches."""
-        count = self.settings.repetitions
-        return sum(self.score(rules, self.kit.seed * 10_000 + i) for i in range(count)) / count
+    def best_set(self, sets: Mapping[str, Sequence[Rule]]) -> tuple[str, dict[str, float]]:
+        """Return which set has the best mean score over some starts and searches, and the scores of
+        all."""
+        scores, first, count = {}, self.kit.seed * 10_000, self.settings.repetitions
+        for name, rules in sets.items():
+            scores[name] = sum(self.score(rules, first + i) for i in range(count)) / count
+            self.log(f"{name}, {_names(rules)}: {scores[name]:g}")
+        return max(scores, key=lambda name: scores[name]), scores
 
     def grow(self, ranked: Sequence[Rule], report: dict[str, Any]) -> list[Rule]:
         """Return the set of rules with which trials score best, found one by one."""
@@ -239,43 +247,17 @@ class RuleSearch:
             for rule in ranked:
                 if rule not in chosen:
                     scores[rule] = self.score([*chosen, rule])
-                    names = [r.name for r in (*chosen, rule)]
-                    trials.append({"options": names, "score": scores[rule]})
+                    trials.append({"options": _names([*chosen, rule]), "score": scores[rule]})
             chosen.append(max(scores, key=lambda rule: scores[rule]))
             reached.append(scores[chosen[-1]])
-            self.log(f"{[rule.name for rule in chosen]}: {reached[-1]:g}")
+            self.log(f"{_names(chosen)}: {reached[-1]:g}")
             if len(chosen) > settings.min_options and reached[-1] < max(reached):
                 break
         # Where a short trial cannot tell, more options are safer than fewer.
         least = min(settings.min_options, len(chosen)) - 1
         count = max(range(least, len(chosen)), key=lambda i: (round(reached[i], 3), i)) + 1
-        report["chosen"] = [rule.name for rule in chosen[:count]]
+        report["chosen"] = _names(chosen[:count])
         return chosen[:count]
-
-    def _best_action_set(self, every: list[Rule], report: dict[str, Any]) -> list[Rule]:
-        firing = [rule for rule in every if "FIRE" in rule.name]
-        sets = {"all": every, "firing": firing}
-        sets["not firing"] = [rule for rule in every if rule not in firing]
-        report["action_sets"] = scores = {}
-        for name, rules in sets.items():
-            if name == "all" or 2 <= len(rules) < len(every):
-                scores[name] = self.mean_score(rules)
-                self.log(f"{name}, {[rule.name for rule in rules]}: {scores[name]:g}")
-        return sets[max(scores, key=lambda name: scores[name])]
-
-    def _best(self) -> Options:
-        found: dict[str, Options] = {}
-        scores: dict[str, float] = {}
-        for name in ("action_sets", "actions", "goals"):
-            found[name] = options = self.find(name)
-            assert isinstance(options.worker, JoinedWorkers)
-            parts = zip(options.names, options.worker.workers, strict=True)
-            scores[name] = self.mean_score([Rule(*part) for part in parts])
-            self.log(f"{name}, {options.names}: {scores[name]:g}")
-        best = max(scores, key=lambda name: scores[name])
-        tried = {n: {"score": scores[n], "options": o.names} for n, o in found.items()}
-        report = {**found[best].report, "source": best, "sources": tried}
-        return replace(found[best], num_frames=self.num_frames, report=report)
 
 
 def make_goals(

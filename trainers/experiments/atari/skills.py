@@ -6,6 +6,7 @@ Letters: Z options, A actions, S states.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,15 +20,19 @@ from torchrl_hmcts.trainers.experiments.atari.kit import (
     AtariKit,
     random_states,
 )
-from torchrl_hmcts.trainers.experiments.atari.options import Log, Options, Training
+from torchrl_hmcts.trainers.experiments.atari.options import Options, Training
 from torchrl_hmcts.trainers.experiments.atari.rules import RuleSearch, RuleSource
 
+SLOW: dict[str, Any] = {
+    "critic_lr": 3e-4,
+    "objective_lr": 3e-4,
+    "target_tau": 0.01,
+}  # than in a maze
 _DISCRIMINATORS = ("state", "displacement", "controllable")
 
 
 def learn_skills(
     kit: AtariKit,
-    log: Log,
     *,
     num_skills: int = 3,
     base_steps: int = 40_000,
@@ -42,7 +47,6 @@ def learn_skills(
 
     Args:
         kit: of the game.
-        log: told how well skills can be told apart.
         num_skills: Z (the dissertation's N_policies).
         base_steps: of training.
         skill_steps: base steps of a mini-episode.
@@ -59,11 +63,11 @@ def learn_skills(
     """
     if discriminator not in _DISCRIMINATORS:
         raise ValueError(f"discriminator is one of {_DISCRIMINATORS}; got {discriminator!r}.")
-    report: dict[str, object] = {}
+    report: dict[str, Any] = {}
     num_frames = 0
     bytes_seen = None if discriminator == "state" else list(range(128))
     if discriminator == "controllable":
-        search, probed = RuleSearch(RuleSource("goals"), kit, log), {}
+        search, probed = RuleSearch(RuleSource("goals"), kit), dict[str, Any]()
         search.probe(probed)
         num_frames += search.num_frames
         report["controllable"] = bytes_seen = probed["controllable"]
@@ -91,18 +95,15 @@ def learn_skills(
         env,
         loss,
         total_frames=base_steps,
-        frames_per_batch=64,
         updates_per_batch=8,
         actor_lr=3e-4,
-        critic_lr=3e-4,
-        objective_lr=3e-4,
-        target_tau=0.01,
+        **SLOW,
         seed=kit.seed,
     )
     trainer.train()
     last = {name: values[-20:] for name, values in trainer.history.items() if len(values)}
     report["last"] = means = {name: sum(values) / len(values) for name, values in last.items()}
-    log(f"DIAYN: accuracy {means.get('discriminator_accuracy', float('nan')):.2f}")
+    kit.log(f"DIAYN: accuracy {means.get('discriminator_accuracy', float('nan')):.2f}")
     worker = SharedMLP(num_skills, env.action_spec.space.n, hidden=hidden)
     worker.load(loss.actor_network_params.parameters())
     return Options(
@@ -117,7 +118,6 @@ def learn_skills(
 def distil(
     found: Options,
     kit: AtariKit,
-    log: Log,
     *,
     samples: int = 20_000,
     epochs: int = 8,
@@ -137,7 +137,6 @@ def distil(
     Args:
         found: the options that are learned.
         kit: of the game.
-        log: told which share of the labels the network learned.
         samples: labelled states of each round.
         epochs: passes over all of them in each round.
         hidden: widths of the shared layers.
@@ -173,7 +172,7 @@ def distil(
         for _ in range(epochs):
             agreement = _fit(network, optimizer, *data, batch_size, generator)
         student.load(network.parameters())
-        log(f"distilled: {agreement:.1%} of {data[1].numel():,} labels")
+        kit.log(f"distilled: {agreement:.1%} of {data[1].numel():,} labels")
     report = {**found.report, "distilled_agreement": agreement}
     return Options(worker, found.names, num_frames, report, teacher=teacher)
 

@@ -10,10 +10,9 @@ from torchrl_hmcts.trainers.experiments.atari.agent import AtariSearch
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.fine_tuning import fine_tune, retrain
 from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
-from torchrl_hmcts.trainers.experiments.atari.options import Log, Options, OptionSource
+from torchrl_hmcts.trainers.experiments.atari.options import Options, OptionSource
 from torchrl_hmcts.trainers.experiments.atari.rules import CANDIDATES, RuleSource
 from torchrl_hmcts.trainers.experiments.atari.skills import distil, learn_skills
-from torchrl_hmcts.trainers.experiments.atari.trials import TrialMemory
 
 _TRAININGS: dict[str, Any] = {
     "diayn": learn_skills,
@@ -67,31 +66,29 @@ class TrainedSource:
             raise TypeError(f"TrainedSource({training!r}) {needs}; got {source!r}.")
         self.training, self.source, self.settings = training, source, settings
         begin = [] if source is None else [None]
-        inspect.signature(_TRAININGS[training]).bind(*begin, None, None, **settings)
+        inspect.signature(_TRAININGS[training]).bind(*begin, None, **settings)
 
-    def find(self, kit: AtariKit, *, log: Log = print) -> Options:
-        """Return the options of a game.
-
-        Args:
-            kit: of the game.
-            log: told how the training went.
-        """
-        begin = [] if self.source is None else [self.source.find(kit, log=log)]
-        options: Options = _TRAININGS[self.training](*begin, kit, log, **self.settings)
+    def find(self, kit: AtariKit) -> Options:
+        """Return the options of a game."""
+        begin = [] if self.source is None else [self.source.find(kit)]
+        options: Options = _TRAININGS[self.training](*begin, kit, **self.settings)
         return options
 
 
-def make_source(
-    config: AtariConfig, search: AtariSearch, memory: TrialMemory | None = None
-) -> OptionSource:
-    """Return the source that a configuration names, with the planner and memory of its trials."""
-    trials = {"trial_steps": config.trial_steps, "trial_ratio": config.trial_ratio}
-    rules = partial(RuleSource, search=search, min_options=2, memory=memory, **trials)
+def make_source(config: AtariConfig, search: AtariSearch) -> OptionSource:
+    """Return the source that a configuration names, with the planner of its trials."""
+    rules = partial(
+        RuleSource,
+        search=search,
+        min_options=2,
+        trial_steps=config.trial_steps,
+        trial_ratio=config.trial_ratio,
+    )
     if config.source in CANDIDATES:
-        return rules(config.source)
-    steps = {"base_steps": config.skill_base_steps}
-    rounds = {"round_steps": config.trial_steps}
-    network = TrainedSource("distilled", rules("goals"))
+        return rules(candidates=config.source)
+    steps: dict[str, Any] = {"base_steps": config.skill_base_steps}
+    rounds: dict[str, Any] = {"round_steps": config.trial_steps}
+    network = TrainedSource("distilled", rules(candidates="goals"))
     skills = partial(TrainedSource, "diayn", num_skills=config.num_skills, **steps)
     networks = {
         "goals_network": network,

@@ -1,72 +1,20 @@
-"""Short planned episodes in which options and settings are compared, and a memory of them."""
+"""Short planned episodes in which options and settings are compared."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.envs import OptionWorker
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
-from torchrl_hmcts.trainers.experiments.atari.options import Log, plain_worker
-from torchrl_hmcts.trainers.saving.files import read_json, write_json
+from torchrl_hmcts.trainers.experiments.atari.memory import Trial
+from torchrl_hmcts.trainers.experiments.atari.options import plain_worker
 
 _OPTION_STEPS = (10, 5, 20, 30)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A trial's score by the game, its base steps (fewer than asked for if the episode ended), and
-    the frames emulated for it, real and simulated."""
-
-    score: float
-    real_steps: int
-    num_frames: int
-
-    @property
-    def rank(self) -> float:
-        """The score; ties go to who lived longer."""
-        return self.score + 1e-6 * self.real_steps
-
-
-class TrialMemory:
-    """Trials in a file, so that a search for options that is stopped plays none twice.
-
-    A trial is a function of its key and of the ``settings`` (plain data). A file of other settings
-    is replaced; so is one that is damaged, and a line on stderr tells it.
-    """
-
-    def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
-        self._path = Path(path)
-        self._settings = dict(settings)
-        self._known: dict[str, list[float]] = {}
-        if self._path.is_file():
-            try:
-                found = read_json(self._path)
-                if set(found) != {"settings", "trials"}:
-                    raise ValueError(f"{self._path} cannot be read: it holds {sorted(found)}.")
-                if found["settings"] == self._settings:
-                    self._known = dict(found["trials"])
-            except (ValueError, TypeError) as error:  # it saves time only
-                print(f"{error} Its trials are played again.", file=sys.stderr)
-
-    def recall(self, key: str) -> Trial | None:
-        """Return the trial of a key, or None if there was none."""
-        row = self._known.get(key)
-        return None if row is None else Trial(float(row[0]), int(row[1]), int(row[2]))
-
-    def remember(self, key: str, trial: Trial) -> None:
-        """Add a trial and write the file in one move."""
-        self._known[key] = [trial.score, trial.real_steps, trial.num_frames]
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        content = {"settings": self._settings, "trials": self._known}
-        write_json(self._path, content, checksum=True)
 
 
 def play_trial(
@@ -78,10 +26,10 @@ def play_trial(
     real_steps: int,
     seed: int,
     start: int | None = None,
-    memory: TrialMemory | None = None,
 ) -> Trial:
-    """Plan and play a short episode, from the kit's start if ``start`` names no seed of another."""
-    key = None
+    """Plan and play a short episode, from the kit's start if ``start`` names no seed of another;
+    what the kit's memory knows is not played."""
+    key, memory = None, kit.memory
     if memory is not None:
         # Older versions had two settings more, and their trials are still known.
         how = {**dataclasses.asdict(search), "reuse": True, "life_loss_penalty": None}
@@ -122,9 +70,6 @@ def tune_search(
     kit: AtariKit,
     search: AtariSearch,
     config: AtariConfig,
-    *,
-    memory: TrialMemory | None = None,
-    log: Log = print,
 ) -> Tuned:
     """Try settings in short episodes and return the best by the game's score.
 
@@ -145,12 +90,11 @@ def tune_search(
             option_steps=option_steps,
             real_steps=2 * config.trial_steps,
             seed=config.seed,
-            memory=memory,
         )
         tuned.num_frames += played.num_frames
         row = {"option_steps": option_steps, "c": c, "score": played.score}
         tuned.trials.append({**row, "real_steps": played.real_steps})
-        log(f"trial: {tuned.trials[-1]}")
+        kit.log(f"trial: {tuned.trials[-1]}")
         return played.rank
 
     if config.tune_with == "grid":
