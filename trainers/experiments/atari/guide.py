@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import PolicyValueEvaluator, Search, search_examples
 
@@ -100,6 +100,7 @@ class SearchGuide:
         whole_number("SearchGuide", "num_options", num_options, least=1)
         whole_number("SearchGuide", "buffer_size", buffer_size, least=1)
         seed = whole_number("SearchGuide", "seed", seed)
+        instance("SearchGuide", "hidden", hidden, Sequence)
         self.values = bool(values)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)

@@ -127,7 +127,8 @@ class RuleSource:
 
     def find(self, kit: AtariKit) -> Options:
         """Return the options of a game."""
-        search, report = RuleSearch(self, kit), dict[str, Any]()
+        search = RuleSearch(self, kit)
+        report: dict[str, Any] = {}
         rules = search.choose(self.candidates, report)
         return Options(joined(rules), _names(rules), search.num_frames, report)
 

@@ -67,7 +67,8 @@ def learn_skills(
     num_frames = 0
     bytes_seen = None if discriminator == "state" else list(range(128))
     if discriminator == "controllable":
-        search, probed = RuleSearch(RuleSource("goals"), kit), dict[str, Any]()
+        search = RuleSearch(RuleSource("goals"), kit)
+        probed: dict[str, Any] = {}
         search.probe(probed)
         num_frames += search.num_frames
         report["controllable"] = bytes_seen = probed["controllable"]
