@@ -6,31 +6,38 @@ level with the statistics of every node they stand at.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_hmcts.planners.tree import CLOSED, EXPANDED, FORBIDDEN, PENDING, PRUNED, TERMINAL
+from torchrl_hmcts.planners.settings import SearchSettings
+from torchrl_hmcts.planners.tree import (
+    CLOSED,
+    EXPANDED,
+    FORBIDDEN,
+    PENDING,
+    PRUNED,
+    TERMINAL,
+    TreeArrays,
+)
 from torchrl_hmcts.planners.tree_policies import NodeStatistics, ScoreFunction
 
-if TYPE_CHECKING:
-    from torchrl_hmcts.planners.search import Search
 
-
-def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) -> int:
+def select_by_scores(
+    tree: TreeArrays, settings: SearchSettings, record: np.ndarray, wave: np.ndarray
+) -> int:
     """Descend to the leaves of every active root; return how many outcomes to simulate.
 
     Does what :func:`kernels.select` does, with one difference: a root whose descent ends in a leaf
     that is known already has it backed up and adds nothing to this wave.
     """
-    tree, kernels = search.tree, search._kernels
+    from torchrl_hmcts.planners import subtree_kernels as kernels
+
     nodes, edges, roots = tree.nodes, tree.edges, tree.roots
-    settings = search.settings[0]
-    revisit = bool(settings["revisit"])
+    revisit, scores = settings.revisit, settings.tree_policy
+    assert callable(scores)
     scheduled = roots["scheduled"].copy()
-    waits = np.zeros(search.num_roots, np.bool_)  # ran into a leaf that is being simulated
+    waits = np.zeros(len(roots), np.bool_)  # ran into a leaf that is being simulated
     count = 0
 
     def schedule(b: np.ndarray, n: np.ndarray, a: np.ndarray) -> None:
@@ -44,7 +51,7 @@ def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) ->
         waits[b] = True
         kernels.release_all(nodes, edges, b, n)
 
-    for _ in range(search.leaves_per_wave):
+    for _ in range(settings.leaves_per_wave):
         room = roots["simulations"] + scheduled < roots["limit"]
         open_ = (nodes["flags"][:, 0] & CLOSED) == 0
         if revisit:
@@ -55,7 +62,7 @@ def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) ->
             flags = nodes["flags"][b, n]
             known = (flags & (TERMINAL | PRUNED)) != 0
             fresh = np.zeros(len(b), np.bool_)
-            if search.expand_all:
+            if settings.expand == "all":
                 fresh = ~known & ((flags & EXPANDED) == 0) & (nodes["open_options"][b, n] > 0)
                 pending = fresh & ((flags & PENDING) != 0)
                 give_up(b[pending], n[pending])
@@ -64,10 +71,10 @@ def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) ->
                 which, options = np.nonzero(edges["closed"][b[leaves], n[leaves]] != FORBIDDEN)
                 schedule(b[leaves][which], n[leaves][which], options)
             # With chance, what is in flight keeps options above from being drawn again.
-            early = known & search.stochastic & (scheduled[b] > 0)
+            early = known & (settings.chance is not None) & (scheduled[b] > 0)
             give_up(b[early], n[early])
             late = known & ~early
-            kernels.revisit_all(nodes, edges, roots, search.settings, b[late], n[late])
+            kernels.revisit_all(nodes, edges, roots, record, b[late], n[late])
             stays = known | fresh
             b, n = b[~stays], n[~stays]
             if not len(b):
@@ -77,18 +84,18 @@ def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) ->
             stuck = ~allowed.any(-1)
             if stuck.any():
                 if revisit:
-                    kernels.revisit_all(nodes, edges, roots, search.settings, b[stuck], n[stuck])
+                    kernels.revisit_all(nodes, edges, roots, record, b[stuck], n[stuck])
                 else:
                     give_up(b[stuck], n[stuck])
                 b, n, edge, allowed = b[~stuck], n[~stuck], edge[~stuck], allowed[~stuck]
                 if not len(b):
                     break
-            if settings["twins"]:
+            if settings.transpositions is not None:
                 kernels.refresh_all(nodes, edges, b, n)
                 edge = edges[b, n]
             a = _best(scores, nodes[b, n], edge, allowed)
             taken = edge[np.arange(len(b)), a]
-            wants = (taken["child"] < 0) | kernels.wants_samples(edges, search.settings, b, n, a)
+            wants = (taken["child"] < 0) | kernels.wants_samples(edges, record, b, n, a)
             busy = wants & (taken["in_flight"] > 0)
             give_up(b[busy], n[busy])
             edges["in_flight"][b[~busy], n[~busy], a[~busy]] += 1

@@ -17,11 +17,10 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     HighestValue,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     Search,
     SearchBudget,
+    SearchSettings,
     TreeRollout,
     WidthNovelty,
 )
@@ -63,45 +62,33 @@ class AtariSearch:
     width_novelty: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("ratio", "c"):
-            real_number("AtariSearch", name, getattr(self, name), least=0.0)
-        least = {"rollout_options": 0, "leaves_per_wave": 1, "waves_in_flight": 1}
-        for name, low in least.items():
-            whole_number("AtariSearch", name, getattr(self, name), least=low)
-        if self.leaves_per_wave * self.waves_in_flight > 255:
-            raise ValueError(
-                "AtariSearch needs a product of leaves_per_wave and waves_in_flight of at most "
-                f"255; got {self.leaves_per_wave} and {self.waves_in_flight}."
-            )
-        if self.tree_policy not in ("puct", "uct"):
+        real_number("AtariSearch", "ratio", self.ratio, least=0.0)
+        whole_number("AtariSearch", "rollout_options", self.rollout_options)
+        if not isinstance(self.tree_policy, str) or self.tree_policy not in ("puct", "uct"):
             raise ValueError(
                 f"AtariSearch: tree_policy is 'puct' or 'uct'; got {self.tree_policy!r}."
             )
+        self.settings()  # which checks the rest
 
     def budget(self, option_steps: int) -> int:
         """Return the simulated base steps of a decision."""
         return max(1, round(self.ratio * option_steps))
 
-    def _planner(
-        self, pool: AtariOptionPool, seed: int, guide: SearchGuide | None, reward_scale: float
-    ) -> MCTSPlanner:
-        """Build the planner over a pool's options; UCT explores in units of the reward scale."""
-        rollout = TreeRollout(self.rollout_options) if self.rollout_options else None
+    def settings(self, reward_scale: float = 1.0) -> SearchSettings:
+        """Return what a search is set to.
+
+        Args:
+            reward_scale: what there is to gain, in units of which UCT explores.
+        """
         puct = self.tree_policy == "puct"
-        return MCTSPlanner(
-            pool,
+        return SearchSettings(
             tree_policy=PUCT(c=self.c, normalize="tree") if puct else UCT(c=self.c * reward_scale),
-            backup=MaxBackup() if puct else MeanBackup(),
+            backup="max" if puct else "mean",
             expand="one",
-            rollout=rollout,
-            option_prior=None if guide is None else guide.prior,
-            leaf_evaluator=None if guide is None else guide.value,
+            rollout=TreeRollout(self.rollout_options) if self.rollout_options else None,
             leaves_per_wave=self.leaves_per_wave,
             waves_in_flight=self.waves_in_flight,
             novelty=WidthNovelty("ram") if self.width_novelty else None,
-            final_choice=HighestValue(random_ties=True),
-            budget=SearchBudget(base_steps=self.budget(pool.max_steps), until_plan=False),
-            seed=seed,
         )
 
 
@@ -173,13 +160,13 @@ class AtariAgent:
             )
         self.replant_every = whole_number("AtariAgent", "replant_every", replant_every, least=1)
         self.pool, self.real = pool, pool if play_in is None else play_in
-        self.settings = AtariSearch() if search is None else search
+        self.search = AtariSearch() if search is None else search
         self.guide = guide
         self.seed = seed
         self.greatest_reward = 0.0
         self.state: TensorDictBase | None = None
         self.last_option = -1  # executed by the latest decision
-        self._search: Search | None = None
+        self._tree: Search | None = None
         self._new_episode(done=True)
         self._make_planner()
 
@@ -188,16 +175,23 @@ class AtariAgent:
         self.options_taken = [0] * self.pool.num_options
 
     def _make_planner(self) -> None:
-        """Make the planner whose exploration is worth what there is to gain."""
+        """Make the planner; under UCT exploration is worth what there is to gain."""
         self._scale = self._wanted_scale
-        self.planner = self.settings._planner(self.pool, self.seed, self.guide, self._scale)
-        if self.guide is not None and "ram" not in self.planner.simulator.kept_keys:
-            self.planner.simulator.keep(["ram"])
-        self._search = None
+        self.planner = MCTSPlanner(
+            self.pool,
+            **vars(self.search.settings(self._scale)),
+            leaf_evaluator=self.guide,
+            final_choice=HighestValue(random_ties=True),
+            budget=SearchBudget(
+                base_steps=self.search.budget(self.pool.max_steps), until_plan=False
+            ),
+            seed=self.seed,
+        )
+        self._tree = None
 
     @property
     def _wanted_scale(self) -> float:
-        return max(self.greatest_reward, 1.0) if self.settings.tree_policy == "uct" else 1.0
+        return max(self.greatest_reward, 1.0) if self.search.tree_policy == "uct" else 1.0
 
     @property
     def num_frames(self) -> int:
@@ -214,7 +208,7 @@ class AtariAgent:
     def begin(self) -> None:
         """Begin an episode."""
         self.state = self.real.reset(TensorDict(batch_size=[1]))
-        self._search = None
+        self._tree = None
         self._new_episode()
 
     def play(self, decisions: int | None = None, *, max_steps: int | None = None) -> AtariAgent:
@@ -244,9 +238,9 @@ class AtariAgent:
             self._make_planner()
         seed = (self.seed * 1_000_003 + self.decisions) & 0x7FFFFFFF
         kept = self.real is self.pool and self.decisions % self.replant_every
-        if self._search is None or not kept:
-            self._search = self.planner.plant(state, seed=seed)
-        search = self._search
+        if self._tree is None or not kept:
+            self._tree = self.planner.plant(state, seed=seed)
+        search = self._tree
         self.planner.resume(search)
         option = torch.from_numpy(self.planner.choose(search))
         self.last_option = int(option)
@@ -289,7 +283,7 @@ class AtariAgent:
         for name, value in episode.items():
             setattr(self, name, value)
         self.greatest_reward = float(state_dict["greatest_reward"])
-        rows, self.state, self._search = state_dict["state"], None, None
+        rows, self.state, self._tree = state_dict["state"], None, None
         if rows is not None:
             td = TensorDict({"emulator_state": rows}, [1])
             self.state = self.real.reset(td, set_state=True)

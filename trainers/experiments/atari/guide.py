@@ -16,7 +16,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.objectives import ExpertIterationLoss
-from torchrl_hmcts.planners import PolicyValueEvaluator, Search, search_examples
+from torchrl_hmcts.planners import Evaluation, PolicyValueEvaluator, Search, search_examples
 
 
 class _TwoHeads(nn.Module):
@@ -113,19 +113,17 @@ class SearchGuide:
             storage=LazyTensorStorage(buffer_size), batch_size=256, generator=self._generator
         )
         self._evaluator = PolicyValueEvaluator(self._module, uniform_share=0.25)
+        self.in_keys = self._evaluator.in_keys
         self.scale = 1.0
         self.num_examples = 0
         self._searches = 0
 
-    @property
-    def prior(self) -> Any:
-        """For a planner's ``option_prior``."""
-        return self._evaluator.prior
-
-    @property
-    def value(self) -> Any:
-        """For a planner's ``leaf_evaluator``; None if leaves are not valued."""
-        return _Scaled(self) if self.values else None
+    @torch.no_grad()
+    def __call__(self, td: TensorDictBase) -> Evaluation:
+        """Return priors ``[K, Z]`` of states with ``"ram"``, and their values in units of the
+        reward if leaves are valued: for a planner's ``leaf_evaluator``."""
+        priors, values = self._evaluator(td)
+        return Evaluation(priors, values * self.scale if self.values else None)
 
     def learn(self, search: Search, scale: float) -> None:
         """Take examples from a search of one root, and train if it is time.
@@ -190,14 +188,3 @@ class SearchGuide:
         self.scale = float(state_dict["scale"])
         self.num_examples = int(state_dict["num_examples"])
         self._searches = int(state_dict["searches"])
-
-
-class _Scaled:
-    """A guide's values in units of the reward."""
-
-    def __init__(self, guide: SearchGuide) -> None:
-        self._guide = guide
-        self.in_keys = list(guide._evaluator.in_keys)
-
-    def __call__(self, td: TensorDictBase) -> Tensor:
-        return self._guide._evaluator.value(td) * self._guide.scale
