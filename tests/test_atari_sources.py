@@ -454,16 +454,17 @@ def test_a_guide_learns_which_option_was_visited_and_what_it_was_worth() -> None
     guide = SearchGuide(
         3, values=True, hidden=(32,), min_visits=10_000, learn_every=1, updates=150, lr=1e-2
     )
-    agent = AtariAgent(breakout(TRACKERS, 5, seed=1), AtariSearch(ratio=6), seed=0)
+    pool = breakout(TRACKERS, 5, seed=1)
+    agent = AtariAgent(pool, AtariSearch(ratio=6), guide=SearchGuide(3), seed=0)
     agent.begin()
-    agent.planner.simulator.keep(["ram"])
     search = agent.planner.plant(agent.state, seed=0)
     agent.planner.resume(search)
     visits = search.tree.edges["visits"][0, 0].astype(float)
     search.tree.nodes["value"][0, 0] = 3.0  # of a scale of 6
     guide.learn(search, scale=6.0)
     root = agent.state.select("ram")
-    prior = guide.evaluate(root).priors[0].detach().numpy()
-    np.testing.assert_allclose(prior, 0.75 * visits / visits.sum() + 0.25 / 3, atol=0.03)
-    assert guide.evaluate(root).values.item() == pytest.approx(3.0, abs=0.5)
-    assert SearchGuide(3).value is None
+    priors, values = guide(root)
+    expected = 0.75 * visits / visits.sum() + 0.25 / 3
+    np.testing.assert_allclose(priors[0].numpy(), expected, atol=0.03)
+    assert values.item() == pytest.approx(3.0, abs=0.5)
+    assert SearchGuide(3)(root).values is None

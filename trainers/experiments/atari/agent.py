@@ -187,6 +187,8 @@ class AtariAgent:
             ),
             seed=self.seed,
         )
+        if self.guide is not None:
+            self.planner.simulator.keep(self.guide.in_keys)  # in the tree, from which it learns
         self._tree = None
 
     @property

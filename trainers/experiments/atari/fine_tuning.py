@@ -1,6 +1,7 @@
 """Networks that are trained further: on their goals, on the game, on what searches simulated.
 
 Letters: Z options, B transitions, n recorded options, T base steps of an option.
+:class:`TrainedSource` tells what the settings are.
 """
 
 from __future__ import annotations
@@ -140,33 +141,7 @@ def fine_tune(
     num_envs: int = 8,
     updates_per_batch: int = 16,
 ) -> Options:
-    r"""Train a distilled network further by soft actor-critic on its goals and on the game.
-
-    .. math:: r = r_{goal}(s, z, a, s') + \mathrm{sign}(r_{game})
-
-    with the goals' reward of :class:`OptionGoals`. The actor begins as the network that imitates
-    the rules, the critics learn alone first, and the policy is kept near where it began
-    (``policy_prior`` of :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`): critics of a
-    policy that hardly varies know little of other actions, and would spoil it.
-
-    Args:
-        found: options of a network, distilled from goals or repeated actions.
-        kit: of the game.
-        base_steps: of training in all.
-        warm_up: share of them in which only the critics learn.
-        skill_steps: base steps for which an option is kept.
-        lr: Adam's learning rate of the actor.
-        num_envs: emulators that play at a time.
-        updates_per_batch: updates for every 64 base steps.
-
-    Raises:
-        TypeError: if no network executes the options, or nobody knows what they are for.
-        ValueError: if a number is out of range.
-
-    Reference:
-        Christodoulou, "Soft Actor-Critic for Discrete Action Settings", 2019, arXiv 1910.07207; the
-        use is this project's.
-    """
+    """Train a distilled network further by soft actor-critic on its goals and on the game."""
     real_number("fine_tuned", "warm_up", warm_up, least=0.0, most=1.0)
     training = _goal_training(found, kit)
     loss = training.loss
@@ -215,34 +190,7 @@ def retrain(
     warm_up: float = 0.75,
     lr: float = 3e-4,
 ) -> Options:
-    r"""Retrain a network on what the manager's searches simulated: Algorithm 3.
-
-    Rounds of planning with the worker as it is, every base step of every option that is simulated
-    being kept as S; then updates of its own loss on :math:`S \cup D`, with D what it was trained on
-    before:
-
-    .. math:: r = c_i\, r_\phi(s, z, s') + \mathrm{sign}(r_{game})
-
-    Args:
-        found: options of a network: skills, or distilled from goals or repeated actions.
-        kit: of the game.
-        search: the planner of the rounds. Default: with a ratio of 10.
-        rounds: of planning and retraining.
-        round_steps: real base steps of a round.
-        option_steps: base steps of an option.
-        intrinsic_weight: :math:`c_i`.
-        warm_up: share of the first round's updates in which new critics learn alone; critics that
-            came with the network need none.
-        lr: Adam's learning rate.
-
-    Raises:
-        TypeError: if no network executes the options, or nobody knows what they are for.
-        ValueError: if a number is out of range.
-        FloatingPointError: if a loss is not finite.
-
-    Reference:
-        Dissertation, algorithm 3 and chapter 5.
-    """
+    """Retrain a network on what the manager's searches simulated: Algorithm 3."""
     whole_number("retrained", "rounds", rounds, least=1)
     real_number("retrained", "warm_up", warm_up, least=0.0, most=1.0)
     network_of(found.worker)

@@ -1,6 +1,6 @@
 """Networks that learn a game's options: DIAYN's skills, or what rules do.
 
-Letters: Z options, A actions, S states.
+Letters: Z options, S states. :class:`TrainedSource` tells what the settings are.
 """
 
 from __future__ import annotations
@@ -41,26 +41,7 @@ def learn_skills(
     num_envs: int = 8,
     hidden: Sequence[int] = (128, 128, 128),
 ) -> Options:
-    """Learn skills by DIAYN on the RAM, before the manager plans: the dissertation's worker.
-
-    The actor is 128 - 3 x 128 - A with ReLU and a softmax, a head for each skill.
-
-    Args:
-        kit: of the game.
-        num_skills: Z (the dissertation's N_policies).
-        base_steps: of training.
-        skill_steps: base steps of a mini-episode.
-        discriminator: ``"state"`` tells skills by the RAM, ``"displacement"`` by how it changed
-            since the option began, ``"controllable"`` by how its controllable bytes did.
-        num_envs: emulators that play at a time.
-        hidden: widths of the shared layers.
-
-    Raises:
-        ValueError: if the discriminator is unknown, or no byte of the game can be controlled.
-
-    Reference:
-        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; dissertation, ch. 5.
-    """
+    """Learn skills by DIAYN on the RAM."""
     if discriminator not in _DISCRIMINATORS:
         raise ValueError(f"discriminator is one of {_DISCRIMINATORS}; got {discriminator!r}.")
     report: dict[str, Any] = {}
@@ -126,28 +107,7 @@ def distil(
     batch_size: int = 256,
     lr: float = 1e-3,
 ) -> Options:
-    r"""Teach options to one network with a head for each.
-
-    .. math:: \min_\theta\; -\mathbb{E}_{s, z}\, \log \pi_\theta\bigl(\mu_z(s) \mid s, z\bigr)
-
-    with :math:`\mu_z` the option's own worker, in states on the way of random options of that
-    worker, and in a second round of the network itself, labelled by the worker (DAgger). The
-    network samples its actions, so that it keeps some noise, and takes FIRE in 5 % of its steps,
-    where a game has it: one that has forgotten it waits for ever where a game waits for it.
-
-    Args:
-        found: the options that are learned.
-        kit: of the game.
-        samples: labelled states of each round.
-        epochs: passes over all of them in each round.
-        hidden: widths of the shared layers.
-        batch_size: labels of an update.
-        lr: of Adam.
-
-    Reference:
-        Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction to
-        no-regret online learning", 2011, arXiv 1011.0686.
-    """
+    """Teach options to one network with a head for each, in the states of both (DAgger)."""
     teacher, num_options, names = found.worker, found.worker.num_options, kit.action_names
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(kit.seed)
