@@ -45,7 +45,8 @@ class TrainedSource:
 
     ``"retrained"`` is Algorithm 3, for skills and for a distilled or fine-tuned network: rounds of
     planning with the worker as it is, every base step of every option that is simulated being kept
-    as S; then updates of its own loss on :math:`S \cup D`, with D what it was trained on before, and
+    as S; then updates of its own loss on :math:`S \cup D`, with D what it was trained on before,
+    and
 
     .. math:: r = c_i\, r_\phi(s, z, s') + \mathrm{sign}(r_{game}).
 
