@@ -46,11 +46,8 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.runs.config import DemoConfig
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
-    from torchrl_hmcts.trainers.saving.resume import (
-        GeneratorStates,
-        ResumableTrainer,
-        RunningEpisodes,
-    )
+    from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+    from torchrl_hmcts.trainers.saving.run_state import GeneratorStates, RunningEpisodes
     from torchrl_hmcts.trainers.skills.controllability import (
         Controllability,
         probe_controllability,
@@ -132,7 +129,7 @@ _MODULES = {
     "DemoConfig": "runs.config",
     "DurableRotation": "saving.checkpoints",
     "ExpertIterationTrainer": "expert_iteration",
-    "GeneratorStates": "saving.resume",
+    "GeneratorStates": "saving.run_state",
     "GoalEpisodes": "experiments.waterworld.goal_episodes",
     "OptionGoals": "experiments.atari.fine_tuning",
     "SearchGuide": "experiments.atari.guide",
@@ -146,8 +143,8 @@ _MODULES = {
     "MazeView": "skills.hindsight",
     "Options": "experiments.atari.options",
     "ResumableTrainer": "saving.resume",
-    "RunningEpisodes": "saving.resume",
     "RuleSource": "experiments.atari.rules",
+    "RunningEpisodes": "saving.run_state",
     "ScriptedExpert": "experiments.waterworld.scripted_expert",
     "SearchCollector": "expert_iteration",
     "SearchCoverage": "skills.growing",

@@ -25,6 +25,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
     search_examples,
 )
+from torchrl_hmcts.processes import system_errors
 from torchrl_hmcts.trainers.diayn import Progress
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 
@@ -293,11 +294,10 @@ class ExpertIterationTrainer(ResumableTrainer):
             seed=seed,
             example_kwargs={"roots": False} if example_kwargs is None else example_kwargs,
         )
-        buffer = ReplayBuffer(
-            storage=LazyTensorStorage(buffer_size),
-            batch_size=batch_size,
-            generator=torch.Generator().manual_seed(index(seed)),
-        )
+        generator = torch.Generator().manual_seed(index(seed))
+        with system_errors("ExpertIterationTrainer cannot have the shared memory of its buffer"):
+            storage = LazyTensorStorage(buffer_size)
+            buffer = ReplayBuffer(storage=storage, batch_size=batch_size, generator=generator)
         optimizer = torch.optim.Adam(loss_module.parameters(), lr=lr)
         super().__init__(
             collector=collector,  # type: ignore[arg-type]
