@@ -120,8 +120,7 @@ def test_a_short_run_of_two_processes_leaves_its_figures(tmp_path) -> None:
     for name in ("index.html", "scores.png", "episode.gif"):
         assert (tmp_path / name).stat().st_size > 100
     checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
-    assert checkpoints[-1] == f"checkpoint-{metrics['frames']:012d}.torchrl"
-    assert len(checkpoints) == 2
+    assert checkpoints[1:] == [f"checkpoint-{metrics['frames']:012d}.torchrl"]
 
 
 def stopped(config: AtariConfig, after: int) -> tuple[AtariRun, dict]:
