@@ -198,16 +198,16 @@ def test_an_option_of_probability_zero_is_never_taken() -> None:
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        (lambda td: torch.ones(len(td), 3), r"a Tensor \[1, 3\].*\[1, 2\].*ModulePrior"),
-        (lambda td: td, r"a TensorDict \[1\].*ModulePrior"),
-        (lambda td: torch.full((len(td), 2), float("nan")), "probability of nan.*softmax"),
-        (lambda td: torch.tensor([[-0.5, 1.5]]), "probability of -0.5.*softmax"),
+        (lambda td: torch.ones(len(td), 3), r"shape \[1, 3\].*\[1, 2\]"),
+        (lambda td: td, "a tensor; got TensorDict.*ModulePrior"),
+        (lambda td: torch.full((len(td), 2), float("nan")), "policy returned nan.*softmax"),
+        (lambda td: torch.tensor([[-0.5, 1.5]]), "policy returned -0.5.*softmax"),
         (lambda td: torch.zeros(len(td), 2), "probability 0 to every option"),
     ],
 )
 def test_a_rollout_policy_that_returns_nonsense_is_named(policy: Any, message: str) -> None:
     env = ChainEnv(4)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         MCTSPlanner(env, leaf_evaluator=RolloutEvaluator(policy))(env.reset())
 
 
@@ -443,12 +443,9 @@ def test_a_mixture_hands_on_what_its_parts_need() -> None:
     torch.testing.assert_close(mixed(td), expected)
 
 
-def test_a_mixture_out_of_range_or_of_misfits_is_refused() -> None:
-    for weight in (-0.1, 1.5, float("nan")):
-        with pytest.raises(ValueError, match=f"weight >= 0.0 and <= 1.0; got {weight}"):
-            MixedEvaluator(constant(0.0), constant(0.0), weight)
+def test_a_mixture_of_misfits_is_refused() -> None:
     mixed = MixedEvaluator(constant(0.0), lambda td: torch.zeros(len(td), 2))
-    with pytest.raises(ValueError, match=r"second evaluator returned a Tensor \[3, 2\].*\[3, 1\]"):
+    with pytest.raises(ValueError, match=r"second evaluator returned shape \[3, 2\].*\[3, 1\]"):
         mixed(TensorDict({}, [3]))
 
 

@@ -835,7 +835,7 @@ def constant(shape: tuple[int, ...], value: float) -> Any:
         ({"option_prior": constant((2,), 0.5)}, ValueError, r"shape \[2\].*\[1, 2\]"),
         ({"option_prior": constant((1, 2), float("nan"))}, ValueError, "prior returned nan"),
         ({"option_prior": constant((1, 2), -0.5)}, ValueError, "prior returned -0.5.*softmax"),
-        ({"option_prior": lambda td: [0.5]}, TypeError, "option_prior must return a tensor"),
+        ({"option_prior": lambda td: [0.5]}, TypeError, "option prior must return a tensor"),
     ],
 )
 def test_an_evaluator_that_returns_nonsense_is_named(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_hmcts.checks import real_number, whole_number
+from torchrl_hmcts.checks import instance, real_number, whole_number
 
 _DEFAULT_EXPANSIONS = 1000
 
@@ -65,6 +65,7 @@ class SearchBudget:
                 object.__setattr__(self, name, whole_number("SearchBudget", name, value))
         if all(getattr(self, name) is None for name in limits):
             object.__setattr__(self, "expansions", _DEFAULT_EXPANSIONS)
+        instance("SearchBudget", "until_plan", self.until_plan, bool)
         more = whole_number("SearchBudget", "improve_expansions", self.improve_expansions)
         object.__setattr__(self, "improve_expansions", more)
 

@@ -19,8 +19,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.nesting import env_name
+from torchrl_hmcts.planners.keys import entry_key, entry_keys
 from torchrl_hmcts.planners.mcts import MCTSPlanner
-from torchrl_hmcts.planners.novelty import entry_keys
 from torchrl_hmcts.planners.plan import Plan, extract_plans
 from torchrl_hmcts.planners.search import Search
 
@@ -75,6 +75,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         ValueError: if a number is out of range, ``divergence`` comes without ``divergence_key`` or
             the other way round, the planner's env has no such entry, or ``env`` has other options;
             at a call if the mapped state lacks an entry or has another batch size.
+        TypeError: if an argument is of another kind.
 
     Reference:
         Dissertation, sections 3.2.1 and 4.2: plan in a simulation, execute in the environment.
@@ -93,7 +94,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         [1, 2, 3]
         >>> policy = HierarchicalPolicy(  # a model that has another name for its state
         ...     MCTSPlanner(env), state_map=lambda td: TensorDict({"state": td["place"]}, []))
-        >>> policy(TensorDict({"place": torch.tensor([2])}, []))["action"]
+        >>> policy(TensorDict({"place": torch.tensor(2)}, []))["action"]
         tensor(1)
     """
 
@@ -124,8 +125,9 @@ class HierarchicalPolicy(TensorDictModuleBase):
         self.divergence_keys: list[NestedKey] = []
         if divergence is not None and divergence_key is not None:
             real_number(owner, "divergence", divergence, least=0.0)
-            self.divergence_keys = entry_keys(divergence_key, owner)
+            self.divergence_keys = entry_keys(owner, "divergence_key", divergence_key)
         self.planner, self.replan_every = planner, replan_every
+        instance(owner, "reuse", reuse, bool)
         self.divergence, self.reuse = divergence, reuse
         planner.simulator.keep(self.divergence_keys)
         self._state_keys = list(dict.fromkeys([*planner.in_keys, *self.divergence_keys]))
@@ -311,6 +313,7 @@ class GoalPlanner:
     Raises:
         ValueError: if the macro environment has no entry ``goal_key``; when planning, if a search
             ends without a plan.
+        TypeError: if ``to_macro`` cannot be called.
 
     Reference:
         Dissertation, section 3.2.1 and figure 3.3.
@@ -341,10 +344,10 @@ class GoalPlanner:
         if not callable(to_macro):
             raise TypeError(f"to_macro must be callable on a tensordict; got {to_macro!r}.")
         self.planner, self.to_macro = planner, to_macro
-        self.goal_key = unravel_key(goal_key)
+        self.goal_key = entry_key("GoalPlanner", "goal_key", goal_key)
         planner.simulator.keep([self.goal_key])
         if in_keys is not None:
-            self.in_keys = [unravel_key(key) for key in in_keys]
+            self.in_keys = entry_keys("GoalPlanner", "in_keys", in_keys)
 
     def plan_goals(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Plan from states.

@@ -102,47 +102,52 @@ class NodeEvaluator:
             found = found._replace(
                 priors=answer.priors if isinstance(answer, Evaluation) else answer
             )
-        return self._priors(found.priors, td), self._values(found.values, td, terminated)
+        m, priors, values = td.batch_size[0], found.priors, found.values
+        return (
+            np.zeros((0, self.num_options), np.float32)
+            if priors is None
+            else check_priors(priors, (m, self.num_options), "option prior").float().numpy(),
+            np.zeros(m, np.float32)
+            if values is None
+            else np.where(
+                terminated, np.float32(0.0), check_values(values, m, "leaf evaluator").numpy()
+            ),
+        )
 
-    def _priors(self, priors: Tensor | None, td: TensorDictBase) -> np.ndarray:
-        if priors is None:
-            return np.zeros((0, self.num_options), np.float32)
-        shape = (td.batch_size[0], self.num_options)
-        _check_tensor(priors, "option_prior")
-        if tuple(priors.shape) != shape:
-            raise ValueError(
-                f"The option prior returned shape {list(priors.shape)}; it must give one "
-                f"probability per node and option, {list(shape)}."
-            )
-        found: np.ndarray = priors.to(torch.float32).cpu().contiguous().numpy()
-        good = (found >= 0) & (found < LARGEST)
-        if not good.all():
-            raise ValueError(
-                f"The option prior returned {found[~good][0]}. Probabilities must be finite and "
-                f"not negative; apply a softmax to logits."
-            )
-        return found
 
-    def _values(
-        self, values: Tensor | None, td: TensorDictBase, terminated: np.ndarray
-    ) -> np.ndarray:
-        m = td.batch_size[0]
-        if values is None:
-            return np.zeros(m, np.float32)
-        _check_tensor(values, "leaf_evaluator")
-        if tuple(values.shape) not in ((m,), (m, 1)):
-            raise ValueError(
-                f"The leaf evaluator returned shape {list(values.shape)}; it must give one value "
-                f"per state, [{m}] or [{m}, 1]."
-            )
-        found: np.ndarray = values.reshape(-1).to(torch.float32).cpu().numpy()
-        good = np.abs(found) < LARGEST
-        if not good.all():
-            raise ValueError(
-                f"The leaf evaluator returned {found[~good][0]}. Values must be finite and smaller "
-                f"than {LARGEST:g}; check the network's input and weights."
-            )
-        return np.where(terminated, np.float32(0.0), found)
+def check_priors(priors: Any, shape: tuple[int, int], reader: str) -> Tensor:
+    """Return probabilities, contiguous on the CPU; refuse what is none."""
+    _check_tensor(priors, reader)
+    if tuple(priors.shape) != shape:
+        raise ValueError(
+            f"The {reader} returned shape {list(priors.shape)}; it must give one probability per "
+            f"state and option, {list(shape)}."
+        )
+    good = (priors >= 0) & (priors < LARGEST)
+    if not good.all():
+        raise ValueError(
+            f"The {reader} returned {priors[~good][0].item()}. Probabilities must be finite and "
+            f"not negative; apply a softmax to logits."
+        )
+    return priors.detach().cpu().contiguous()
+
+
+def check_values(values: Any, num_states: int, reader: str) -> Tensor:
+    """Return values, float32 ``[m]`` on the CPU; refuse what no search can use."""
+    _check_tensor(values, reader)
+    if tuple(values.shape) not in ((num_states,), (num_states, 1)):
+        raise ValueError(
+            f"The {reader} returned shape {list(values.shape)}; it must give one value per state, "
+            f"[{num_states}] or [{num_states}, 1]."
+        )
+    found: Tensor = values.detach().reshape(-1).to("cpu", torch.float32)
+    good = found.abs() < LARGEST
+    if not good.all():
+        raise ValueError(
+            f"The {reader} returned {found[~good][0].item()}. Values must be finite and smaller "
+            f"than {LARGEST:g}; check the network's input and weights."
+        )
+    return found
 
 
 def _with_seeds(
@@ -153,11 +158,11 @@ def _with_seeds(
     return td.copy().set(SEED_KEY, torch.from_numpy(seeds()))
 
 
-def _check_tensor(value: Any, name: str) -> None:
+def _check_tensor(value: Any, reader: str) -> None:
     if not isinstance(value, Tensor):
         raise TypeError(
-            f"{name} must return a tensor; got {type(value).__name__}. Wrap a TensorDictModule as "
-            f'lambda td: module(td)["state_value"].'
+            f"The {reader} must return a tensor; got {type(value).__name__}. Wrap a module in "
+            f"ModulePrior or ValueEvaluator."
         )
 
 

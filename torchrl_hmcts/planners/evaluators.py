@@ -18,7 +18,14 @@ from torch import Tensor
 
 from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.direct_calls import is_plain
-from torchrl_hmcts.planners.evaluation import SEED_KEY, Evaluation, Evaluator
+from torchrl_hmcts.planners.evaluation import (
+    SEED_KEY,
+    Evaluation,
+    Evaluator,
+    check_priors,
+    check_values,
+)
+from torchrl_hmcts.planners.keys import entry_key
 from torchrl_hmcts.planners.simulator import Simulator
 
 
@@ -342,21 +349,7 @@ class RolloutEvaluator:
         shape = (td.batch_size[0], self._simulator.num_options)
         weights = np.ones(shape) if masks is None else masks.astype(np.float64)
         if self.policy is not None:
-            probabilities = self.policy(td)
-            got = list(getattr(probabilities, "shape", ()))
-            if not isinstance(probabilities, Tensor) or got != list(shape):
-                raise ValueError(
-                    f"The rollout policy returned a {type(probabilities).__name__} {got}; it must "
-                    f"give one probability per state and option, a tensor {list(shape)}. Wrap a "
-                    f"module in ModulePrior."
-                )
-            given = probabilities.to(torch.float64).cpu().numpy()
-            if not (np.isfinite(given) & (given >= 0.0)).all():
-                bad = given[~(np.isfinite(given) & (given >= 0.0))][0]
-                raise ValueError(
-                    f"The rollout policy returned a probability of {bad}. Probabilities must be "
-                    f"finite and not negative; apply a softmax to logits."
-                )
+            given = check_priors(self.policy(td), shape, "rollout policy").double().numpy()
             weights = weights * given
         cumulative = weights.cumsum(-1)
         total = cumulative[:, -1:]
@@ -375,7 +368,7 @@ class RolloutEvaluator:
         if getattr(self.bootstrap, "is_random", False):
             seeds = (bits >> np.uint64(1)).astype(np.int64)
             td = td.copy().set(SEED_KEY, torch.from_numpy(seeds))
-        return _values(self.bootstrap, td, "bootstrap").to(torch.float64).numpy()
+        return check_values(self.bootstrap(td), len(td), "bootstrap").double().numpy()
 
     def __repr__(self) -> str:
         return (
@@ -422,7 +415,8 @@ class MixedEvaluator:
             _bind(part, simulator, gamma)
 
     def __call__(self, td: TensorDictBase) -> Tensor:
-        first, second = _values(self.first, td, "first"), _values(self.second, td, "second")
+        first = check_values(self.first(td), len(td), "first evaluator")
+        second = check_values(self.second(td), len(td), "second evaluator")
         return (1.0 - self.weight) * first + self.weight * second
 
     def __repr__(self) -> str:
@@ -443,7 +437,7 @@ class _Network:
                 f'TensorDictModule(net, in_keys=["observation"], out_keys={list(keys)!r}).'
             )
         writes = [unravel_key(k) for k in module.out_keys]
-        self.keys = [unravel_key(k) for k in keys]
+        self.keys = [entry_key(owner, "its outputs", k) for k in keys]
         for key in self.keys:
             if key not in writes:
                 raise ValueError(f"{owner} reads {key!r}; its module writes {writes}.")
@@ -488,18 +482,6 @@ def _bind(part: Evaluator | None, simulator: Simulator, gamma: float) -> None:
 
 def _rows(td: TensorDictBase, rows: np.ndarray) -> TensorDictBase:
     return td if len(rows) == td.batch_size[0] else td[torch.from_numpy(rows)]
-
-
-def _values(evaluator: Evaluator, td: TensorDictBase, name: str) -> Tensor:
-    """The values of an evaluator, float32 ``[m]`` on the CPU, checked."""
-    values, num_states = evaluator(td), td.batch_size[0]
-    got = tuple(getattr(values, "shape", ()))
-    if not isinstance(values, Tensor) or got not in ((num_states,), (num_states, 1)):
-        raise ValueError(
-            f"The {name} evaluator returned a {type(values).__name__} {list(got)}; it must give "
-            f"one value per state, a tensor [{num_states}] or [{num_states}, 1]."
-        )
-    return values.reshape(-1).to("cpu", torch.float32)
 
 
 def _mix(bits: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ from torchrl_hmcts.planners.tree import (
     PENDING,
     PRUNED,
     PUCT_SCORE,
+    PYTHON_SCORE,
     RAW_VALUES,
     REWARDED,
     SIBLINGS,
@@ -224,6 +225,10 @@ def select(nodes, edges, roots, record, gumbel, wave, walked):
                     break  # nothing is left to simulate
                 if chosen >= 0:
                     met, n, a = _ONE_OPTION, start, chosen
+                    if links[n, a]["in_flight"] > 0:
+                        met = _COLLISION
+                    elif s["mark"]:
+                        links[n, a]["in_flight"] += 1
                 else:
                     met, n, a = _descend(tree, links, root, s, gumbel, b, start, revisit)
                 start, chosen = 0, -1
@@ -249,6 +254,8 @@ def select(nodes, edges, roots, record, gumbel, wave, walked):
                     break  # what is in flight keeps options above from being drawn again
                 revisit_leaf(tree, links, root, s, n)
                 revisits += 1
+                if s["score"] == PYTHON_SCORE:
+                    break
                 if scheduled:  # it counts as a leaf: what is in flight may change the next choice
                     found = True
                     break

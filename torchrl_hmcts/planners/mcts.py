@@ -102,6 +102,7 @@ class MCTSPlanner(TensorDictModuleBase):
         ValueError: at construction if the env cannot be set to a state or its action is not
             discrete; at the call if an entry of the state is missing or not finite, or no option
             may be taken.
+        TypeError: if a part is of another kind.
 
     Reference:
         Dissertation, sections 2.4.2, 3.2.1 and 4.2; Kocsis and Szepesvari 2006.
@@ -177,6 +178,12 @@ class MCTSPlanner(TensorDictModuleBase):
         self._gumbel_choice = final_choice is None and self.settings.is_gumbel
         if final_choice is None:
             final_choice = BestPlan() if chance is None else MostVisited()
+        if not hasattr(final_choice, "choose"):
+            raise TypeError(
+                f"final_choice needs choose(search), e.g. BestPlan(); got {final_choice}."
+            )
+        if progress is not None and not callable(progress):
+            raise TypeError(f"progress must be callable; got {progress!r}.")
         self.final_choice = final_choice
         self.progress = progress
         if seed is not None:

@@ -10,10 +10,11 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_hmcts.checks import real_number, whole_number
+from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts.planners.keys import entry_keys
 
 
 class NoveltyTest(Protocol):
@@ -145,7 +146,7 @@ class RadiusNovelty(_Counted):
         shorter_paths: bool = False,
         shorter_by: float = 1.0,
     ) -> None:
-        self.in_keys = entry_keys(key, "RadiusNovelty")
+        self.in_keys = entry_keys("RadiusNovelty", "key", key)
         self.radius = real_number("RadiusNovelty", "radius", radius, above=0.0)
         self.scale = [1.0] * len(self.in_keys) if scale is None else list(scale)
         if len(self.scale) != len(self.in_keys):
@@ -161,6 +162,7 @@ class RadiusNovelty(_Counted):
                 f"its radius; got {relaxation}."
             )
         self.max_relaxations = whole_number("RadiusNovelty", "max_relaxations", max_relaxations)
+        instance("RadiusNovelty", "shorter_paths", shorter_paths, bool)
         self.shorter_paths = shorter_paths
         self.shorter_by = real_number("RadiusNovelty", "shorter_by", shorter_by, above=0, most=1)
         self.start(0)
@@ -286,7 +288,7 @@ class WidthNovelty(_Counted):
     """
 
     def __init__(self, key: NestedKey | Sequence[NestedKey], *, max_relaxations: int = 14) -> None:
-        self.in_keys = entry_keys(key, "WidthNovelty")
+        self.in_keys = entry_keys("WidthNovelty", "key", key)
         self.max_relaxations = whole_number("WidthNovelty", "max_relaxations", max_relaxations)
         if self.max_relaxations > 254:
             raise ValueError(
@@ -385,16 +387,6 @@ class WidthNovelty(_Counted):
 
     def __repr__(self) -> str:
         return f"WidthNovelty({self.in_keys})"
-
-
-def entry_keys(key: NestedKey | Sequence[NestedKey], owner: str) -> list[NestedKey]:
-    """Return one or several keys as a list, for an owner that needs at least one."""
-    keys = [key] if isinstance(key, (str, tuple)) else list(key)
-    if not keys:
-        raise ValueError(
-            f'{owner} needs the entries it compares; got none. Name them by key, e.g. "ram".'
-        )
-    return [unravel_key(k) for k in keys]
 
 
 def _side_by_side(parts: list[torch.Tensor]) -> np.ndarray:

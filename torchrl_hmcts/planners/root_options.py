@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_hmcts.checks import real_number
+from torchrl_hmcts.checks import instance, real_number
 from torchrl_hmcts.planners.search import Search
 from torchrl_hmcts.planners.tree import FORBIDDEN
 from torchrl_hmcts.planners.tree_policies import Gumbel
@@ -130,6 +130,9 @@ class HighestValue:
     """
 
     random_ties: bool = False
+
+    def __post_init__(self) -> None:
+        instance("HighestValue", "random_ties", self.random_ties, bool)
 
     def choose(self, search: Search) -> np.ndarray:
         """Return an option for each root, int64 ``[B]``."""

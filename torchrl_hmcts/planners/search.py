@@ -113,16 +113,14 @@ class Search:
         self._kernels = kernels
         settings = SearchSettings() if settings is None else settings
         instance("Search", "settings", settings, SearchSettings)
-        self.num_options = whole_number("Search", "num_options", num_options, least=1)
-        self.num_roots = whole_number("Search", "num_roots", num_roots)
-        capacity = whole_number("Search", "capacity", capacity, least=1)
+        self.tree = SearchTree(num_roots, num_options, capacity=capacity)
+        self.num_roots, self.num_options = self.tree.num_roots, self.tree.num_options
         # Copies: what one search has seen is nothing to the next, nor to one that is resumed later.
         self.novelty = copy.copy(settings.novelty)
         self.transpositions = copy.copy(settings.transpositions)
         self.inserting = False  # also after an interruption: nodes may be there without a state
         self.growing = False  # also after an interruption: some of it may have been in flight
         self._set(settings)
-        self.tree = SearchTree(num_roots, num_options, capacity=capacity)
         self.gumbel = np.zeros((0, 0), np.float32)  # [B, A + N], see root_options.halve
         self.seeds = np.arange(self.num_roots)  # [B]
         self.rollouts: dict[int, np.random.Generator] = {}

@@ -11,7 +11,7 @@ from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.planners.budget import ProgressiveWidening, TreeRollout
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.transpositions import Transpositions
-from torchrl_hmcts.planners.tree import MAX_BACKUP, MEAN_BACKUP, RECORD
+from torchrl_hmcts.planners.tree import MAX_BACKUP, MEAN_BACKUP, PYTHON_SCORE, RECORD
 from torchrl_hmcts.planners.tree_policies import UCT, CompiledPolicy, Gumbel, TreePolicy
 
 _MOST_HALVED = 2**24  # simulations of Gumbel, whose schedule holds counts in float32
@@ -190,6 +190,7 @@ class SearchSettings:
             "leaves": self.leaves_per_wave,
             "revisit": self.revisit,
             "twins": self.transpositions is not None,
+            "score": PYTHON_SCORE,
             "mark": True,
         }
         if self.chance is not None:

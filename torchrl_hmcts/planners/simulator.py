@@ -26,6 +26,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
 from torchrl_hmcts.nesting import env_name, flat_transforms, set_states, step_states
+from torchrl_hmcts.planners.keys import entry_key
 from torchrl_hmcts.planners.simulator_checks import (
     check_durations_and_masks,
     check_env,
@@ -82,8 +83,9 @@ class Simulator:
         extra = [unravel_key(k) for k in extra_keys]
         self._check_available(extra, "The novelty test or an evaluator")
         self.kept_keys = list(self.state_keys)
-        shown = [None if key is None else unravel_key(key) for key in (duration_key, mask_key)]
-        self.duration_key, self.mask_key = (k if k in available else None for k in shown)
+        for name, key in (("duration_key", duration_key), ("mask_key", mask_key)):
+            key = None if key is None else entry_key("MCTSPlanner", name, key)
+            setattr(self, name, key if key in available else None)
         self.root_keys = list(dict.fromkeys([*self.state_keys, *extra]))
         if self.mask_key is not None:
             self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))

@@ -5,7 +5,7 @@ import numba
 import numpy as np
 
 from torchrl_hmcts.compiling import njit
-from torchrl_hmcts.planners.kernels import release, revisit_leaf, schedule
+from torchrl_hmcts.planners.kernels import schedule
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     EXPANDED,
@@ -173,18 +173,16 @@ def solve(trees, links, roots, b, tolerance, max_sweeps):
 # ------------------------------------------------------- for descents that are controlled by Python
 
 
-@njit(error_model="numpy", _nrt=False)
-def release_all(nodes, edges, rows, leaves):
-    for i in range(rows.shape[0]):
-        release(nodes[rows[i]], edges[rows[i]], leaves[i])
-
-
-@njit(error_model="numpy", _nrt=False)
-def revisit_all(nodes, edges, roots, record, rows, leaves):
-    for i in range(rows.shape[0]):
-        release(nodes[rows[i]], edges[rows[i]], leaves[i])
-        b = rows[i]
-        revisit_leaf(nodes[b], edges[b], roots[b], record[0], leaves[i])
+@njit(error_model="numpy")
+def may_descend(nodes, roots, record):
+    """Which active roots have simulations left, and something to simulate or revisit."""
+    may = np.zeros(roots.shape[0], np.bool_)
+    for b in range(roots.shape[0]):
+        root = roots[b]
+        if root["active"] and root["simulations"] + root["scheduled"] < root["limit"]:
+            endless = root["limit"] == np.iinfo(np.int64).max
+            may[b] = not nodes[b, 0]["flags"] & CLOSED or (record[0]["revisit"] and not endless)
+    return may
 
 
 @njit(error_model="numpy", _nrt=False)

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_hmcts.planners.novelty import entry_keys
+from torchrl_hmcts.planners.keys import entry_keys
 
 
 class Transpositions:
@@ -35,7 +35,7 @@ class Transpositions:
         2008.
 
     Example:
-        >>> from torchrl_hmcts.planners import MaxBackup, MCTSPlanner, SearchBudget
+        >>> from torchrl_hmcts.planners import MCTSPlanner, SearchBudget, Transpositions
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> env = ChainEnv(length=6)
         >>> planner = MCTSPlanner(env, transpositions=Transpositions("state"),
@@ -46,7 +46,7 @@ class Transpositions:
     """
 
     def __init__(self, key: NestedKey | Sequence[NestedKey]) -> None:
-        self.in_keys = entry_keys(key, "Transpositions")
+        self.in_keys = entry_keys("Transpositions", "key", key)
         self.start(0)
 
     def start(self, num_roots: int) -> None:

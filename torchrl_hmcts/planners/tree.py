@@ -22,6 +22,8 @@ from tensordict.tensorclass import _TensorClassMeta
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_hmcts.checks import whole_number
+
 NODE = np.dtype(
     [
         ("visits", np.int32),
@@ -88,7 +90,7 @@ FACTORS = 256  # visits of a node up to which its exploration factor is looked u
 # 0.1 us each a call.
 RECORD = np.dtype(
     [
-        ("score", np.int64),  # UCT_SCORE ... GUMBEL_SCORE
+        ("score", np.int64),  # UCT_SCORE ... PYTHON_SCORE
         ("c", np.float64),
         ("c_base", np.float64),  # 0: a constant c
         ("c_scale", np.float64),
@@ -106,7 +108,7 @@ RECORD = np.dtype(
     ],
     align=True,
 )
-UCT_SCORE, PUCT_SCORE, GUMBEL_SCORE = 0, 1, 2
+UCT_SCORE, PUCT_SCORE, GUMBEL_SCORE, PYTHON_SCORE = 0, 1, 2, 3
 RAW_VALUES, SIBLINGS, WHOLE_TREE = 0, 1, 2
 MEAN_BACKUP, MAX_BACKUP = 0, 1
 
@@ -125,6 +127,7 @@ MOST_VISITS = MOST_NODES - 2**24
 MOST_SAMPLES = np.iinfo(np.int16).max  # outcomes drawn of one option
 # Rewards and values are smaller than this: no sum of them along a path overflows in float32.
 LARGEST = 1e30
+_MOST_EDGES = 2**48
 
 # An edge's ``closed``: 0, or one of these.
 SOLVED = 1  # nothing is left to simulate behind it
@@ -151,9 +154,14 @@ class TreeArrays:
     """
 
     def __init__(self, num_roots: int, num_options: int, capacity: int = 64) -> None:
-        self.num_roots = num_roots
-        self.num_options = num_options
-        self.capacity = capacity
+        self.num_roots = whole_number("A search", "num_roots", num_roots)
+        self.num_options = whole_number("A search", "num_options", num_options, least=1)
+        self.capacity = whole_number("A search", "capacity", capacity, least=1)
+        if self.num_roots * self.num_options * self.capacity > _MOST_EDGES:
+            raise ValueError(
+                f"A search of num_roots={num_roots} with num_options={num_options} and room for "
+                f"capacity={capacity} nodes each is too large for any memory."
+            )
         self.nodes = np.zeros((num_roots, capacity), NODE)
         self.edges = np.zeros((num_roots, capacity, num_options), EDGE)
         self.roots = np.zeros(num_roots, ROOT)

@@ -162,7 +162,9 @@ class PUCT(CompiledPolicy):
 
     def __post_init__(self) -> None:
         real_number("PUCT", "c", self.c, least=0.0)
-        if self.normalize not in (None, "siblings", "tree"):
+        if self.normalize is not None and (
+            not isinstance(self.normalize, str) or self.normalize not in ("siblings", "tree")
+        ):
             raise ValueError(
                 f"PUCT: normalize is None, 'siblings' or 'tree'; got {self.normalize!r}."
             )
