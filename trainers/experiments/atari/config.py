@@ -3,28 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
 
-from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.trainers.experiments.registry import ExperimentError
 from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
-
-_CHOICES = {
-    "protocol": ("deterministic", "sticky"),
-    "source": (
-        "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
-        "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable",
-        "diayn_retrained",
-    ),
-    "tune_with": ("grid", "optuna"),
-    "tree_policy": ("puct", "uct"),
-    "guide": ("none", "prior", "prior_value"),
-}  # fmt: skip
-_AT_LEAST_ONE = (
-    "frames", "max_episode_frames", "tune_trials", "num_skills", "skill_base_steps",
-    "leaves_per_wave", "waves_in_flight", "trial_steps", "replant_every",
-)  # fmt: skip
-_LEAST = {"option_steps": 0, "rollout_options": 0, "num_processes": -1}
 
 
 @dataclass
@@ -106,6 +89,33 @@ class AtariConfig(RunConfig):
 
     FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
     PATHS = ("out", "options_from")
+    CHOICES = {
+        "protocol": ("deterministic", "sticky"),
+        "source": (
+            "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
+            "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable",
+            "diayn_retrained",
+        ),
+        "tune_with": ("grid", "optuna"),
+        "tree_policy": ("puct", "uct"),
+        "guide": ("none", "prior", "prior_value"),
+    }  # fmt: skip
+    LEAST = {
+        **dict.fromkeys(("frames", "max_episode_frames", "tune_trials", "num_skills"), 1),
+        **dict.fromkeys(("skill_base_steps", "leaves_per_wave", "waves_in_flight"), 1),
+        **dict.fromkeys(("trial_steps", "replant_every"), 1),
+        **dict.fromkeys(("option_steps", "rollout_options"), 0),
+        "num_processes": -1,
+    }
+    ABOVE_ZERO = ("ratio", "c", "trial_ratio")
+    TOY: ClassVar[dict[str, Any]] = {
+        "frames": 20_000,
+        "max_episode_frames": 2_000,
+        "source": "repeat",
+        "option_steps": 10,
+        "ratio": 5.0,
+        "skill_base_steps": 512,
+    }
 
     @property
     def KEPT(self) -> tuple[str, ...]:  # type: ignore[override]  # noqa: N802
@@ -137,12 +147,19 @@ class AtariConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, choices in _CHOICES.items():
+        for name, least in self.LEAST.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}.")
+        for name in self.ABOVE_ZERO:
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")
+        if not 0.0 < self.gamma <= 1.0:
+            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")
+        for name, choices in self.CHOICES.items():
             value = getattr(self, name)
             if value not in choices:
                 raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
-        for name, least in (dict.fromkeys(_AT_LEAST_ONE, 1) | _LEAST).items():
-            whole_number("AtariConfig", name, getattr(self, name), least=least)
-        for name in ("ratio", "c", "trial_ratio"):
-            real_number("AtariConfig", name, getattr(self, name), above=0.0)
-        real_number("AtariConfig", "gamma", self.gamma, above=0.0, most=1.0)
+
+    def sized(self) -> AtariConfig:
+        """Return the configuration that is run: with ``toy`` a small one."""
+        return replace(self, **self.TOY) if self.toy else self
