@@ -123,7 +123,9 @@ class SearchGuide:
         """Return priors ``[K, Z]`` of states with ``"ram"``, and their values in units of the
         reward if leaves are valued: for a planner's ``leaf_evaluator``."""
         priors, values = self._evaluator(td)
-        return Evaluation(priors, values * self.scale if self.values else None)
+        if values is None or not self.values:
+            return Evaluation(priors)
+        return Evaluation(priors, values * self.scale)
 
     def learn(self, search: Search, scale: float) -> None:
         """Take examples from a search of one root, and train if it is time.
