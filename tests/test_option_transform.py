@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from functools import partial
 
 import pytest
@@ -17,8 +15,6 @@ from torchrl.data import (
     Bounded,
     Categorical,
     Composite,
-    LazyTensorStorage,
-    ReplayBuffer,
     Unbounded,
 )
 from torchrl.envs import (
@@ -727,20 +723,6 @@ class TestOwnership:
         td = macro(ChainEnv(6), worker).rollout(3)
         assert not td["next", "reward"].requires_grad
 
-    @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
-    def test_a_copy_of_the_env_steps_as_the_original(self, duplicate):
-        worker = TensorDictModule(Hidden(), ["skill"], ["action"])
-        env = TransformedEnv(
-            ChainEnv(6), Compose(StepCounter(7), OptionTransform(worker, 2, 4, GAMMA))
-        )
-        td = env.reset(TensorDict(batch_size=[3]))
-        td["option"] = torch.tensor([LEFT, RIGHT, RIGHT])
-        expected = env.step(td.clone())["next"]
-        twin = duplicate(env)
-        assert_close(twin.step(td.clone())["next"], expected)
-        assert_close(duplicate(twin).step(td.clone())["next"], expected)
-        check_env_specs(twin)
-
     def test_a_clone_serves_a_second_env_with_the_same_worker(self):
         transform = OptionTransform(skill_is_action(), 2, 4, GAMMA)
         first = TransformedEnv(ChainEnv(6), transform)
@@ -872,16 +854,6 @@ class TestBadInput:
         env.reward_spec = Composite(reward=Unbounded((1,)), cost=Unbounded((1,)))
         with pytest.raises(ValueError, match="sums one reward; ChainEnv has the rewards .*cost"):
             macro(env)
-
-    def test_a_replay_buffer_is_no_place_for_it(self):
-        buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=2)
-        buffer.extend(macro(ChainEnv(6)).rollout(3))
-        buffer.append_transform(OptionTransform(skill_is_action(), 2, 4))
-        with pytest.raises(RuntimeError, match="stored data hold what it writes.*TransformedEnv"):
-            buffer.sample()
-        for td in (ChainEnv(6).rollout(3), macro(ChainEnv(6)).rollout(3)):
-            with pytest.raises(RuntimeError, match="no meaning in a replay buffer"):
-                buffer.extend(td)
 
     def test_one_transform_cannot_serve_two_envs(self):
         env = macro(ChainEnv(6))

@@ -283,8 +283,8 @@ def _in_rollouts(
             reference,
             data,
             f"{it.name} changed <key> of the env, which is not among its changes. Name it there, "
-            "or leave it. (It may also draw random numbers that the env needs: then give one of the "
-            "two a generator of its own.)",
+            "or leave it. (It may also draw random numbers that the env needs: then give one of "
+            "the two a generator of its own.)",
             leaves(reference) - own,
         )
     env.close()
