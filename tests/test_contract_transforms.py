@@ -16,11 +16,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import Categorical, OneHot
+from torchrl.data import Categorical, Composite, OneHot, Unbounded
 from torchrl.envs import (
     Compose,
     EnvBase,
-    RenameTransform,
     SerialEnv,
     StepCounter,
     Transform,
@@ -89,18 +88,37 @@ class OneHotPoint(PointMassEnv):
         return super()._step(tensordict.copy().set("action", index))
 
 
-def nested_point() -> TransformedEnv:
+class NestedPoint(EnvBase):
     """A point mass whose entries, action and reward are nested."""
-    state, names = ["position", "velocity"], [("agent", "x"), ("agent", "v")]
-    return TransformedEnv(
-        PointMassEnv(),
-        RenameTransform(
-            [*state, "reward"],
-            [*names, ("agent", "r")],
-            [*state, "action"],
-            [*names, ("agent", "push")],
-        ),
-    )
+
+    batch_locked = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = PointMassEnv()
+        spec = self.inner.observation_spec
+        agent = Composite(x=spec["position"].clone(), v=spec["velocity"].clone())
+        self.observation_spec = Composite(agent=agent)
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Composite(agent=Composite(push=Categorical(4)))
+        self.reward_spec = Composite(agent=Composite(r=Unbounded((1,))))
+
+    def _nest(self, flat: TensorDictBase) -> TensorDictBase:
+        agent = {"x": flat.pop("position"), "v": flat.pop("velocity")}
+        if "reward" in flat.keys():
+            agent["r"] = flat.pop("reward")
+        return flat.set("agent", TensorDict(agent, batch_size=flat.batch_size))
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        return self._nest(self.inner._reset(tensordict))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        agent = tensordict.get("agent")
+        flat = {"position": agent["x"], "velocity": agent["v"], "action": agent["push"]}
+        return self._nest(self.inner._step(TensorDict(flat, batch_size=agent.batch_size)))
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.inner._set_seed(seed)
 
 
 def chain_with_options(*, one_hot: bool = False, trajectory_keys: Any = None) -> EnvBase:
@@ -122,7 +140,7 @@ def nested_option(**kwargs: Any) -> OptionTransform:
 
 def nested_skills() -> EnvBase:
     skill = SkillTransform(3, skill_key=("agent", "z"), skill_step_key=("agent", "k"))
-    return nested_point().append_transform(skill)
+    return TransformedEnv(NestedPoint(), skill)
 
 
 def one_hot_skills() -> EnvBase:
@@ -297,7 +315,7 @@ case("skill_on_one_hot_actions", skills, OneHotChain, **SKILL)
 case(
     "skill_nested",
     partial(skills, 2, skill_key=("agent", "z"), skill_step_key=("agent", "k")),
-    nested_point,
+    NestedPoint,
     writes=[("agent", "z"), ("agent", "k")],
     redrawn_keys=[("agent", "z"), ("agent", "k")],
     inside_workers=False,
@@ -318,7 +336,7 @@ case("displacement_inside_workers", moves, counted_points, only=["serial"], insi
 case(
     "displacement_nested",
     partial(moves, ("agent", "x"), ("agent", "d"), origin_key=("agent", "o"), skill_step_key=None),
-    nested_point,
+    NestedPoint,
     writes=[("agent", "d"), ("agent", "o")],
 )
 case("skill_reward", lambda: SkillReward(discriminator_objective()), skilled_for_good, **REWARD)
@@ -350,7 +368,7 @@ case(
 case(
     "option_nested",
     nested_option,
-    nested_point,
+    NestedPoint,
     writes=[("agent", "k")],
     changes=[("agent", "r")],
     inverse_writes=[("agent", "push"), ("agent", "z")],
@@ -371,8 +389,8 @@ case(
 case(
     "recorder_nested",
     nested_recorder,
-    lambda: nested_point().append_transform(
-        nested_option(trajectory_keys=nested_recorder().trajectory_keys)
+    lambda: TransformedEnv(
+        NestedPoint(), nested_option(trajectory_keys=nested_recorder().trajectory_keys)
     ),
     **{
         **TAKES,
@@ -410,7 +428,7 @@ case("stall_one_hot", partial(stall, "state", 0.5), OneHotChain, writes=["stalle
 case(
     "stall_nested",
     partial(stall, ("agent", "x"), 0.1, ("agent", "stalled")),
-    nested_point,
+    NestedPoint,
     writes=[("agent", "stalled")],
 )
 case("subgoal", subgoals, parallel=True, **SUBGOAL)
@@ -427,7 +445,7 @@ case(
         task_reward_key=("agent", "task_reward"),
         relative=False,
     ),
-    nested_point,
+    NestedPoint,
     writes=[("agent", "goals"), ("agent", "plan"), *COUNTS],
     writes_next=[("agent", "task_reward")],
     changes=[("agent", "r")],

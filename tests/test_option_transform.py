@@ -257,13 +257,6 @@ class TestAgainstALoop:
         assert after["state"].tolist() == [2, 1]
         assert after["duration"].tolist() == [[1], [1]]
 
-    def test_one_base_step_per_option_is_the_base_env(self):
-        env, td = chain(start=[0, 4], batch=[2])
-        after = step_next(macro(env, max_steps=1), td, [RIGHT, RIGHT])
-        plain = env.step(td.copy().set("action", torch.tensor([RIGHT, RIGHT])))["next"]
-        assert_close(after, plain)
-        assert after["duration"].tolist() == [[1], [1]]
-
     @pytest.mark.parametrize("batch", BATCHES)
     def test_nested_keys(self, batch):
         env = NestedChainEnv()
@@ -299,10 +292,6 @@ class TestAgainstALoop:
         td["option"] = nn.functional.one_hot(option, 2).bool()
         after = one_hot.step(td.clone())["next"]
         assert_close(after, by_hand(env, td.set("option", option), skill_is_action()))
-
-    def test_gamma_one_adds_up_the_rewards(self):
-        env, td = chain(start=1)
-        assert step_next(macro(env, gamma=1.0), td, RIGHT)["reward"].item() == pytest.approx(0)
 
     def test_a_root_can_be_stepped_again_with_another_option(self):
         """What the first step left under "next" is of no consequence for the second."""
@@ -518,33 +507,6 @@ class TestRollouts:
 
 
 class TestOtherTransforms:
-    def test_those_before_it_see_base_steps(self):
-        base = TransformedEnv(
-            ChainEnv(6, reward_per_step=-0.25),
-            Compose(StepCounter(max_steps=7), RewardScaling(0.5, 2.0)),
-        )
-        env = TransformedEnv(
-            ChainEnv(6, reward_per_step=-0.25),
-            Compose(
-                StepCounter(max_steps=7),
-                RewardScaling(0.5, 2.0),
-                OptionTransform(skill_is_action(), 2, 3, GAMMA),
-            ),
-        )
-        check_env_specs(env)
-        td = env.reset(TensorDict(batch_size=[2]))
-        counts, truncated = [], []
-        for _ in range(3):
-            td["option"] = torch.tensor([LEFT, RIGHT])
-            after = env.step(td.clone())["next"]
-            assert_close(after[0], by_hand(base, td[0], skill_is_action(), 3))
-            counts.append(after["step_count"][0].item())
-            truncated.append(after["truncated"][0].item())
-            td = after.exclude("reward")
-        assert counts == [3, 6, 7]
-        assert truncated == [False, False, True]
-        assert after["duration"][0] == 1
-
     def test_those_after_it_see_macro_steps(self):
         env = TransformedEnv(
             ChainEnv(6, reward_per_step=-0.25),
