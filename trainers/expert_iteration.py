@@ -19,7 +19,6 @@ from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import (
     PUCT,
-    MaxBackup,
     MCTSPlanner,
     NoveltyTest,
     PolicyValueEvaluator,
@@ -78,9 +77,8 @@ def make_guided_planner(
     return MCTSPlanner(
         env,
         tree_policy=PUCT(c=c),
-        leaf_evaluator=guide.value,
-        option_prior=guide.prior,
-        backup=MaxBackup(),
+        leaf_evaluator=guide,
+        backup="max",
         novelty=novelty,
         expand=expand,
         budget=budget,
