@@ -24,7 +24,7 @@ OTHERS = {  # of other packages
 }
 # What is there today: names go, and none comes.
 KNOWN = {
-    *("_TensorClassMeta", "_alpha", "_alpha_loss", "_cached_detached_qvalue_params"),
+    *("_TensorClassMeta", "_alpha", "_alpha_loss"),
     *("_clear_weakrefs", "_compute_target_v2"),
     *("_decode_state_dict_value", "_encode_state_dict_value", "_foreach_lerp_", "_get_str"),
     *("_get_time_dim", "_get_tuple", "_modules", "_new_unsafe", "_optim_count"),
