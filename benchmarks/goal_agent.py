@@ -21,8 +21,8 @@ import torch
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.trainers.experiments import find_experiment
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.agents import play_mazes
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import play_mazes
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
 from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
 from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves

@@ -38,10 +38,10 @@ from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
 from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
-from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, DemoConfig
 from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
@@ -119,7 +119,7 @@ def train(
         env,
         loss,
         total_frames=base_steps,
-        frames_per_batch=FRAMES_PER_BATCH,
+        frames_per_batch=BATCH_STEPS,
         seed=seed,
     )
     worker = SkillPolicy(loss.actor_network, deterministic=True)

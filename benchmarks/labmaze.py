@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     frames_curve,
     solve_mazes,

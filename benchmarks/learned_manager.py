@@ -30,11 +30,13 @@ from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MaxBackup, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
-from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.skills import learn
 from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer, make_guided_planner
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 
 OPTION_STEPS, RADIUS, GAMMA = 25, 0.7, 0.99  # those of the demo
 MAIN = "learned, expand one, novelty 0.2"  # the one that is followed over the iterations
@@ -112,7 +114,7 @@ def measure(planner: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> dict
 def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
     begin = time.process_time()
     if args.worker_weights is None:
-        _, loss = train_worker(DemoConfig(seed=seed))
+        loss = learn(make_kit(DemoConfig(seed=seed))).loss
     else:
         loss = load_worker(args.worker_weights.format(seed=seed))
     worker = SkillPolicy(loss.actor_network, deterministic=True)
@@ -189,7 +191,7 @@ def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
 def load_worker(path: str) -> Any:
     """Read a worker's loss that was trained before; only to try this script out quickly."""
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-    from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+    from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
     loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=0)
     loss.load_state_dict(torch.load(path, weights_only=True))

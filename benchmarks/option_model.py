@@ -27,7 +27,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillPolicy
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.experiments.demo import train_worker
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.skills import learn
 from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
     OptionModelConfig,
     error_by_horizon,
@@ -36,8 +37,8 @@ from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
     train_option_model,
 )
 from torchrl_hmcts.trainers.experiments.waterworld.real_episodes import EpisodesInEachMaze, act
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.transforms import OptionTransform
 
 OPTION_STEPS, GAMMA, TIME_LIMIT = 25, 0.99, 1_000
@@ -73,7 +74,7 @@ def make_memory(model: OptionModel, args: argparse.Namespace) -> OptionMemory:
 
 def run_seed(seed: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """All rows of one seed."""
-    _, loss = train_worker(DemoConfig(seed=seed))
+    loss = learn(make_kit(DemoConfig(seed=seed))).loss
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     rows: list[dict[str, Any]] = []
 

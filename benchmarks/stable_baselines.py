@@ -24,7 +24,7 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from torchrl_hmcts.envs import TorchRLGymnasiumEnv, WaterworldMazeEnv, maze_pool
-from torchrl_hmcts.trainers.experiments.demo import make_starts
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
 
 ALGORITHMS = {"A2C": A2C, "PPO": PPO}
 

@@ -32,9 +32,11 @@ from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy, TerminationNetwork
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
-from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.skills import learn
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.skills.termination import (
     TerminationConfig,
     collect_option_steps,
@@ -64,10 +66,10 @@ class Workers:
     def __init__(self, seed: int, termination: dict[str, Any], weights: Path | None) -> None:
         self.seed = seed
         if weights is None:
-            _, loss = train_worker(DemoConfig(seed=seed))
+            loss = learn(make_kit(DemoConfig(seed=seed))).loss
         else:
             from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-            from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+            from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
             loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=seed)
             loss.load_state_dict(torch.load(str(weights).format(seed=seed), weights_only=True))

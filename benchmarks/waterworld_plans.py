@@ -32,9 +32,11 @@ from torchrl_hmcts.planners import (
     SearchBudget,
     extract_plans,
 )
-from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.skills import learn
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 
 OPTION_STEPS, RADIUS, GAMMA = 25, DemoConfig().novelty_radius, 0.99  # those of the demo
 
@@ -92,7 +94,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
 
-    _, loss = train_worker(DemoConfig(seed=args.seed))
+    loss = learn(make_kit(DemoConfig(seed=args.seed))).loss
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     env = make_option_env(worker, maze_pool("test"), option_steps=OPTION_STEPS, gamma=GAMMA)
     starts = make_starts(env.base_env, args.mazes, args.seed)

@@ -21,17 +21,19 @@ from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
-from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.skills import learn
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
 from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
-from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, DemoConfig
 
 RADIUS = 0.7  # of the novelty test, tiles, in all benchmarks of skills
 
 
 def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     """Train a worker and take all figures."""
-    config = DemoConfig(seed=seed, train_base_steps=base_steps // FRAMES_PER_BATCH * 64)
+    config = DemoConfig(seed=seed, train_base_steps=base_steps // BATCH_STEPS * 64)
     trainer, loss = train_worker(config)
     mazes = maze_pool("test")
     greedy = SkillPolicy(loss.actor_network, deterministic=True)

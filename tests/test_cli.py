@@ -9,7 +9,7 @@ import pytest
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment, find_experiment
 from torchrl_hmcts.trainers.experiments.registry import field_docs
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 
 ALL = [*EXPERIMENTS.values()]
 
@@ -71,7 +71,7 @@ def test_ctrl_c_ends_with_the_command_that_continues(tmp_path, capsys, monkeypat
         raise KeyboardInterrupt
 
     monkeypatch.setattr(
-        "torchrl_hmcts.trainers.experiments.waterworld.run.run_waterworld", interrupted
+        "torchrl_hmcts.trainers.experiments.goals.run_goals", interrupted
     )
     assert main(["train", "experiment=waterworld_a3c", "out=runs/my own"]) == 130
     assert "Continue with: hmcts train 'resume=runs/my own'" in capsys.readouterr().err

@@ -21,7 +21,7 @@ from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import find_experiment
 from torchrl_hmcts.trainers.experiments.evaluations import evaluate_labmaze
 from torchrl_hmcts.trainers.experiments.lab import training
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     _with_second_search,
     frames_curve,
@@ -30,7 +30,7 @@ from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     wrong_models,
 )
 from torchrl_hmcts.trainers.experiments.lab.run import run_labmaze
-from torchrl_hmcts.trainers.experiments.lab.script import ShortestPathScript
+from torchrl_hmcts.trainers.experiments.kits.lab_script import ShortestPathScript
 from torchrl_hmcts.trainers.experiments.lab.training import train_worker
 from torchrl_hmcts.trainers.experiments.lab.worker import (
     TRAINING_MAZES,

@@ -21,15 +21,16 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.waterworld.config import WaterworldGoalsConfig
-from torchrl_hmcts.trainers.runs.config import DemoConfig, RunConfig, home, parse_overrides
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.settings import WaterworldGoalsConfig
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.runs.config import RunConfig, home, parse_overrides
 from torchrl_hmcts.trainers.runs.folder import read_run
 from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
 
 CONFIGS = (DemoConfig, LabMazeConfig, WaterworldGoalsConfig, AtariConfig)
-DEMO = "torchrl_hmcts.trainers.experiments.demo.run_demo"
+DEMO = "torchrl_hmcts.trainers.experiments.skills.run_skills"
 
 
 @pytest.fixture(autouse=True)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         OptionGoals,
         RetrainedSource,
     )
-    from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import (
+    from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
         GoalEpisodes,
         GoalTrack,
         run_goal_episodes,
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
     from torchrl_hmcts.trainers.restarting_collector import CollectorError
-    from torchrl_hmcts.trainers.runs.config import DemoConfig
+    from torchrl_hmcts.trainers.experiments.settings import DemoConfig
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
     from torchrl_hmcts.trainers.saving.resume import (

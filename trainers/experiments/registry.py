@@ -7,13 +7,9 @@ import difflib
 import importlib
 import inspect
 import textwrap
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
-
-
-class ExperimentError(ValueError):
-    """What an experiment was asked for does not fit what is there; the message says it all."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +26,7 @@ class Experiment:
         objective: figure that a sweep improves, e.g. ``"test.solved"``, larger is better; with a
             minus before it, smaller is better. Default: none, the user has to name one.
         progress: logged value by which a sweep gives up trials early. Default: none.
+        kit: its name in ``hmcts train kit=NAME``. Default: none.
 
     Example:
         >>> find_experiment("waterworld_goals").config_class(seed=3).seed
@@ -43,6 +40,7 @@ class Experiment:
     evaluate: str = ""
     objective: str = ""
     progress: str = ""
+    kit: str = ""
 
     @property
     def config_class(self) -> Any:
@@ -80,12 +78,16 @@ class Experiment:
         meanings = field_docs(self.config_class)
         lines = []
         for field in fields(self.config_class):
-            lines.append(f"  {field.name}={field.default}")
+            part = field.default is MISSING
+            lines.append(f"  {field.name}.KEY=VALUE" if part else f"  {field.name}={field.default}")
             lines += textwrap.wrap(
                 meanings.get(field.name, ""), 92, initial_indent=" " * 6, subsequent_indent=" " * 6
             )
         return "\n".join(lines)
 
+
+_SKILLS = (".skills:run_skills", ".skills:evaluate_skills")
+_GOALS = (".goals:run_goals", ".goals:evaluate_goals", "test.solved_share", "eval_solved_share")
 
 EXPERIMENTS = {
     experiment.name: experiment
@@ -93,29 +95,23 @@ EXPERIMENTS = {
         Experiment(
             "waterworld_goals",
             "chapter 3's goal-based agent: tree search over tiles sets goals, A3C reaches them",
-            ".waterworld.config:WaterworldGoalsConfig",
-            ".waterworld.run:run_waterworld",
-            ".evaluations:evaluate_waterworld",
-            objective="test.solved_share",
-            progress="eval_solved_share",
+            ".settings:WaterworldGoalsConfig",
+            *_GOALS,
         ),
         Experiment(
             "waterworld_a3c",
             "chapter 3's comparison: A3C alone on the same mazes, network and budget",
-            ".waterworld.config:WaterworldA3CConfig",
-            ".waterworld.run:run_waterworld",
-            ".evaluations:evaluate_waterworld",
-            objective="test.solved_share",
-            progress="eval_solved_share",
+            ".settings:WaterworldA3CConfig",
+            *_GOALS,
         ),
         Experiment(
             "labmaze",
             "chapter 4: tree search over skills learned by DIAYN in DeepMind Lab's random maze",
-            ".lab.config:LabMazeConfig",
-            ".lab.run:run_labmaze",
-            ".evaluations:evaluate_labmaze",
+            ".settings:LabMazeConfig",
+            *_SKILLS,
             objective="test.solved",
             progress="test_solved",
+            kit="labmaze",
         ),
         Experiment(
             "atari",
@@ -124,6 +120,7 @@ EXPERIMENTS = {
             ".atari.run:run_atari",
             ".atari.run:evaluate_atari",
             objective="score_max",
+            kit="atari",
         ),
     )
 }
@@ -131,19 +128,23 @@ EXPERIMENTS = {
 DEMO = Experiment(
     "demo",
     "learn four skills and solve random mazes",
-    "..runs.config:DemoConfig",
-    ".demo:run_demo",
-    ".evaluations:evaluate_demo",
+    ".settings:DemoConfig",
+    *_SKILLS,
+    objective="solved",
+    kit="waterworld",
 )
 ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS}
-"""The experiments of ``hmcts train``, and the demo: whatever leaves a folder of a run."""
+"""The experiments of ``hmcts train``, and the demo: all that leave a folder of a run."""
+KITS = {e.kit: e for e in ALL_EXPERIMENTS.values() if e.kit}
+"""The experiments that ``hmcts train kit=NAME`` runs, by kit."""
 
 
-def find_experiment(name: str) -> Experiment:
+def find_experiment(name: str, among: Mapping[str, Experiment] = EXPERIMENTS) -> Experiment:
     """Return an experiment by name.
 
     Args:
         name: one of ``EXPERIMENTS``.
+        among: experiments by name, or by kit.
 
     Returns:
         Where its configuration, its run and its evaluation are.
@@ -157,10 +158,11 @@ def find_experiment(name: str) -> Experiment:
         ...
         ValueError: Unknown experiment 'labmaz'. Did you mean: labmaze...
     """
-    if name not in EXPERIMENTS:
-        near = difflib.get_close_matches(name, EXPERIMENTS, n=3, cutoff=0.4) or EXPERIMENTS
-        raise ValueError(f"Unknown experiment {name!r}. Did you mean: {', '.join(near)}?")
-    return EXPERIMENTS[name]
+    if name not in among:
+        near = difflib.get_close_matches(name, among, n=3, cutoff=0.4) or among
+        what = "kit" if among is KITS else "experiment"
+        raise ValueError(f"Unknown {what} {name!r}. Did you mean: {', '.join(near)}?")
+    return among[name]
 
 
 def field_docs(config_class: type) -> dict[str, str]:
@@ -170,7 +172,7 @@ def field_docs(config_class: type) -> dict[str, str]:
         config_class: a dataclass; fields of its base classes are included.
 
     Example:
-        >>> from torchrl_hmcts.trainers.runs.config import DemoConfig
+        >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
         >>> field_docs(DemoConfig)["gamma"]
         'Discount per base step.'
     """

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import run_goal_episodes
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import run_goal_episodes
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
 from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
 from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
@@ -50,8 +50,8 @@ def draw_goals(sources: Sources, path: Path, name: str) -> str:
     whose = "a scripted worker"
     env = make_goal_env(maze_pool("test"), observation=bool(runs))
     if runs:
-        from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-        from torchrl_hmcts.trainers.experiments.waterworld.run import (
+        from torchrl_hmcts.trainers.runs.worker_file import load_networks
+        from torchrl_hmcts.trainers.experiments.goals import (
             make_agent_env,
             make_agent_loss,
         )

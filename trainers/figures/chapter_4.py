@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.lab.training import curve_script_frames
 from torchrl_hmcts.trainers.experiments.lab.worker import (
     held_out_seeds,
@@ -52,7 +52,7 @@ def draw_skills(sources: Sources, path: Path, name: str) -> str:
     """Draw the trajectories of the skills of a run's worker."""
     runs = sources.of("labmaze")
     if runs:
-        from torchrl_hmcts.trainers.experiments.evaluations import load_networks
+        from torchrl_hmcts.trainers.runs.worker_file import load_networks
 
         config: LabMazeConfig = load_config(runs[0])[1]
         loss = make_worker_loss(config.num_skills, seed=config.seed)

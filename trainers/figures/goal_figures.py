@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, TARGET_COLOR
 from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import GoalTrack
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import GoalTrack
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_tile_planner
 from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.pictures import save_figure

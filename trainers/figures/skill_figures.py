@@ -114,7 +114,7 @@ def search_coverage(search: Search, env: WaterworldMazeEnv) -> Tensor:
 
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+        >>> from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
         >>> from tensordict.nn import TensorDictModule
         >>> push = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         >>> env = make_option_env(push, seed=0)

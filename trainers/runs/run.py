@@ -16,15 +16,15 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, ExperimentError
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.runs.config import BOOL_WORDS
+from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError
 from torchrl_hmcts.trainers.runs.folder import (
     RunFolder,
     end_record,
     read_run,
     start_record,
 )
+from torchrl_hmcts.trainers.saving.files import left_out, write_csv
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled, stop_asked
 
@@ -52,8 +52,8 @@ class Run:
         resumes: whether there is a checkpoint to continue from, and it was asked for.
 
     Example:
-        >>> from torchrl_hmcts.trainers.runs.config import DemoConfig
-        >>> Run(DemoConfig(out="runs/my run"), "demo").resume_command
+        >>> from torchrl_hmcts.trainers.runs.config import RunConfig
+        >>> Run(RunConfig(out="runs/my run"), "demo").resume_command
         "hmcts train 'resume=runs/my run'"
     """
 
@@ -76,21 +76,54 @@ class Run:
         """The command that continues the run exactly."""
         return resume_command(self.config.out)
 
+    def save_worker(self, loss_module: Any, step: int) -> None:
+        """Write the networks of the worker that the page shows.
+
+        Args:
+            loss_module: holds them.
+            step: base steps of training that they have seen.
+        """
+        from torchrl_hmcts.trainers.runs.worker_file import save_worker
+
+        save_worker(self.path, loss_module, step)
+
+    def write_curves(
+        self, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], steps: str
+    ) -> None:
+        """Write ``curves.csv``, a value a row: name, step, value.
+
+        Args:
+            curves: steps and values by name.
+            steps: name of the column of the steps, which tells their unit, e.g. ``"base_steps"``.
+        """
+        rows = [
+            (name, int(step), value)
+            for name, (x, y) in curves.items()
+            for step, value in zip(x, y, strict=True)
+        ]
+        with left_out("curves.csv"):
+            write_csv(self.path / "curves.csv", ("name", steps, "value"), rows)
+
     @contextlib.contextmanager
-    def finish(self, metrics: Mapping[str, Any], *, title: str) -> Iterator[Pictures]:
+    def finish(
+        self, metrics: dict[str, Any], config: Any = None, *, title: str
+    ) -> Iterator[Pictures]:
         """Write ``metrics.json``, note that the run is finished, then pictures and the page.
 
         What cannot be drawn or written is left out, with a line on stderr.
 
         Args:
-            metrics: its figures.
+            metrics: its figures; the configuration and the versions are added to them.
+            config: as it was run. Default: that of the run.
             title: heading of the page.
 
         Yields:
             The pictures to draw.
         """
-        from torchrl_hmcts.trainers.figures.report import finish
+        from torchrl_hmcts.trainers.figures.report import finish, versions
 
+        metrics.setdefault("config", dataclasses.asdict(self.config if config is None else config))
+        metrics.setdefault("versions", versions())
         with finish(self.path, title, metrics) as pictures:
             end_record(self.path, "finished")
             yield pictures
@@ -112,7 +145,7 @@ def open_run(
 
     Args:
         config: of the experiment; ``out`` is the folder.
-        experiment: its name. Default: by the class of the configuration.
+        experiment: its name. Default: that of the configuration's class.
         command: words of the command line, for the record.
         fresh: take the first of ``out``, ``out_2``, ``out_3``, ... that holds nothing.
 
@@ -129,14 +162,7 @@ def open_run(
         return
     if hasattr(config, "check_inputs"):
         config.check_inputs()
-    name = experiment or next(
-        (
-            e.name
-            for e in ALL_EXPERIMENTS.values()
-            if e.config.endswith(f":{type(config).__name__}")
-        ),
-        "",
-    )
+    name = experiment or config.EXPERIMENT
     with contextlib.ExitStack() as stack:
         config = _claim(stack, config, name, fresh)
         resumes = getattr(config, "resume", False) and has_checkpoint(config.out)

@@ -82,7 +82,7 @@ def parse_space(
         ValueError: if a key is unknown or given twice, or its values are not of its type.
 
     Example:
-        >>> from torchrl_hmcts.trainers.runs.config import DemoConfig
+        >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
         >>> parse_space(DemoConfig, ["num_skills=[3,4]", "gamma=0.9..0.99", "mazes=5"])[0][0].values
         (3, 4)
     """

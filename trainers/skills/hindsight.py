@@ -93,7 +93,7 @@ class HindsightTransitions:
         Andrychowicz et al., "Hindsight experience replay", 2017, arXiv 1707.01495.
 
     Example:
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+        >>> from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
         >>> env = make_training_env(copies=2)
         >>> data = env.rollout(20, break_when_any_done=False)
         >>> transitions = HindsightTransitions(data, MazeView(env.mazes), touch=1e-3)

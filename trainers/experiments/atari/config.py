@@ -6,8 +6,7 @@ import os
 from dataclasses import dataclass, fields
 
 from torchrl_hmcts.arguments import name_arguments
-from torchrl_hmcts.trainers.experiments.registry import ExperimentError
-from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
+from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
 GUIDES = ("none", "prior", "prior_value")
 PROTOCOLS = ("deterministic", "sticky")
@@ -94,6 +93,7 @@ class AtariConfig(RunConfig):
     toy: bool = False
     """A run of seconds, to see that everything works."""
 
+    EXPERIMENT = "atari"
     FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
     PATHS = ("out", "options_from")
 
