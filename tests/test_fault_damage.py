@@ -35,7 +35,7 @@ from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer, ExpertIterationTrainer, HMCTSTrainer
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-from torchrl_hmcts.trainers.runs.folder import load_config, read_run, start_record
+from torchrl_hmcts.trainers.saving.run_folder import load_config, read_run, start_record
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     PlainStateAdapter,
@@ -43,6 +43,7 @@ from torchrl_hmcts.trainers.saving.checkpoints import (
     newest_checkpoint,
     plain_checkpoint,
 )
+from torchrl_hmcts.trainers.saving.run_folder import load_config, read_run, start_record
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 REFUSED = (CheckpointError, ValueError)  # of checkpoints, and of JSON
@@ -127,7 +128,7 @@ def _of_trainer(make: Callable[[], Any]) -> Kind:
 
 def demo(folder: Path) -> Kind:
     from torchrl_hmcts.trainers.experiments.demo import train_worker
-    from torchrl_hmcts.trainers.runs.worker_file import load_networks
+    from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
     config = DemoConfig(train_base_steps=128, out=str(folder))
     _, loss = train_worker(config, save_dir=folder / "checkpoints")
@@ -140,7 +141,7 @@ def demo(folder: Path) -> Kind:
 
 
 def labmaze(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.runs.worker_file import load_networks
+    from torchrl_hmcts.trainers.saving.worker_file import load_networks
     from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
     from torchrl_hmcts.trainers.experiments.lab.training import train_worker
 

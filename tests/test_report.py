@@ -18,7 +18,7 @@ from torchrl_hmcts.trainers.figures.comparison_page import group_runs
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
 from torchrl_hmcts.trainers.figures.page_parts import picture, plain
 from torchrl_hmcts.trainers.figures.report import write_page, write_run_page
-from torchrl_hmcts.trainers.runs.folder import (
+from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
     add_evaluation,
     load_config,

@@ -25,9 +25,10 @@ from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.settings import WaterworldGoalsConfig
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.runs.config import RunConfig, home, parse_overrides
-from torchrl_hmcts.trainers.runs.folder import read_run
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 CONFIGS = (DemoConfig, LabMazeConfig, WaterworldGoalsConfig, AtariConfig)
 DEMO = "torchrl_hmcts.trainers.experiments.skills.run_skills"

@@ -26,8 +26,8 @@ from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, resume, stopping
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.runs.folder import read_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.stopping import Stopped
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 

@@ -76,7 +76,7 @@ def test_a_worker_is_trained_with_a_local_ray_cluster(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["config"]["collector"] == "ray"
     # The worker has learned something from what came back.
-    from torchrl_hmcts.trainers.runs.worker_file import load_networks
+    from torchrl_hmcts.trainers.saving.worker_file import load_networks
     from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
 
     before, after = (make_worker_loss(4, seed=0) for _ in range(2))

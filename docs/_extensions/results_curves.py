@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
-from torchrl_hmcts.trainers.figures.dissertation import draw_figure
+from torchrl_hmcts.trainers.experiments.dissertation_figures import draw_figure
 
 _COLORS = ("#1d4ed8", "#e66100", "#00798c", "#5d3a9b", "#d41159", "#8c6e00", "#5a5a5a")
 
@@ -31,8 +31,8 @@ def draw_curves(results: Path, folder: Path) -> dict[str, dict[str, str]]:
     if (results / "atari/runs.json").exists():
         games = [draw_figure(f"5.{number}", [], results, folder) for number in range(1, 8)]
         drawn["atari/runs.json"] = {
-            game.path.name: f"The source's figure {game.figure.name}. {game.caption}"
-            for game in games
+            path.name: f"The dissertation's figure 5.{number}. {caption}"
+            for number, (path, caption) in enumerate(games, 1)
         }
     return drawn
 

@@ -29,11 +29,14 @@ from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
     play_mazes,
     run_goal_episodes,
 )
-from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
+from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
+    make_goal_env,
+    make_tile_planner,
+)
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
-from torchrl_hmcts.trainers.runs.worker_file import load_networks
+from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
 _GOAL_KEYS = (
     *("num_goals", "goal_met_threshold", "goal_divergence_threshold"),
@@ -118,18 +121,18 @@ def _run(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
     with run.finish(metrics, config, title=f"Random mazes: {name}") as pictures:
         words = "Test mazes solved and base steps of an episode while it learns."
         with pictures.one("learning.png", words) as path:
-            from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
+            from torchrl_hmcts.trainers.figures.curves import learning_panels, plot_training
 
             curve = {
                 "training_steps": history["eval_frames"],
                 "solved_share": history["eval_solved_share"],
                 "episode_steps": history["eval_episode_steps"],
             }
-            plot_learning_curves(
+            plot_training(
                 {name: [curve]},
+                learning_panels(config.max_episode_steps),
                 path,
                 title=f"{name[0].upper()}{name[1:]}, seed {config.seed}",
-                max_steps=config.max_episode_steps,
             )
         if _with_goals(config):
             _draw_episode(policy, tests, starts, greedy, pictures)
@@ -293,16 +296,19 @@ def _draw_episode(
         steps = len(track.positions) - 1
         words = words.replace("maze", f"maze that was NOT solved in {steps} base steps")
     with pictures.one("episode.gif", words) as path:
-        from torchrl_hmcts.trainers.figures.goal_figures import write_goal_gif
+        from torchrl_hmcts.trainers.figures.goals import write_goal_gif
 
         write_goal_gif(env.base_env, start, track, path)
     words = "The same episode: the manager's goals, half way, and at the end."
     with pictures.one("goals.png", words) as path:
-        from torchrl_hmcts.trainers.figures.goal_figures import plot_goals
+        from torchrl_hmcts.trainers.figures.goals import plot_goals
 
         plot_goals(env.base_env, start, track, path)
     words = "The manager's tree over tiles, and the path it found."
     with pictures.one("search.png", words) as path:
-        from torchrl_hmcts.trainers.figures.goal_figures import plot_tile_search
+        from torchrl_hmcts.trainers.figures.goals import plot_tile_search
 
-        plot_tile_search(env.base_env, start, path)
+        manager = make_tile_planner(env.base_env)
+        goals, lengths = manager.plan_goals(start[None])
+        search = manager.planner.last_search
+        plot_tile_search(env.base_env, start, search, goals[0, : int(lengths[0])], path)

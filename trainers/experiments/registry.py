@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import ast
 import difflib
 import importlib
-import inspect
 import textwrap
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
+
+from torchrl_hmcts.trainers.runs.config import config_keys
+from torchrl_hmcts.trainers.saving.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -75,14 +76,11 @@ class Experiment:
 
     def describe(self) -> str:
         """Return its keys with their defaults and meaning, a line or two each."""
-        meanings = field_docs(self.config_class)
         lines = []
-        for field in fields(self.config_class):
-            part = field.default is MISSING
-            lines.append(f"  {field.name}.KEY=VALUE" if part else f"  {field.name}={field.default}")
-            lines += textwrap.wrap(
-                meanings.get(field.name, ""), 92, initial_indent=" " * 6, subsequent_indent=" " * 6
-            )
+        for key, (default, meaning) in config_keys(self.config_class).items():
+            lines.append(f"  {key}.KEY=VALUE" if default == {} else f"  {key}={default}")
+            indent = " " * 6
+            lines += textwrap.wrap(meaning, 92, initial_indent=indent, subsequent_indent=indent)
         return "\n".join(lines)
 
 
@@ -165,26 +163,55 @@ def find_experiment(name: str, among: Mapping[str, Experiment] = EXPERIMENTS) ->
     return among[name]
 
 
-def field_docs(config_class: type) -> dict[str, str]:
-    """Return the sentence below each field of a configuration, by the field's name.
+def recognise(run: RunFolder) -> RunFolder:
+    """Return a run with what its experiment says of its keys, for its page.
+
+    The experiment of a run without ``run.json`` is the one that has the keys of its config.
 
     Args:
-        config_class: a dataclass; fields of its base classes are included.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-        >>> field_docs(DemoConfig)["gamma"]
-        'Discount per base step.'
+        run: of :func:`~torchrl_hmcts.trainers.saving.run_folder.read_run`; changed in place.
     """
-    docs: dict[str, str] = {}
-    for owner in reversed(config_class.__mro__[:-1]):
-        tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))
-        body = tree.body[0].body  # type: ignore[attr-defined]
-        for field, below in zip(body, body[1:], strict=False):
-            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
-                assert isinstance(field.target, ast.Name)
-                docs[field.target.id] = " ".join(ast.literal_eval(below.value).split())
-    return docs
+    if not run.experiment and run.config:
+        known = (
+            (len(keys), name)
+            for name in ALL_EXPERIMENTS
+            if set(run.config) <= set(keys := config_keys(ALL_EXPERIMENTS[name].config_class))
+        )
+        run.record["experiment"] = min(known, default=(0, ""))[1]
+    if run.experiment in ALL_EXPERIMENTS:
+        run.keys = config_keys(ALL_EXPERIMENTS[run.experiment].config_class)
+    return run
+
+
+def load_config(run: RunFolder) -> tuple[Experiment, Any]:
+    """Return the experiment of a run and its configuration, with ``out`` at the folder.
+
+    Args:
+        run: of :func:`read_run`.
+
+    Raises:
+        ValueError: if ``run.json`` is damaged, or the experiment is unknown or no longer has one of
+            the keys.
+    """
+    for sentence in run.damage:
+        if "run.json" in sentence:
+            raise ValueError(sentence)
+    run = recognise(run)
+    if run.experiment not in ALL_EXPERIMENTS:
+        raise ValueError(
+            f"{run.path} does not say which experiment it is of (run.json). Experiments: "
+            f"{', '.join(ALL_EXPERIMENTS)}."
+        )
+    experiment = ALL_EXPERIMENTS[run.experiment]
+    known = {field.name for field in fields(experiment.config_class)}
+    unknown = sorted(set(run.config) - known)
+    if unknown:
+        raise ValueError(
+            f"{run.path} was made with keys that experiment={experiment.name} no longer has: "
+            f"{', '.join(unknown)}. Use the version that made it: {run.record.get('versions')}."
+        )
+    config = experiment.config_class(**{**run.config, "out": str(run.path)})
+    return experiment, config
 
 
 def _load(path: str) -> Any:

@@ -30,21 +30,25 @@ from torchrl_hmcts.objectives import SkillObjective
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
-from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, Trial, make_kit
+from torchrl_hmcts.trainers.experiments.kits import (
+    OBJECTIVE,
+    Kit,
+    LearnedSkills,
+    Trial,
+    make_kit,
+)
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, SkillsConfig
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.trainers.parts import build, merged
 from torchrl_hmcts.trainers.ray_collector import make_ray_collector
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
-from torchrl_hmcts.trainers.runs.worker_file import load_networks
+from torchrl_hmcts.trainers.saving.worker_file import load_networks
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.skills.curves import Curves
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
 
-OBJECTIVE = {"_component_": "torchrl_hmcts.objectives.SkillDiscriminatorLoss"}
-"""DIAYN's objective, the default."""
 _REWARD_SCALES = {"METRAEncoderLoss": 3.0, "LSDEncoderLoss": 10.0, "SkillDynamicsLoss": 0.5}
 _CURVE_EXPANSIONS = 300  # of a search while the worker learns
 
@@ -272,7 +276,8 @@ def _make_diayn(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> DIAYNTr
     scale = _REWARD_SCALES.get(type(loss.objective).__name__)
     if scale is not None:
         own["reward"] = SkillReward(loss.objective, intrinsic_coeff=scale)
-    return DIAYNTrainer(kit.make_training_env(), loss, **{**own, **keywords})
+    path = kit.parts()["trainer"]["_component_"]
+    return build(path, env=kit.make_training_env(), loss_module=loss, **{**own, **keywords})
 
 
 def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTrainer:
@@ -303,7 +308,8 @@ def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTr
             "test_rounds": config.curve_mazes,
             "test_interval": max(1, round(expected / config.curve_points)),
         }
-    return HMCTSTrainer(partial(kit.make_env, "train"), loss, **{**own, **keywords})
+    make_env = partial(kit.make_env, "train")
+    return HMCTSTrainer(make_env, loss, **{**own, **keywords})
 
 
 def _curve_budget(config: SkillsConfig) -> dict[str, int]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
 import importlib
+import inspect
 import math
 import numbers
 import os
+import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, ClassVar, TypeVar
 
 C = TypeVar("C")
@@ -259,3 +262,27 @@ def unknown_key(key: str, known: Sequence[str]) -> str:
     """
     near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or list(known)
     return f"Unknown key {key!r}. Did you mean: {', '.join(near)}?"
+
+
+def config_keys(config_class: type) -> dict[str, tuple[Any, str]]:
+    """Return the default of each key of a configuration, and the sentence below it.
+
+    Args:
+        config_class: a dataclass; fields of its base classes are included.
+
+    Example:
+        >>> config_keys(RunConfig)["resume"]
+        (False, 'Continue the run in `out` from its newest checkpoint.')
+    """
+    docs: dict[str, str] = {}
+    for owner in reversed(config_class.__mro__[:-1]):
+        tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))
+        body = tree.body[0].body  # type: ignore[attr-defined]
+        for field, below in zip(body, body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                assert isinstance(field.target, ast.Name)
+                docs[field.target.id] = " ".join(ast.literal_eval(below.value).split())
+    return {
+        field.name: ({} if field.default is MISSING else field.default, docs.get(field.name, ""))
+        for field in fields(config_class)
+    }

@@ -16,7 +16,6 @@ from typing import Any
 from torch import Tensor
 from torchrl.record.loggers import CSVLogger, Logger
 
-from torchrl_hmcts.trainers.runs.config import check_logger
 from torchrl_hmcts.trainers.saving.files import left_out
 
 Observer = Callable[[str, float, int], None]
@@ -127,10 +126,8 @@ def make_logger(config: Any) -> ScalarLoggers:
             ``out/wandb`` and sends nothing, unless the variable ``WANDB_MODE`` is ``online``.
 
     Raises:
-        ValueError: if ``logger`` is none of the names.
         ModuleNotFoundError: if its package is not installed.
     """
-    check_logger(config.logger)
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     if not getattr(config, "resume", False):

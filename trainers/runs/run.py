@@ -17,12 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError
-from torchrl_hmcts.trainers.runs.folder import (
+from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError, config_keys
+from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
     end_record,
+    machine,
     read_run,
     start_record,
+    versions,
 )
 from torchrl_hmcts.trainers.saving.files import left_out, write_csv
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
@@ -83,7 +85,7 @@ class Run:
             loss_module: holds them.
             step: base steps of training that they have seen.
         """
-        from torchrl_hmcts.trainers.runs.worker_file import save_worker
+        from torchrl_hmcts.trainers.saving.worker_file import save_worker
 
         save_worker(self.path, loss_module, step)
 
@@ -120,11 +122,11 @@ class Run:
         Yields:
             The pictures to draw.
         """
-        from torchrl_hmcts.trainers.figures.report import finish, versions
+        from torchrl_hmcts.trainers.figures.run_page import finish
 
         metrics.setdefault("config", dataclasses.asdict(self.config if config is None else config))
         metrics.setdefault("versions", versions())
-        with finish(self.path, title, metrics) as pictures:
+        with finish(self.path, title, metrics, config_keys(type(self.config))) as pictures:
             end_record(self.path, "finished")
             yield pictures
 
@@ -169,8 +171,6 @@ def open_run(
         run = Run(config, name, resumes)
         if getattr(config, "overwrite", False):
             clear(run.path)
-        from torchrl_hmcts.trainers.figures.report import machine, versions
-
         start_record(name, config, command, {"versions": versions(), "machine": machine()})
         token = _current.set(run)
         stack.callback(_current.reset, token)

@@ -20,11 +20,11 @@ from sqlalchemy.pool import NullPool  # Optuna depends on it
 
 from torchrl_hmcts.trainers.experiments.registry import Experiment
 from torchrl_hmcts.trainers.runs.config import home
-from torchrl_hmcts.trainers.runs.folder import read_run
 from torchrl_hmcts.trainers.runs.journal import CheckedJournal
 from torchrl_hmcts.trainers.runs.loggers import observed
 from torchrl_hmcts.trainers.runs.run import next_free, open_run, run_files
 from torchrl_hmcts.trainers.runs.sweep_space import Choice, Dimension
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 _SPACE = "space"  # attribute of a study

@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
@@ -31,6 +33,9 @@ from torchrl_hmcts.transforms import OptionTransform
 KITS = {"waterworld": "waterworld.WaterworldKit", "labmaze": "lab.LabMazeKit"}
 """Class of each kit by its name on the command line, in this package."""
 
+
+OBJECTIVE = {"_component_": "torchrl_hmcts.objectives.SkillDiscriminatorLoss"}
+"""DIAYN's objective, the default of every kit."""
 
 Curve = tuple[Sequence[float], Sequence[float]]  # steps and values
 
@@ -94,6 +99,7 @@ class Kit:
             about.
         worker_keys (sequence of NestedKey): what the worker sees besides its skill.
         state_keys (sequence of NestedKey): what pictures need of a state.
+        captions (mapping): of the pictures.
         unit (str): of the times that are reported.
         curve_steps (str): column of the steps in ``curves.csv``, named for their unit.
         title (str): of the page.
@@ -109,6 +115,16 @@ class Kit:
     place_key: NestedKey = "position"
     worker_keys: Sequence[NestedKey] = ("observation",)
     state_keys: Sequence[NestedKey] = ("position",)
+    captions: Mapping[str, str] = {
+        "episode.gif": "A test maze as it was solved: the plan (pale; colours are skills) and the "
+        "worker's way.",
+        "unsolved": "A test maze that was NOT solved: the plan, if one was found (pale; colours "
+        "are skills), and how far the worker came.",
+        "search.png": "The search for that plan: every place an option led to (grey: refused by "
+        "the novelty test), and the tree.",
+        "skills.png": "The skills: 10 mini-episodes for each, in an open room and in a maze.",
+        "losses.png": "Training of the worker: actor, both critics, discriminator.",
+    }
     unit = "base steps"
     curve_steps = "base_steps"
     title = "Planning over learned skills"
@@ -192,6 +208,16 @@ class Kit:
             "leaves_per_wave": config.leaves_per_wave,
         }
 
+    def parts(self) -> dict[str, dict[str, Any]]:
+        """Return the components that keys of the command line change, at the kit's defaults."""
+        trainer = {"hmcts": "HMCTSTrainer"}.get(self.config.algorithm, "DIAYNTrainer")
+        return {
+            "objective": dict(OBJECTIVE),
+            "loss": {"_component_": "torchrl_hmcts.objectives.DiscreteSkillSACLoss"},
+            "trainer": {"_component_": f"torchrl_hmcts.trainers.{trainer}"},
+            "planner": self.planner_part(),
+        }
+
     def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
         """Return the planner that the configuration describes.
 
@@ -239,20 +265,45 @@ class Kit:
             for name, values in learned.history.items()
         }
 
-    def draw(self, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
-        """Draw the pictures of a run."""
-        self.draw_losses(pictures, learned)
+    def map(self, env: EnvBase) -> Any:
+        """Return what draws the states of a base env; None where there is no map.
 
-    def draw_losses(
-        self, pictures: Pictures, learned: LearnedSkills, words: str = "Training of the worker: "
-    ) -> None:
-        """Draw the curves of the training, if there was one."""
+        See :class:`~torchrl_hmcts.trainers.figures.maps.MapDrawing`.
+        """
+        return None
+
+    def draw(self, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
+        """Draw the pictures of a run: an episode, its search, the skills, their training."""
+        config, captions = self.config, self.captions
+        shown, episode, search = self.replay(learned.worker, trial)
+        states, options = episode.states[0], episode.options[0].tolist()
+        plan, env = episode.plans[0], self.make_env("test")
+        drawing = self.map(env)
+        if drawing is not None:
+            words = captions["episode.gif" if episode.solved[0] else "unsolved"]
+            with pictures.one("episode.gif", words) as path:
+                from torchrl_hmcts.trainers.figures.maps import write_episode_gif
+
+                write_episode_gif(drawing, list(states.unbind(0)), options, plan, path)
+            with pictures.one("search.png", captions["search.png"]) as path:
+                from torchrl_hmcts.trainers.figures.maps import plot_search
+
+                plot_search(drawing, search, path)
         if learned.loss is None:
             return
-        with pictures.one(
-            "losses.png", f"{words}actor, both critics, discriminator."
-        ) as path:
-            from torchrl_hmcts.trainers.figures.plots import plot_losses
+        if drawing is not None:
+            seen = f" The worker of all pictures has learned for {learned.worker_step:,} base steps."
+            with pictures.one("skills.png", captions["skills.png"] + seen) as path:
+                from torchrl_hmcts.trainers.figures.maps import plot_skill_fan
+
+                generator = torch.Generator().manual_seed(config.seed)
+                sampling = SkillPolicy(learned.loss.actor_network, generator=generator)
+                maze = int(trial.starts[shown].get("maze_index", torch.zeros(())))
+                rooms = drawing.rooms(10 * config.num_skills, maze)
+                steps = 100 // config.frames_per_step
+                plot_skill_fan(sampling, rooms, path, num_skills=config.num_skills, steps=steps)
+        with pictures.one("losses.png", captions["losses.png"]) as path:
+            from torchrl_hmcts.trainers.figures.curves import plot_losses
 
             plot_losses(learned.history, learned.steps, path)
 

@@ -11,9 +11,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from itertools import count, islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +21,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
-from torchrl_hmcts.modules import SkillPolicy, StallTermination
+from torchrl_hmcts.modules import StallTermination
 from torchrl_hmcts.planners import ModelBasedControl
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.kits import Curve, Kit, LearnedSkills, Trial
@@ -45,19 +43,6 @@ TEST_SEED, CURVE_SEED = 1_000_000, 2_000_000
 """First seeds of the test mazes, and of the mazes that Figure 4.10's curve is drawn from."""
 _STALL_SPEED = 0.3  # share of the top speed below which a player is at a standstill
 _FRAME = 3  # column of the state's "level"
-
-_PICTURES = {
-    "episode.gif": "A test maze as it was solved: the plan (pale; colours are skills), the worker "
-    "that executes it, and what the player sees.",
-    "solving.png": "Figure 4.10: frames of an episode in held-out mazes while the worker learns; "
-    "an episode that is not solved counts with all its frames.",
-    "skills.png": "Figure 4.5: the skills, 10 mini-episodes of 100 frames for each.",
-    "search.png": "The search for that plan: every place an option led to (grey: refused by the "
-    "novelty test), and the tree.",
-    "mazes.png": 'Figure 4.4: four test mazes, as text (goal "G", walls "*") and from above.',
-    "view.png": "Figure 4.3: what the player sees (drawn by this package, not by DeepMind Lab).",
-}
-
 
 def make_lab_env(maze_seeds: Sequence[int] = range(TRAINING_MAZES), **kwargs: Any) -> LabMazeEnv:
     """Build the maze as the experiment plays it: only the goal is rewarded, and ends the episode.
@@ -145,6 +130,17 @@ class LabMazeKit(Kit):
     place_key = "tile_position"
     worker_keys = ("body_velocity", "heading")
     state_keys = ("maze_index", "position", "velocity", "turned", "level")
+    captions = {
+        **Kit.captions,
+        "solving.png": "Figure 4.10: frames of an episode in held-out mazes while the worker "
+        "learns; an episode that is not solved counts with all its frames.",
+        "skills.png": "Figure 4.5: the skills, 10 mini-episodes of 100 frames for each.",
+        "losses.png": "Figures 4.6 to 4.9: training of the worker: actor, both critics, "
+        "discriminator.",
+        "mazes.png": 'Figure 4.4: four test mazes, as text (goal "G", walls "*") and from above.',
+        "view.png": "Figure 4.3: what the player sees (drawn by this package, not by DeepMind "
+        "Lab).",
+    }
     unit = "frames"
     curve_steps = "training_frames"
     title = "DeepMind Lab's random maze, by planning over learned skills"
@@ -351,55 +347,35 @@ class LabMazeKit(Kit):
 
     # ------------------------------------------------------- pictures
 
+    def map(self, env: EnvBase) -> Any:
+        from torchrl_hmcts.trainers.figures.maps import LabMap
+
+        return LabMap(env)  # type: ignore[arg-type]
+
     def draw(self, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
-        config, captions = self.config, dict(_PICTURES)
-        shown, episode, search = self.replay(learned.worker, trial)
+        super().draw(pictures, learned, trial)
+        config, captions = self.config, self.captions
         env = self.make_env("test", max(4, config.mazes))
-        if not episode.solved[0]:
-            captions["episode.gif"] = (
-                "A test maze that was NOT solved: the plan, if one was found (pale; colours are "
-                "skills), how far the worker came, and what the player sees."
-            )
-        frames = learned.worker_step * config.frames_per_step
-        captions["skills.png"] += f" The worker of all pictures is that after {frames:,} frames."
+        if learned.tests.columns["round"].size:
+            with pictures.one("solving.png", captions["solving.png"]) as path:
+                from torchrl_hmcts.trainers.figures.curves import plot_training, solving_panels
 
-        def picture(name: str) -> AbstractContextManager[Path]:
-            return pictures.one(name, captions[name])
-
-        with picture("episode.gif") as path:
-            from torchrl_hmcts.trainers.figures.lab_figures import write_episode_gif
-
-            states, options = episode.states[0].unbind(0), episode.options[0].tolist()
-            write_episode_gif(env, states, options, episode.plans[0], path)
-        with picture("solving.png") as path:
-            from torchrl_hmcts.trainers.figures.lab_figures import plot_frames_curves
-
-            plot_frames_curves(
-                [self.frames_curve(learned.tests)],
-                path,
-                title=f"{'Algorithm 3' if config.algorithm == 'hmcts' else 'DIAYN'}: "
-                f"{config.curve_mazes} held-out mazes of 9 x 9",
-                script=self.script_frames(),
-            )
-        with picture("skills.png") as path:
-            from torchrl_hmcts.trainers.figures.lab_figures import plot_skill_fan
-
-            generator = torch.Generator().manual_seed(config.seed)
-            sampling = SkillPolicy(learned.loss.actor_network, generator=generator)
-            plot_skill_fan(sampling, env, path, num_skills=config.num_skills)
-        self.draw_losses(pictures, learned, "Figures 4.6 to 4.9: training of the worker: ")
-        with picture("search.png") as path:
-            from torchrl_hmcts.trainers.figures.lab_figures import plot_search
-
-            plot_search(search, env, path)
-        with picture("mazes.png") as path:
-            from torchrl_hmcts.trainers.figures.lab_figures import plot_mazes
+                name = "Algorithm 3" if config.algorithm == "hmcts" else "DIAYN"
+                plot_training(
+                    {name: [self.frames_curve(learned.tests)]},
+                    solving_panels(self.script_frames()),
+                    path,
+                    title=f"{name}: {config.curve_mazes} held-out mazes of 9 x 9",
+                    x_label="frames of training",
+                )
+        with pictures.one("mazes.png", captions["mazes.png"]) as path:
+            from torchrl_hmcts.trainers.figures.maps import plot_mazes
 
             plot_mazes(env, path)
-        with picture("view.png") as path, replacing(path) as temporary:
+        with pictures.one("view.png", captions["view.png"]) as path, replacing(path) as temporary:
             import imageio.v3 as iio
 
-            view = draw_first_person(env, trial.starts[shown], width=640, height=480)
+            view = draw_first_person(env, trial.starts[0], width=640, height=480)
             temporary.write_bytes(iio.imwrite("<bytes>", view, extension=".png"))
 
     def table(self, metrics: Mapping[str, Any]) -> str:

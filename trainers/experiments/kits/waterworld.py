@@ -14,9 +14,7 @@ from torch import Tensor
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
-from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, Trial
-from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.transforms import DisplacementTransform, OptionTransform, SkillTransform
 
 
@@ -179,33 +177,10 @@ class WaterworldKit(Kit):
             "episode_base_steps_over_shortest": round(median(per_tile), 2),
         }
 
-    def draw(self, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
-        shown, episode, search = self.replay(learned.worker, trial)
-        env, start = self.make_env("test"), trial.starts[shown]
-        words = "A test maze as it was solved: the plan (colours are skills) and the worker's way."
-        if not episode.solved[0]:
-            words = (
-                "A test maze that was NOT solved: the plan, if one was found (colours are skills), "
-                "and how far the worker came."
-            )
-        with pictures.one("episode.gif", words) as path:
-            from torchrl_hmcts.trainers.figures.animation import write_episode_gif
+    def map(self, env: EnvBase) -> Any:
+        from torchrl_hmcts.trainers.figures.maps import WaterworldMap
 
-            write_episode_gif(env, start, episode, path)
-        words = "The search for that plan: every place an option led to in the maze (grey: refused "
-        with pictures.one("search.png", words + "by the novelty test), and the tree.") as path:
-            from torchrl_hmcts.trainers.figures.plots import plot_search
-
-            plot_search(search, env, path)
-        if learned.loss is not None:
-            words = "The skills: 10 mini-episodes of 100 base steps for each, in an open room and "
-            with pictures.one("skills.png", words + "in the maze above.") as path:
-                from torchrl_hmcts.trainers.figures.plots import plot_skill_fan
-
-                maze = env.mazes[int(start["maze_index"])]
-                skills = SkillPolicy(learned.loss.actor_network)
-                plot_skill_fan(skills, self.config.num_skills, maze, path)
-        self.draw_losses(pictures, learned)
+        return WaterworldMap(env)  # type: ignore[arg-type]
 
     def table(self, metrics: Mapping[str, Any]) -> str:
         rows = [
