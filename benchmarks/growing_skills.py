@@ -38,10 +38,9 @@ from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, DemoConfig
+from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
 from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
 from torchrl_hmcts.transforms import (
     DisplacementTransform,

@@ -27,7 +27,6 @@ import numpy as np
 import torch
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     frames_curve,
     solve_mazes,
@@ -36,6 +35,7 @@ from torchrl_hmcts.trainers.experiments.lab.evaluation import (
 )
 from torchrl_hmcts.trainers.experiments.lab.training import curve_script_frames, train_worker
 from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.figures.curves import plot_training, solving_panels
 
 ERROR = 0.05

@@ -31,12 +31,11 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MaxBackup, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.kits import make_kit
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.experiments.skills import learn
 from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer, make_guided_planner
-from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 
 OPTION_STEPS, RADIUS, GAMMA = 25, 0.7, 0.99  # those of the demo
 MAIN = "learned, expand one, novelty 0.2"  # the one that is followed over the iterations

@@ -44,8 +44,11 @@ from torchrl_hmcts.objectives import (
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import (
+    make_option_env,
+    make_starts,
+    make_training_env,
+)
 from torchrl_hmcts.transforms import SkillReward
 
 NUM_SKILLS, OPTION_STEPS, BASE_STEPS = 4, 25, 40_000

@@ -33,10 +33,9 @@ from torchrl_hmcts.modules import SkillPolicy, TerminationNetwork
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.kits import make_kit
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
-from torchrl_hmcts.trainers.experiments.skills import learn
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.skills import learn
 from torchrl_hmcts.trainers.skills.termination import (
     TerminationConfig,
     collect_option_steps,

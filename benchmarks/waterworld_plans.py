@@ -33,10 +33,9 @@ from torchrl_hmcts.planners import (
     extract_plans,
 )
 from torchrl_hmcts.trainers.experiments.kits import make_kit
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
-from torchrl_hmcts.trainers.experiments.skills import learn
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.skills import learn
 
 OPTION_STEPS, RADIUS, GAMMA = 25, DemoConfig().novelty_radius, 0.99  # those of the demo
 

@@ -22,11 +22,10 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.kits import make_kit
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
-from torchrl_hmcts.trainers.experiments.skills import learn
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, DemoConfig
+from torchrl_hmcts.trainers.experiments.skills import learn
+from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
 
 RADIUS = 0.7  # of the novelty test, tiles, in all benchmarks of skills
 
@@ -34,7 +33,8 @@ RADIUS = 0.7  # of the novelty test, tiles, in all benchmarks of skills
 def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     """Train a worker and take all figures."""
     config = DemoConfig(seed=seed, train_base_steps=base_steps // BATCH_STEPS * 64)
-    trainer, loss = train_worker(config)
+    learned = learn(make_kit(config))
+    loss = learned.loss
     mazes = maze_pool("test")
     greedy = SkillPolicy(loss.actor_network, deterministic=True)
     env, real = (make_option_env(greedy, mazes) for _ in range(2))
@@ -57,7 +57,7 @@ def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "train_base_steps": config.train_base_steps,
-        "last_training_accuracy": round(trainer.history["discriminator_accuracy"][-1], 4),
+        "last_training_accuracy": round(learned.history["discriminator_accuracy"][-1], 4),
         "greedy": skill_figures(greedy, loss.discriminator, mazes, seed=seed),
         "sampled": skill_figures(sampling, loss.discriminator, mazes, seed=seed),
         "coverage_200_expansions": spread(coverage.numpy()),

@@ -70,9 +70,7 @@ def test_ctrl_c_ends_with_the_command_that_continues(tmp_path, capsys, monkeypat
     def interrupted(config) -> dict:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(
-        "torchrl_hmcts.trainers.experiments.goals.run_goals", interrupted
-    )
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.goals.run_goals", interrupted)
     assert main(["train", "experiment=waterworld_a3c", "out=runs/my own"]) == 130
     assert "Continue with: hmcts train 'resume=runs/my own'" in capsys.readouterr().err
 

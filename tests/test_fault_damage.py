@@ -35,7 +35,6 @@ from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer, ExpertIterationTrainer, HMCTSTrainer
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-from torchrl_hmcts.trainers.saving.run_folder import load_config, read_run, start_record
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     PlainStateAdapter,
@@ -127,11 +126,12 @@ def _of_trainer(make: Callable[[], Any]) -> Kind:
 
 
 def demo(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.demo import train_worker
+    from torchrl_hmcts.trainers.experiments.kits import make_kit
+    from torchrl_hmcts.trainers.experiments.skills import learn
     from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
     config = DemoConfig(train_base_steps=128, out=str(folder))
-    _, loss = train_worker(config, save_dir=folder / "checkpoints")
+    loss = learn(make_kit(config), save_dir=folder / "checkpoints").loss
 
     def load() -> Any:
         load_networks(loss, folder)
@@ -141,14 +141,15 @@ def demo(folder: Path) -> Kind:
 
 
 def labmaze(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.saving.worker_file import load_networks
+    from torchrl_hmcts.trainers.experiments.kits import make_kit
     from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
-    from torchrl_hmcts.trainers.experiments.lab.training import train_worker
+    from torchrl_hmcts.trainers.experiments.skills import learn
+    from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
     config = LabMazeConfig(
         algorithm="diayn", train_frames=256, expansions=2, curve_mazes=1, curve_points=1
     )
-    loss = train_worker(config, save_dir=folder / "checkpoints").loss
+    loss = learn(make_kit(config), save_dir=folder / "checkpoints").loss
 
     def load() -> Any:
         load_networks(loss, folder)

@@ -33,12 +33,12 @@ from torchrl.trainers import Trainer
 
 from torchrl_hmcts import envs, modules, objectives, planners, trainers, transforms
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 from torchrl_hmcts.trainers.experiments.settings import (
+    LabMazeConfig,
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # torch may warn of what it then accepts
 Good = Callable[[], tuple[Callable[..., Any], dict[str, Any]]]

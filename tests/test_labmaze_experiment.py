@@ -20,8 +20,8 @@ from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import find_experiment
 from torchrl_hmcts.trainers.experiments.evaluations import evaluate_labmaze
+from torchrl_hmcts.trainers.experiments.kits.lab_script import ShortestPathScript
 from torchrl_hmcts.trainers.experiments.lab import training
-from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     _with_second_search,
     frames_curve,
@@ -30,7 +30,6 @@ from torchrl_hmcts.trainers.experiments.lab.evaluation import (
     wrong_models,
 )
 from torchrl_hmcts.trainers.experiments.lab.run import run_labmaze
-from torchrl_hmcts.trainers.experiments.kits.lab_script import ShortestPathScript
 from torchrl_hmcts.trainers.experiments.lab.training import train_worker
 from torchrl_hmcts.trainers.experiments.lab.worker import (
     TRAINING_MAZES,
@@ -40,6 +39,7 @@ from torchrl_hmcts.trainers.experiments.lab.worker import (
     make_starts,
     make_worker_loss,
 )
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import OptionTransform
 

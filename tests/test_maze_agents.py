@@ -11,14 +11,14 @@ from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.experiments.settings import (
+    WaterworldA3CConfig,
+    WaterworldGoalsConfig,
+)
 from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
     MazeNetwork,
     make_maze_networks,
     play_mazes,
-)
-from torchrl_hmcts.trainers.experiments.settings import (
-    WaterworldA3CConfig,
-    WaterworldGoalsConfig,
 )
 
 

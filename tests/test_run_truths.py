@@ -13,15 +13,13 @@ import torch
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.saving.worker_file import load_networks
 from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
-from torchrl_hmcts.trainers.figures.report import write_run_page
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run
+from torchrl_hmcts.trainers.figures.report import write_run_page
 from torchrl_hmcts.trainers.runs.run import open_run
-from torchrl_hmcts.trainers.saving.worker_file import find_worker, save_worker
 from torchrl_hmcts.trainers.saving.files import read_json, write_json
 from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run
+from torchrl_hmcts.trainers.saving.worker_file import find_worker, load_networks, save_worker
 
 
 def finish(out: Path, metrics: dict[str, Any], **captions: str) -> str:

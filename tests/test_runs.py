@@ -21,11 +21,12 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
-from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.settings import WaterworldGoalsConfig
-from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import (
+    DemoConfig,
+    LabMazeConfig,
+    WaterworldGoalsConfig,
+)
 from torchrl_hmcts.trainers.runs.config import RunConfig, home, parse_overrides
-from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
 from torchrl_hmcts.trainers.saving.run_folder import read_run

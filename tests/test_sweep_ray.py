@@ -77,9 +77,8 @@ def test_a_worker_is_trained_with_a_local_ray_cluster(tmp_path: Path) -> None:
     assert record["config"]["collector"] == "ray"
     # The worker has learned something from what came back.
     from torchrl_hmcts.trainers.saving.worker_file import load_networks
-    from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
 
-    before, after = (make_worker_loss(4, seed=0) for _ in range(2))
+    before, after = (make_loss(LabMazeKit(LabMazeConfig())) for _ in range(2))
     load_networks(after, tmp_path / "run")
     pairs = zip(before.parameters(), after.parameters(), strict=True)
     assert any(not torch.equal(a, b) for a, b in pairs)

@@ -2,225 +2,121 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+import inspect
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchrl_hmcts.trainers.a3c.learner_processes import LearnerError
-    from torchrl_hmcts.trainers.a3c.shared_optimizers import (
-        SharedAdam,
-        SharedRMSprop,
-        share_optimizer,
-    )
-    from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
-    from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
-    from torchrl_hmcts.trainers.experiments.atari.agent import (
-        AtariAgent,
-        AtariProgress,
-        AtariSearch,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.goals import (
-        Candidate,
-        GoalFinder,
-        GoalSearch,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
+    from torchrl_hmcts.trainers.a3c.learner_processes import LearnerError as LearnerError
+    from torchrl_hmcts.trainers.a3c.shared_optimizers import SharedAdam as SharedAdam
+    from torchrl_hmcts.trainers.a3c.shared_optimizers import SharedRMSprop as SharedRMSprop
+    from torchrl_hmcts.trainers.a3c.shared_optimizers import share_optimizer as share_optimizer
+    from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer as A3CTrainer
+    from torchrl_hmcts.trainers.diayn import DIAYNTrainer as DIAYNTrainer
+    from torchrl_hmcts.trainers.diayn import make_skill_optimizer as make_skill_optimizer
+    from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent as AtariAgent
+    from torchrl_hmcts.trainers.experiments.atari.agent import AtariProgress as AtariProgress
+    from torchrl_hmcts.trainers.experiments.atari.agent import AtariSearch as AtariSearch
+    from torchrl_hmcts.trainers.experiments.atari.goals import Candidate as Candidate
+    from torchrl_hmcts.trainers.experiments.atari.goals import GoalFinder as GoalFinder
+    from torchrl_hmcts.trainers.experiments.atari.goals import GoalSearch as GoalSearch
+    from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide as SearchGuide
+    from torchrl_hmcts.trainers.experiments.atari.learned_sources import DIAYNSource as DIAYNSource
     from torchrl_hmcts.trainers.experiments.atari.learned_sources import (
-        DIAYNSource,
-        DistilledSource,
+        DistilledSource as DistilledSource,
     )
-    from torchrl_hmcts.trainers.experiments.atari.options import Options, WorkerSource, load_options
-    from torchrl_hmcts.trainers.experiments.atari.sources import (
-        ActionSetSource,
-        ActionSource,
-        BestSource,
-        GoalSource,
-        RepeatSource,
-    )
+    from torchrl_hmcts.trainers.experiments.atari.options import Options as Options
+    from torchrl_hmcts.trainers.experiments.atari.options import WorkerSource as WorkerSource
+    from torchrl_hmcts.trainers.experiments.atari.options import load_options as load_options
+    from torchrl_hmcts.trainers.experiments.atari.sources import ActionSetSource as ActionSetSource
+    from torchrl_hmcts.trainers.experiments.atari.sources import ActionSource as ActionSource
+    from torchrl_hmcts.trainers.experiments.atari.sources import BestSource as BestSource
+    from torchrl_hmcts.trainers.experiments.atari.sources import GoalSource as GoalSource
+    from torchrl_hmcts.trainers.experiments.atari.sources import RepeatSource as RepeatSource
     from torchrl_hmcts.trainers.experiments.atari.trained_sources import (
-        FineTunedSource,
-        OptionGoals,
-        RetrainedSource,
+        FineTunedSource as FineTunedSource,
     )
+    from torchrl_hmcts.trainers.experiments.atari.trained_sources import OptionGoals as OptionGoals
+    from torchrl_hmcts.trainers.experiments.atari.trained_sources import (
+        RetrainedSource as RetrainedSource,
+    )
+    from torchrl_hmcts.trainers.experiments.settings import DemoConfig as DemoConfig
+    from torchrl_hmcts.trainers.experiments.waterworld.episodes import GoalEpisodes as GoalEpisodes
+    from torchrl_hmcts.trainers.experiments.waterworld.episodes import GoalTrack as GoalTrack
     from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
-        GoalEpisodes,
-        GoalTrack,
-        run_goal_episodes,
+        run_goal_episodes as run_goal_episodes,
     )
     from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
-        TilePlanner,
-        make_goal_env,
-        make_tile_planner,
+        TilePlanner as TilePlanner,
     )
+    from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
+        make_goal_env as make_goal_env,
+    )
+    from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
+        make_tile_planner as make_tile_planner,
+    )
+    from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork as MazeNetwork
     from torchrl_hmcts.trainers.experiments.waterworld.networks import (
-        MazeNetwork,
-        shortest_distances,
+        shortest_distances as shortest_distances,
     )
-    from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
+    from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import (
+        ScriptedExpert as ScriptedExpert,
+    )
     from torchrl_hmcts.trainers.expert_iteration import (
-        ExpertIterationTrainer,
-        SearchCollector,
-        make_guided_planner,
+        ExpertIterationTrainer as ExpertIterationTrainer,
     )
-    from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-    from torchrl_hmcts.trainers.restarting_collector import CollectorError
-    from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-    from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
-    from torchrl_hmcts.trainers.saving.locking import FolderInUse
-    from torchrl_hmcts.trainers.saving.resume import (
-        GeneratorStates,
-        ResumableTrainer,
-        RunningEpisodes,
-    )
+    from torchrl_hmcts.trainers.expert_iteration import SearchCollector as SearchCollector
+    from torchrl_hmcts.trainers.expert_iteration import make_guided_planner as make_guided_planner
+    from torchrl_hmcts.trainers.hmcts import HMCTSTrainer as HMCTSTrainer
+    from torchrl_hmcts.trainers.restarting_collector import CollectorError as CollectorError
+    from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation as DurableRotation
+    from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint as plain_checkpoint
+    from torchrl_hmcts.trainers.saving.locking import FolderInUse as FolderInUse
+    from torchrl_hmcts.trainers.saving.resume import GeneratorStates as GeneratorStates
+    from torchrl_hmcts.trainers.saving.resume import ResumableTrainer as ResumableTrainer
+    from torchrl_hmcts.trainers.saving.resume import RunningEpisodes as RunningEpisodes
+    from torchrl_hmcts.trainers.skills.controllability import Controllability as Controllability
     from torchrl_hmcts.trainers.skills.controllability import (
-        Controllability,
-        probe_controllability,
+        probe_controllability as probe_controllability,
     )
-    from torchrl_hmcts.trainers.skills.coverage import StateCoverage
-    from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
-    from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
-    from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
+    from torchrl_hmcts.trainers.skills.coverage import StateCoverage as StateCoverage
+    from torchrl_hmcts.trainers.skills.growing import GrowSkills as GrowSkills
+    from torchrl_hmcts.trainers.skills.growing import SearchCoverage as SearchCoverage
+    from torchrl_hmcts.trainers.skills.growing import num_places as num_places
+    from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions as HindsightTransitions
+    from torchrl_hmcts.trainers.skills.hindsight import MazeView as MazeView
+    from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook as SkillRewardHook
+    from torchrl_hmcts.trainers.skills.termination import TerminationConfig as TerminationConfig
+    from torchrl_hmcts.trainers.skills.termination import TerminationResult as TerminationResult
     from torchrl_hmcts.trainers.skills.termination import (
-        TerminationConfig,
-        TerminationResult,
-        collect_option_steps,
-        learn_termination,
-        make_terminating_env,
+        collect_option_steps as collect_option_steps,
+    )
+    from torchrl_hmcts.trainers.skills.termination import learn_termination as learn_termination
+    from torchrl_hmcts.trainers.skills.termination import (
+        make_terminating_env as make_terminating_env,
     )
 
-__all__ = [
-    "A3CTrainer",
-    "ActionSetSource",
-    "ActionSource",
-    "AtariAgent",
-    "AtariProgress",
-    "AtariSearch",
-    "BestSource",
-    "Candidate",
-    "CollectorError",
-    "Controllability",
-    "DIAYNSource",
-    "DIAYNTrainer",
-    "DemoConfig",
-    "DistilledSource",
-    "DurableRotation",
-    "ExpertIterationTrainer",
-    "GeneratorStates",
-    "GoalEpisodes",
-    "FineTunedSource",
-    "OptionGoals",
-    "RetrainedSource",
-    "SearchGuide",
-    "FolderInUse",
-    "GoalFinder",
-    "GoalSearch",
-    "GoalSource",
-    "GoalTrack",
-    "GrowSkills",
-    "HMCTSTrainer",
-    "HindsightTransitions",
-    "LearnerError",
-    "MazeNetwork",
-    "MazeView",
-    "Options",
-    "RepeatSource",
-    "ResumableTrainer",
-    "RunningEpisodes",
-    "ScriptedExpert",
-    "SearchCollector",
-    "SearchCoverage",
-    "SharedAdam",
-    "SharedRMSprop",
-    "SkillRewardHook",
-    "StateCoverage",
-    "TerminationConfig",
-    "TerminationResult",
-    "TilePlanner",
-    "WorkerSource",
-    "collect_option_steps",
-    "learn_termination",
-    "load_options",
-    "make_goal_env",
-    "make_guided_planner",
-    "make_skill_optimizer",
-    "make_terminating_env",
-    "make_tile_planner",
-    "num_places",
-    "plain_checkpoint",
-    "probe_controllability",
-    "run_goal_episodes",
-    "share_optimizer",
-    "shortest_distances",
-]
+
+def _places() -> dict[str, str]:
+    """The module of each public name, read from the imports above."""
+    tree = ast.parse(inspect.getsource(sys.modules[__name__]))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    return {
+        alias.name: str(line.module)
+        for line in block.body
+        if isinstance(line, ast.ImportFrom)
+        for alias in line.names
+    }
+
 
 # Imported when asked for: the command line answers --help without loading torch.
-_MODULES = {
-    "A3CTrainer": "a3c.trainer",
-    "ActionSetSource": "experiments.atari.sources",
-    "ActionSource": "experiments.atari.sources",
-    "AtariAgent": "experiments.atari.agent",
-    "AtariProgress": "experiments.atari.agent",
-    "AtariSearch": "experiments.atari.agent",
-    "BestSource": "experiments.atari.sources",
-    "Candidate": "experiments.atari.goals",
-    "CollectorError": "restarting_collector",
-    "Controllability": "skills.controllability",
-    "DIAYNSource": "experiments.atari.learned_sources",
-    "DIAYNTrainer": "diayn",
-    "DemoConfig": "runs.config",
-    "DistilledSource": "experiments.atari.learned_sources",
-    "DurableRotation": "saving.checkpoints",
-    "ExpertIterationTrainer": "expert_iteration",
-    "GeneratorStates": "saving.resume",
-    "GoalEpisodes": "experiments.waterworld.goal_episodes",
-    "FineTunedSource": "experiments.atari.trained_sources",
-    "OptionGoals": "experiments.atari.trained_sources",
-    "RetrainedSource": "experiments.atari.trained_sources",
-    "SearchGuide": "experiments.atari.guide",
-    "GoalFinder": "experiments.atari.goals",
-    "GoalSearch": "experiments.atari.goals",
-    "GoalSource": "experiments.atari.sources",
-    "GoalTrack": "experiments.waterworld.goal_episodes",
-    "GrowSkills": "skills.growing",
-    "HMCTSTrainer": "hmcts",
-    "HindsightTransitions": "skills.hindsight",
-    "FolderInUse": "saving.locking",
-    "LearnerError": "a3c.learner_processes",
-    "MazeNetwork": "experiments.waterworld.networks",
-    "MazeView": "skills.hindsight",
-    "Options": "experiments.atari.options",
-    "RepeatSource": "experiments.atari.sources",
-    "ResumableTrainer": "saving.resume",
-    "RunningEpisodes": "saving.resume",
-    "ScriptedExpert": "experiments.waterworld.scripted_expert",
-    "SearchCollector": "expert_iteration",
-    "SearchCoverage": "skills.growing",
-    "SharedAdam": "a3c.shared_optimizers",
-    "SharedRMSprop": "a3c.shared_optimizers",
-    "SkillRewardHook": "skills.reward_hook",
-    "StateCoverage": "skills.coverage",
-    "TerminationConfig": "skills.termination",
-    "TerminationResult": "skills.termination",
-    "TilePlanner": "experiments.waterworld.goal_planning",
-    "WorkerSource": "experiments.atari.options",
-    "collect_option_steps": "skills.termination",
-    "learn_termination": "skills.termination",
-    "load_options": "experiments.atari.options",
-    "make_goal_env": "experiments.waterworld.goal_planning",
-    "make_guided_planner": "expert_iteration",
-    "make_skill_optimizer": "diayn",
-    "make_terminating_env": "skills.termination",
-    "make_tile_planner": "experiments.waterworld.goal_planning",
-    "num_places": "skills.growing",
-    "plain_checkpoint": "saving.checkpoints",
-    "probe_controllability": "skills.controllability",
-    "run_goal_episodes": "experiments.waterworld.goal_episodes",
-    "share_optimizer": "a3c.shared_optimizers",
-    "shortest_distances": "experiments.waterworld.networks",
-}
+_PLACES = _places()
+__all__ = sorted(_PLACES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return getattr(importlib.import_module(_PLACES[name]), name)

@@ -54,7 +54,7 @@ _TARGET = "torchrl_hmcts.trainers.parts.build"
 _INTERNAL = ("_target_", "_partial_")
 _PLAIN = (bool, int, float, str)  # types that Hydra checks; any other may be a config or a list
 
-# Classes by group; a name is that of the class in snake case without the suffix, where none is said.
+# Classes by group. Where no name is given, it is that of the class in snake case, less the group.
 _PACKAGES: Mapping[str, Mapping[str, str]] = {
     "torchrl_hmcts.objectives": {
         "loss": "A3CLoss ContinuousDIAYNLoss DIAYNLoss DiscreteSkillSACLoss ExpertIterationLoss "
@@ -379,10 +379,14 @@ def full(node: Mapping[str, Any]) -> dict[str, Any]:
         >>> full({"_component_": "torchrl_hmcts.planners.UCT"})
         {'c': 1.0, '_component_': 'torchrl_hmcts.planners.UCT'}
     """
-    defaults: Any = OmegaConf.to_container(OmegaConf.structured(config_of(named(node["_component_"]))))
+    defaults: Any = OmegaConf.to_container(
+        OmegaConf.structured(config_of(named(node["_component_"])))
+    )
     entries = {k: v for k, v in defaults.items() if k not in _INTERNAL and v != MISSING}
     for key, value in node.items():
-        entries[key] = full(value) if isinstance(value, Mapping) and "_component_" in value else value
+        entries[key] = (
+            full(value) if isinstance(value, Mapping) and "_component_" in value else value
+        )
     return entries
 
 
@@ -425,7 +429,9 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> list[str]:
 def _choices(config: Mapping[str, Any]) -> list[str]:
     """The keys that choose a class."""
     chosen = [part for part in config if part in COMPONENTS]
-    return chosen + [f"{p}/{key}" for p, node in config.items() for key in node if key in COMPONENTS]
+    return chosen + [
+        f"{p}/{key}" for p, node in config.items() for key in node if key in COMPONENTS
+    ]
 
 
 register_configs()

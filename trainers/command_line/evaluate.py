@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
-from torchrl_hmcts.trainers.command_line.words import split_words
+from torchrl_hmcts.trainers.command_line.words import parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import load_config, recognise
-from torchrl_hmcts.trainers.runs.config import home, parse_overrides
+from torchrl_hmcts.trainers.runs.config import home
 from torchrl_hmcts.trainers.saving.files import left_out
 from torchrl_hmcts.trainers.saving.locking import is_locked
 from torchrl_hmcts.trainers.saving.run_folder import (
@@ -31,9 +31,7 @@ def evaluate(words: Sequence[str]) -> int:
             raise ValueError("say which run: run=DIR, the folder that a training wrote.")
         run = read_run(home(own["run"]))
         experiment, saved = load_config(run)
-        changed = parse_overrides(
-            experiment.config_class, rest, base=saved, others=["run", "log_level"]
-        )
+        changed = parse_config(experiment, rest, saved, ["run", "log_level"])
         if changed.out != saved.out:
             raise ValueError("the figures go to the folder of the run, next to its own; no out=.")
         changes = {
@@ -45,8 +43,7 @@ def evaluate(words: Sequence[str]) -> int:
             if key in changes:
                 raise ValueError(f"{key} is for hmcts train; an evaluation changes no run.")
         function = experiment.evaluation
-        if hasattr(changed, "check_inputs"):
-            changed.check_inputs()
+        changed.check_inputs()
     except ModuleNotFoundError as error:
         return missing(error)
     except (ValueError, TypeError) as error:

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.words import set_log_level
-from torchrl_hmcts.trainers.experiments.registry import Experiment, ExperimentError
+from torchrl_hmcts.trainers.experiments.registry import Experiment
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.run import open_run, resume_command
 from torchrl_hmcts.trainers.saving.locking import FolderInUse
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled

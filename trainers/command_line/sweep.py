@@ -9,13 +9,12 @@ import sys
 from collections.abc import Iterator, Sequence
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
-from torchrl_hmcts.trainers.command_line.words import LOG_LEVELS, set_log_level, split_words
+from torchrl_hmcts.trainers.command_line.words import split_words
 from torchrl_hmcts.trainers.experiments.registry import (
     EXPERIMENTS,
-    ExperimentError,
     find_experiment,
 )
-from torchrl_hmcts.trainers.runs.config import parse_overrides, read_value
+from torchrl_hmcts.trainers.runs.config import ExperimentError, parse_overrides, read_value
 from torchrl_hmcts.trainers.runs.sweep_space import parse_space
 from torchrl_hmcts.trainers.saving.files import left_out, write_json
 from torchrl_hmcts.trainers.saving.locking import FolderInUse
@@ -46,8 +45,6 @@ def sweep(words: Sequence[str]) -> int:
             raise ValueError("say what to improve, e.g. objective=test.solved.")
         prune = _yes_or_no("prune", own.get("prune", "true"))
         level = own.get("log_level", "info")
-        if level not in LOG_LEVELS:
-            set_log_level(level)  # raises
         from torchrl_hmcts.trainers.runs.sweep import Sweep
 
         plan = Sweep(experiment, config, space, objective, own.get("storage"), prune, config.seed)

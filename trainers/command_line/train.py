@@ -20,8 +20,8 @@ from torchrl_hmcts.trainers.experiments.registry import (
     load_config,
 )
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, home
-from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.runs.run import next_free, resume_command, run_files
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 
 def demo(words: Sequence[str]) -> int:

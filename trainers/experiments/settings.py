@@ -33,7 +33,8 @@ class SkillsConfig(RunConfig):
     """How the worker learns: "diayn" (mini-episodes, before the manager plans) or "hmcts"
     (Algorithm 3 from scratch: rounds of search in training mazes)."""
     objective: dict[str, Any] = field(default_factory=dict)
-    """What sets skills apart: objective=metra (or lsd, dads; default diayn), objective.KEY=VALUE."""
+    """What sets skills apart: objective=metra, lsd, dads or diayn, the default;
+    objective.KEY=VALUE."""
     loss: dict[str, Any] = field(default_factory=dict)
     """Keywords of the worker's loss: loss.KEY=VALUE, e.g. loss.alpha_init=0.1."""
     trainer: dict[str, Any] = field(default_factory=dict)

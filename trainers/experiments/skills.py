@@ -43,8 +43,8 @@ from torchrl_hmcts.trainers.parts import build, merged
 from torchrl_hmcts.trainers.ray_collector import make_ray_collector
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
-from torchrl_hmcts.trainers.saving.worker_file import load_networks
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+from torchrl_hmcts.trainers.saving.worker_file import load_networks
 from torchrl_hmcts.trainers.skills.curves import Curves
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward

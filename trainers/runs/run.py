@@ -18,6 +18,8 @@ from typing import Any
 
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError, config_keys
+from torchrl_hmcts.trainers.saving.files import left_out, write_csv
+from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
     end_record,
@@ -26,8 +28,6 @@ from torchrl_hmcts.trainers.saving.run_folder import (
     start_record,
     versions,
 )
-from torchrl_hmcts.trainers.saving.files import left_out, write_csv
-from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled, stop_asked
 
 _RECORDS = ("run.json", "metrics.json", "evaluation.json", "page.json", "curves.csv", "index.html")

@@ -36,8 +36,8 @@ from torchrl_hmcts.trainers.experiments.atari.trained_sources import (
 )
 from torchrl_hmcts.trainers.experiments.atari.trials import RememberedTrials
 from torchrl_hmcts.trainers.experiments.atari.tuning import Tuned, tune_search
-from torchrl_hmcts.trainers.experiments.registry import ExperimentError
 from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,

@@ -292,7 +292,8 @@ class Kit:
         if learned.loss is None:
             return
         if drawing is not None:
-            seen = f" The worker of all pictures has learned for {learned.worker_step:,} base steps."
+            steps = learned.worker_step * config.frames_per_step
+            seen = f" The worker of all pictures is that after {steps:,} {self.unit}."
             with pictures.one("skills.png", captions["skills.png"] + seen) as path:
                 from torchrl_hmcts.trainers.figures.maps import plot_skill_fan
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count, islice
 from typing import Any
 
@@ -42,7 +42,9 @@ TRAINING_MAZES = 256
 TEST_SEED, CURVE_SEED = 1_000_000, 2_000_000
 """First seeds of the test mazes, and of the mazes that Figure 4.10's curve is drawn from."""
 _STALL_SPEED = 0.3  # share of the top speed below which a player is at a standstill
+_LOSSES = ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator")
 _FRAME = 3  # column of the state's "level"
+
 
 def make_lab_env(maze_seeds: Sequence[int] = range(TRAINING_MAZES), **kwargs: Any) -> LabMazeEnv:
     """Build the maze as the experiment plays it: only the goal is rewarded, and ends the episode.
@@ -335,11 +337,13 @@ class LabMazeKit(Kit):
     def curves(self, learned: LearnedSkills) -> dict[str, Curve]:
         total, curve = learned.steps * self.config.frames_per_step, self.frames_curve(learned.tests)
         found: dict[str, Curve] = {}
-        for name in ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator"):
-            if learned.history:
-                values = learned.history[name]
-                steps = [round(total * (i + 1) / len(values)) for i in range(len(values))]
-                found[name] = steps, values
+        names: Iterable[str] = (
+            _LOSSES if "discriminator_loss" in learned.history else learned.history
+        )
+        for name in names:
+            values = learned.history[name]
+            steps = [round(total * (i + 1) / len(values)) for i in range(len(values))]
+            found[name] = steps, values
         for name in ("frames", "solved", "solved_frames"):
             if curve:
                 found[name] = [round(x) for x in curve["training_steps"]], curve[name]

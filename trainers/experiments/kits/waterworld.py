@@ -123,7 +123,7 @@ class WaterworldKit(Kit):
     """
 
     worker_keys = ("velocity",)
-    state_keys = ("position", "velocity")
+    state_keys = ("maze_index", "position", "velocity", "target")
     title = "Solving random mazes by planning over learned skills"
     group = 1  # each search is timed on its own
 
@@ -144,9 +144,7 @@ class WaterworldKit(Kit):
         mazes = maze_pool("test")
         lengths = []
         for start in starts.unbind(0):
-            player, target = (
-                start[key].long().flip(-1).tolist() for key in ("position", "target")
-            )
+            player, target = (start[key].long().flip(-1).tolist() for key in ("position", "target"))
             from_target = shortest_path_lengths(mazes[int(start["maze_index"])], target)
             lengths.append(int(from_target[player[0], player[1]]))
         return np.array(lengths, dtype=np.int64)
