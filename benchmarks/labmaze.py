@@ -27,15 +27,9 @@ import numpy as np
 import torch
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.experiments.lab.evaluation import (
-    frames_curve,
-    solve_mazes,
-    solve_with_wrong_model,
-    wrong_models,
-)
-from torchrl_hmcts.trainers.experiments.lab.training import curve_script_frames, train_worker
-from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
+from torchrl_hmcts.trainers.experiments.kits.lab import LabMazeKit, wrong_models
 from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.skills import learn, make_loss, solve
 from torchrl_hmcts.trainers.figures.curves import plot_training, solving_panels
 
 ERROR = 0.05
@@ -79,8 +73,10 @@ def trained(
     if not path.exists():
         parts.results.pop(f"{name} training", None)
 
+    kit = LabMazeKit(config)
+
     def train() -> dict[str, Any]:
-        worker = train_worker(config)
+        worker = learn(kit)
         path.parent.mkdir(parents=True, exist_ok=True)
         torch.save(worker.loss.state_dict(), path)
         return {
@@ -88,39 +84,47 @@ def trained(
             "base_steps": worker.steps,
             "rounds": worker.rounds,
             "cpu_seconds": worker.seconds,
-            "curve": frames_curve(worker.tests, config.frames_per_step, config.max_frames),
+            "curve": kit.frames_curve(worker.tests),
         }
 
     parts(f"{name} training", train)
-    loss = make_worker_loss(config.num_skills, seed=config.seed)
+    loss = make_loss(kit)
     loss.load_state_dict(torch.load(path, weights_only=True))
     return SkillPolicy(loss.actor_network, deterministic=True)
+
+
+def solved(config: LabMazeConfig, worker: SkillPolicy, **changes: Any) -> dict[str, Any]:
+    """First trials with some keys changed."""
+    kit = LabMazeKit(dataclasses.replace(config, **changes))
+    return kit.figures(solve(kit, worker))
 
 
 def run(config: LabMazeConfig, args: argparse.Namespace, parts: Parts) -> None:
     """Measure everything with DIAYN's worker of one seed."""
     key = f"{config.algorithm} {config.seed}"
     worker = trained(config, parts, args.work)
-
-    def solve(size: int, config: LabMazeConfig = config) -> dict[str, Any]:
-        mazes = args.mazes if size <= 15 else args.large_mazes
-        return solve_mazes(config, worker, size=size, mazes=mazes)
-
     for size in args.sizes:
-        parts(f"{key} size {size}", lambda size=size: solve(size))
+        mazes = args.mazes if size <= 15 else args.large_mazes
+        parts(
+            f"{key} size {size}",
+            lambda size=size, mazes=mazes: solved(config, worker, size=size, mazes=mazes),
+        )
+    kit = LabMazeKit(config)
     for name, real in list(wrong_models(ERROR).items())[: args.wrong_models]:
         parts(
             f"{key} wrong model, {name}",
-            lambda real=real: solve_with_wrong_model(config, worker, mazes=args.mazes, **real),
+            lambda real=real: kit.solve_with_wrong_model(worker, args.mazes, **real),
         )
-    fixed = dataclasses.replace(config, stall_steps=0)
-    parts(f"{key} fixed length, size 9", lambda: solve(9, fixed))
+    parts(
+        f"{key} fixed length, size 9",
+        lambda: solved(config, worker, size=9, mazes=args.mazes, stall_steps=0),
+    )
 
 
 def compare(config: LabMazeConfig, args: argparse.Namespace, parts: Parts, name: str) -> None:
     """Measure another way of training in the 9 x 9 mazes."""
     worker = trained(config, parts, args.work, name)
-    parts(f"{name} size 9", lambda: solve_mazes(config, worker, size=9, mazes=args.mazes))
+    parts(f"{name} size 9", lambda: solved(config, worker, size=9, mazes=args.mazes))
 
 
 def table(results: dict[str, Any]) -> str:
@@ -185,7 +189,7 @@ def main() -> None:
         compare(longer, args, parts, f"diayn-160k {config.seed}")
     for kind, title in (("diayn", "DIAYN"), ("hmcts", "Algorithm 3")):
         curves = [parts.results[f"{kind} {c.seed} training"]["curve"] for c in configs]
-        script = float(np.mean([curve_script_frames(config) for config in configs]))
+        script = float(np.mean([LabMazeKit(config).script_frames() for config in configs]))
         plot_training(
             {title: curves},
             solving_panels(script),

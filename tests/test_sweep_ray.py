@@ -76,6 +76,9 @@ def test_a_worker_is_trained_with_a_local_ray_cluster(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["config"]["collector"] == "ray"
     # The worker has learned something from what came back.
+    from torchrl_hmcts.trainers.experiments.kits.lab import LabMazeKit
+    from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+    from torchrl_hmcts.trainers.experiments.skills import make_loss
     from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
     before, after = (make_loss(LabMazeKit(LabMazeConfig())) for _ in range(2))
