@@ -337,7 +337,8 @@ class CurveTests:
         worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
         self.model = kit.make_simulator(worker, "curve")
         self.real = kit.make_options(kit.make_env("curve"), worker)
-        self.starts = kit.starts("curve", kit.config.curve_mazes)
+        with torch.random.fork_rng(devices=[]):  # a new env draws its seed
+            self.starts = kit.starts("curve", kit.config.curve_mazes)
         trainer.register_op("setup", self)
         trainer.register_op("post_steps_log", self)
         trainer.register_module("curve_tests", self)
