@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from skill_figures import search_coverage
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 
@@ -40,7 +41,6 @@ from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, DemoConfig
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
 from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
 from torchrl_hmcts.transforms import (
     DisplacementTransform,

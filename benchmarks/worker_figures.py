@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from skill_figures import search_coverage, skill_figures
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
@@ -25,7 +26,6 @@ from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, DemoConfig
 from torchrl_hmcts.trainers.experiments.skills import learn
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
 
 RADIUS = 0.7  # of the novelty test, tiles, in all benchmarks of skills
 

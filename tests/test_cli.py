@@ -8,7 +8,7 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment, find_experiment
-from torchrl_hmcts.trainers.experiments.registry import field_docs
+from torchrl_hmcts.trainers.experiments.registry import config_keys
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 
 ALL = [*EXPERIMENTS.values()]

@@ -10,7 +10,7 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.figures.run_page import write_page
 from torchrl_hmcts.trainers.runs.config import parse_overrides
 
 TIMES = ("seconds", "config", "versions")

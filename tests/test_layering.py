@@ -193,7 +193,7 @@ def test_every_third_party_import_is_declared(module: str) -> None:
         ("torchrl_hmcts.envs.mazes.layouts", "import torchrl_hmcts"),
         ("torchrl_hmcts.envs.mazes.layouts", "from torchrl_hmcts.planners import MCTSPlanner"),
         ("torchrl_hmcts.envs.mazes.layouts", "from torchrl_hmcts import planners"),
-        ("torchrl_hmcts.envs.mazes.layouts", "from .. import testing"),
+        ("torchrl_hmcts.envs.mazes.layouts", "from ... import testing"),
         (
             "torchrl_hmcts.envs.mazes.layouts",
             "import importlib\nimportlib.import_module('torchrl_hmcts.trainers')",
@@ -217,7 +217,7 @@ def test_the_check_catches_a_violation(module: str, source: str) -> None:
         ("torchrl_hmcts.planners.export", "def f():\n    import networkx"),
         ("torchrl_hmcts.envs.mazes.layouts", "import pymunk\nfrom torchrl_hmcts.envs import mazes"),
         ("torchrl_hmcts.envs.mazes.layouts", "from . import rendering"),
-        ("torchrl_hmcts.trainers.experiments.demo", "from torchrl_hmcts import envs, planners"),
+        ("torchrl_hmcts.trainers.experiments.skills", "from torchrl_hmcts import envs, planners"),
     ],
 )
 def test_the_check_lets_the_right_direction_pass(module: str, source: str) -> None:

@@ -354,7 +354,7 @@ def other_process(opened: str, until: str) -> Any:
     """A process that opens a run and is killed at the end of the context."""
     code = (
         "import time\n"
-        "from torchrl_hmcts.trainers.runs.config import DemoConfig\n"
+        "from torchrl_hmcts.trainers.experiments.settings import DemoConfig\n"
         "from torchrl_hmcts.trainers.runs.run import open_run\n"
         f"with {opened}: time.sleep(100)"
     )

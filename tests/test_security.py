@@ -14,7 +14,7 @@ import pytest
 import torch
 from tensordict import NonTensorData, TensorDict
 
-from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.figures.run_page import write_page
 from torchrl_hmcts.trainers.skills.dataset import load_dataset
 
 if sys.version_info >= (3, 11):

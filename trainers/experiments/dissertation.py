@@ -19,12 +19,7 @@ class MissingData(ValueError):
 
 @dataclass(frozen=True)
 class Sources:
-    """Data that figures may be drawn from.
-
-    Args:
-        runs: folders that were named on the command line.
-        results: folder with measured results, ``docs/results`` of the repository, if there is one.
-    """
+    """Data that figures may be drawn from."""
 
     runs: tuple[RunFolder, ...] = ()
     results: Path | None = None
@@ -162,14 +157,7 @@ FIGURES = {figure.name: figure for figure in _ALL}
 
 
 def find_figure(name: str) -> SourceFigure:
-    """Return a figure by its number; ``figure_`` or ``Figure `` before it does no harm.
-
-    Args:
-        name: e.g. ``"3.6"`` or ``"table5.1"``.
-
-    Raises:
-        ValueError: if there is none of that name; the nearest are named.
-    """
+    """Return a figure by its number; ``figure_`` or ``Figure `` before it does no harm."""
     short = name.lower().replace("figure", "").replace(" ", "").strip("_")
     if short not in FIGURES:
         near = difflib.get_close_matches(short, FIGURES, n=3, cutoff=0.5) or FIGURES
@@ -178,15 +166,7 @@ def find_figure(name: str) -> SourceFigure:
 
 
 def find_results(folder: str | None = None) -> Path | None:
-    """Return the folder of measured results.
-
-    Args:
-        folder: as given by the user. Default: ``docs/results`` in the current folder, else that of
-            the repository from which the package is installed.
-
-    Raises:
-        ValueError: if the given folder does not exist.
-    """
+    """Return the folder of measured results."""
     if folder is not None:
         if not Path(folder).is_dir():
             raise ValueError(f"results={folder} is no folder.")

@@ -54,19 +54,7 @@ _MAZES = 20  # of the test split, of which one with a rather long way is shown
 def draw_figure(
     name: str, folders: Sequence[str | Path], results: Path | None, out: str | Path
 ) -> tuple[Path, str]:
-    """Draw one figure; return its file and its caption.
-
-    Args:
-        name: its number.
-        folders: of runs to draw it from; may be empty.
-        results: folder of measured results.
-        out: folder to write into.
-
-    Raises:
-        MissingData: if what it is drawn from is not there.
-        ValueError: if the name is unknown, a folder is none of a run, or a file that was not drawn
-            by this package would be replaced.
-    """
+    """Draw one figure; return its file and its caption."""
     figure = find_figure(name)
     sources = Sources(tuple(recognise(read_run(folder)) for folder in folders), results)
     Path(out).mkdir(parents=True, exist_ok=True)
@@ -81,16 +69,7 @@ def draw_figure(
 def draw_all(
     folders: Sequence[str | Path], results: Path | None, out: str | Path
 ) -> tuple[Path, list[str]]:
-    """Draw every figure whose data are there, and a page of all of them.
-
-    Args:
-        folders: of runs to draw from.
-        results: folder of measured results.
-        out: folder to write into.
-
-    Returns:
-        The page, and a sentence about each figure that lacks its data.
-    """
+    """Draw every figure whose data are there, and a page of all of them."""
     file = Path(out) / "index.html"
     for path in (file, *(Path(out) / figure.file for figure in FIGURES.values())):
         refuse_foreign(path)

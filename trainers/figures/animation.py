@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,23 +10,18 @@ import numpy as np
 
 from torchrl_hmcts.trainers.saving.files import left_out, replacing
 
+_VIDEO_SECONDS = 300  # after which ffmpeg is given up
+
 
 def steps_to_show(last: int, every: int) -> list[int]:
     """Return the base steps of an episode of which there is a picture.
-
-    Args:
-        last: base step, always shown.
-        every: base steps from one picture to the next.
-
-    Raises:
-        ValueError: if ``every`` is below 1.
 
     Example:
         >>> steps_to_show(5, 2)
         [0, 2, 4, 5]
     """
     if every < 1:
-        raise ValueError(f"a GIF needs one base step or more for a picture; got {every}.")
+        raise ValueError(f"a GIF needs steps_per_frame >= 1; got {every}.")
     return [*range(0, last, every), last]
 
 
@@ -65,15 +61,25 @@ def write_gif(
     still = 0 if last is None else round(last / milliseconds) - 1
     video = Path(path).with_suffix(".mp4")
     video.unlink(missing_ok=True)  # of an older episode
-    height, width = frames[0].shape[:2]
-    even = ((0, 0), (0, height % 2), (0, width % 2), (0, 0))  # H.264 shares colours of two pixels
     with left_out(video.name), replacing(video) as temporary:
-        iio.imwrite(
-            temporary,
-            np.pad(np.stack([*frames, *[frames[-1]] * still]), even, mode="edge"),
-            plugin="FFMPEG",
-            fps=1000.0 / milliseconds,
-            codec="libx264",
-            macro_block_size=2,
-            output_params=["-crf", "25"],
-        )
+        _write_video([*frames, *[frames[-1]] * still], temporary, milliseconds)
+
+
+def _write_video(frames: Sequence[np.ndarray], path: Path, milliseconds: float) -> None:
+    """Write a video with ffmpeg itself: imageio overlooks that it failed, and waits without end."""
+    import imageio_ffmpeg
+
+    height, width = frames[0].shape[:2]
+    even = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 shares the colours of two pixels
+    size = f"{width + width % 2}x{height + height % 2}"
+    pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{1000.0 / milliseconds}"]
+    h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "25", "-v", "error"]
+    done = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *pictures, "-i", "-", "-an", *h264, str(path)],
+        input=b"".join(np.pad(frame, even, mode="edge").tobytes() for frame in frames),
+        capture_output=True,
+        timeout=_VIDEO_SECONDS,
+    )
+    if done.returncode:
+        words = done.stderr.decode(errors="replace").split()
+        raise RuntimeError(f"ffmpeg ended with {done.returncode}: {' '.join(words)}")

@@ -91,9 +91,6 @@ TABLE_A_1 = {
 def best_baseline(game: str) -> tuple[str, float]:
     """Return the best algorithm of Table A.1 in a game, and its mean score.
 
-    Args:
-        game: e.g. ``"Breakout"``.
-
     Example:
         >>> best_baseline("Breakout")
         ('deepq', 131.46)
@@ -102,12 +99,7 @@ def best_baseline(game: str) -> tuple[str, float]:
 
 
 def read_scores(runs: Sequence[RunFolder], results: Path | None) -> list[dict[str, Any]]:
-    """Return the summaries of the runs given, else those of the measured results.
-
-    Args:
-        runs: of ``atari``.
-        results: folder ``docs/results/atari``, if it is there.
-    """
+    """Return the summaries of the runs given, else those of the measured results."""
     rows = [
         {**run.config, **run.metrics, "curves": run.curves}
         for run in runs
@@ -125,12 +117,7 @@ def read_scores(runs: Sequence[RunFolder], results: Path | None) -> list[dict[st
 
 
 def by_protocol(rows: Sequence[Row], game: str) -> dict[str, list[Row]]:
-    """Return the summaries of a game, by protocol.
-
-    Args:
-        rows: summaries of runs.
-        game: e.g. ``"Breakout"``.
-    """
+    """Return the summaries of a game, by protocol."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if row.get("game") == game:
@@ -140,10 +127,6 @@ def by_protocol(rows: Sequence[Row], game: str) -> dict[str, list[Row]]:
 
 def human_normalised(row: Row, key: str) -> float:
     """Return a run's score in units of what a human scores more than random play.
-
-    Args:
-        row: summary of a run.
-        key: ``"score_max"`` or ``"score_final"``.
 
     Reference:
         Mnih et al., "Human-level control through deep reinforcement learning", 2015.
@@ -159,11 +142,8 @@ def human_normalised(row: Row, key: str) -> float:
 def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
     """Return the interquartile mean over games and seeds with its stratified 95 % interval.
 
-    Each game counts as much as another, however many seeds it has.
-
-    Args:
-        scores: human-normalised, of the seeds of each game.
-        draws: resamples of the seeds within each game, from a fixed seed.
+    Each game counts as much as another, however many seeds it has: ``scores`` are human-normalised,
+    of the seeds of each game.
 
     Reference:
         Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
@@ -191,9 +171,6 @@ def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[fl
 def best_source(rows: Sequence[Row]) -> list[Row]:
     """Return the runs of the source of options that scored highest among the runs of a game.
 
-    Args:
-        rows: summaries of one game and protocol.
-
     Example:
         >>> rows = [{"source": "goals", "score_max": 3.0}, {"source": "repeat", "score_max": 7.0}]
         >>> best_source(rows) == rows[1:]
@@ -210,15 +187,10 @@ def over_seeds(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves that begin and end at different steps together.
 
-    A seed counts from its first value on, since looking for options takes some longer than others,
-    and keeps its last value to the end.
-
-    Args:
-        curves: one per seed, S of them.
-        from_start: count steps from the first of each curve, and a seed only as long as it goes.
-
-    Returns:
-        Steps ``[G]`` and values ``[S, G]``, NaN where a seed does not count.
+    Returns steps ``[G]`` and values ``[S, G]``, NaN where a seed does not count. A seed counts from
+    its first value on, since looking for options takes some longer than others, and keeps its last
+    value to the end; with ``from_start``, steps count from the first of each curve, and a seed only
+    as long as it goes.
 
     Example:
         >>> one = RunCurve("x", [0, 10, 20], [0, 1, 2], "steps")
@@ -241,13 +213,7 @@ def over_seeds(
 def draw_game(rows: Sequence[Row], path: Path, game: str) -> str:
     """Draw the scores in a game against emulated steps: mean, least and largest over the seeds.
 
-    Args:
-        rows: summaries of runs.
-        path: PNG to write.
-        game: e.g. ``"Breakout"``.
-
-    Returns:
-        The caption; empty if there is no run of the game with curves, and nothing is drawn.
+    Returns the caption; it is empty, and nothing is drawn, without a run that has curves.
 
     Reference:
         Dissertation, figures 5.1 to 5.7.
@@ -310,13 +276,6 @@ def _draw_protocol(
 def write_table(rows: Sequence[Row], path: Path) -> str:
     """Write Table 5.1 with our scores beside it, as a page and as Markdown beside that.
 
-    Args:
-        rows: summaries of runs.
-        path: HTML to write.
-
-    Returns:
-        A sentence about it.
-
     Reference:
         Dissertation, tables 5.1 and A.1.
     """
@@ -378,11 +337,7 @@ _TOOK = (
 
 
 def what_it_took(runs: Sequence[Row]) -> list[Any]:
-    """Return what the runs of a game took, means over the seeds, in the order of the table.
-
-    Args:
-        runs: summaries.
-    """
+    """Return what the runs of a game took, means over the seeds, in the order of the table."""
     first = runs[0]
 
     def mean(key: str) -> Any:
@@ -415,7 +370,5 @@ def _aggregated(ours: Mapping[tuple[str, str], list[Row]], protocol: str, key: s
 def _interval(values: list[float]) -> Cell:
     if not values:
         return Cell("-")
-    mean = bootstrap(values)
-    return Cell(
-        mean.middle, beside=f"{plain(mean.low)} to {plain(mean.high)}" if mean.count > 1 else ""
-    )
+    mean, low, high = bootstrap(values)
+    return Cell(mean, beside=f"{plain(low)} to {plain(high)}" if len(values) > 1 else "")

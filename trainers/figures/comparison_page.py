@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from torchrl_hmcts.trainers.figures.pages import (
 from torchrl_hmcts.trainers.figures.pictures import COLORS, refuse_foreign
 from torchrl_hmcts.trainers.figures.run_page import config_tables, damage_of, say_damage
 from torchrl_hmcts.trainers.saving.files import left_out
-from torchrl_hmcts.trainers.saving.run_folder import RunFolder, is_run
+from torchrl_hmcts.trainers.saving.run_folder import RunFolder, flat, is_run
 
 _NOT_COMPARED = ("seed", "out", "resume", "logger")  # keys in which runs of a group may differ
 _SEEDS_FOR_IQM = 4
@@ -32,12 +32,7 @@ _KEYS_IN_NAME = 3  # of a group; all that differ are in the table of configs
 
 @dataclass
 class RunGroup:
-    """Runs of one experiment and config that differ in their seeds only.
-
-    Args:
-        name: what sets it apart from the other groups.
-        runs: one per seed.
-    """
+    """Runs of one experiment and config that differ in their seeds only."""
 
     name: str
     runs: list[RunFolder] = field(default_factory=list)
@@ -46,7 +41,7 @@ class RunGroup:
         """Return the numbers of the finished runs, by name."""
         values: dict[str, list[float]] = {}
         for run in self.runs:
-            for name, value in _flat(run.metrics):
+            for name, value in flat(run.metrics):
                 number = isinstance(value, int | float) and not isinstance(value, bool)
                 if not number or name == "seed" or not math.isfinite(value):
                     continue
@@ -58,9 +53,6 @@ class RunGroup:
 
 def group_runs(runs: Sequence[RunFolder]) -> list[RunGroup]:
     """Put runs that differ in their seeds only into groups, named by what sets them apart.
-
-    Args:
-        runs: in the order of the page.
 
     Example:
         >>> configs = [{"seed": seed, "size": size} for size in (9, 15) for seed in (0, 1)]
@@ -88,18 +80,7 @@ def group_runs(runs: Sequence[RunFolder]) -> list[RunGroup]:
 
 
 def write_comparison(runs: Sequence[RunFolder], out: str | Path) -> Path:
-    """Write the page that compares runs; it holds all its pictures.
-
-    Args:
-        runs: as they were read; one that is given twice counts once.
-        out: file to write, or a folder for ``index.html``.
-
-    Returns:
-        The file.
-
-    Raises:
-        ValueError: if ``out`` is a run's folder or a file that this package did not write.
-    """
+    """Write the page that compares runs; it holds all its pictures."""
     runs = list({run.path.resolve(): run for run in runs}.values())
     file = Path(out)
     if file.suffix.lower() not in (".html", ".htm"):
@@ -139,15 +120,6 @@ def _sections(groups: Sequence[RunGroup]) -> list[Section]:
     ]
 
 
-def _flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Nested figures as one list, names joined by dots."""
-    rows: list[tuple[str, Any]] = []
-    for name, value in metrics.items():
-        inside = isinstance(value, Mapping)
-        rows += _flat(value, f"{prefix}{name}.") if inside else [(prefix + name, value)]
-    return rows
-
-
 def _compared(run: RunFolder) -> dict[str, Any]:
     """The keys that make a group; those that an older run did not have yet, by their defaults."""
     values = {**{key: default for key, (default, _) in run.keys.items()}, **run.config}
@@ -184,11 +156,11 @@ def _statistics(values: list[float] | None) -> Cell:
     def shown(value: float) -> str:
         return plain(int(value) if value.is_integer() else value)
 
-    mean = bootstrap(values)
-    below = [f"{shown(mean.low)} to {shown(mean.high)}"] if mean.low < mean.high else []
-    if below and mean.count >= _SEEDS_FOR_IQM:
-        below.append(f"middle half {shown(bootstrap(values, interquartile_mean).middle)}")
-    return Cell(shown(mean.middle), below=below, number=True)
+    mean, low, high = bootstrap(values)
+    below = [f"{shown(low)} to {shown(high)}"] if low < high else []
+    if below and len(values) >= _SEEDS_FOR_IQM:
+        below.append(f"middle half {shown(bootstrap(values, interquartile_mean)[0])}")
+    return Cell(shown(mean), below=below, number=True)
 
 
 def _panels(groups: Sequence[RunGroup]) -> list[Picture]:

@@ -29,14 +29,7 @@ Points = tuple[Sequence[float], Sequence[float]]
 def common_steps(curves: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves to common steps, as far as all of them go.
 
-    Args:
-        curves: one per seed.
-
-    Returns:
-        Steps ``[G]``, those of the curve that ends first, and values ``[S, G]`` interpolated there.
-
-    Raises:
-        ValueError: if there is no curve.
+    Returns the steps ``[G]`` of the curve that ends first, and values ``[S, G]`` at them.
 
     Example:
         >>> common_steps([([0, 10, 20], [0, 1, 2]), ([0, 20], [1, 3])])[1].mean(0).tolist()
@@ -75,13 +68,7 @@ def draw_band(
 
 
 def style(axes: Axes, title: str, *, short: bool = False) -> None:
-    """Give axes of curves their common style.
-
-    Args:
-        axes: whose x axis counts steps.
-        title: above them.
-        short: write 20k instead of 20,000.
-    """
+    """Give axes of curves their common style."""
     axes.set_title(title, fontsize=10, loc="left")
     axes.grid(alpha=0.25)
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -91,12 +78,7 @@ def style(axes: Axes, title: str, *, short: bool = False) -> None:
 
 
 def legend_of_all(figure: Figure, *, ncols: int) -> None:
-    """Write one legend for all axes below a figure.
-
-    Args:
-        figure: whose lines have labels.
-        ncols: columns of the legend.
-    """
+    """Write one legend for all axes below a figure."""
     pairs = [axes.get_legend_handles_labels() for axes in figure.axes]
     shown = {name: line for lines, names in pairs for line, name in zip(lines, names, strict=True)}
     place = "outside lower center"
@@ -105,14 +87,6 @@ def legend_of_all(figure: Figure, *, ncols: int) -> None:
 
 def panel(name: str, groups: Sequence[Sequence[Points]], x_label: str = "steps") -> str:
     """Draw one logged value of several groups of runs, small enough for a phone.
-
-    Args:
-        name: of the value.
-        groups: the curves of each group's seeds; colours go by the order of the groups.
-        x_label: below.
-
-    Returns:
-        An SVG document, the same for the same runs.
 
     Example:
         >>> panel("entropy", [[([0, 1], [2, 1])]])[:5]
@@ -145,23 +119,14 @@ def panel(name: str, groups: Sequence[Sequence[Points]], x_label: str = "steps")
 
 @dataclass(frozen=True)
 class Panel:
-    """One panel of :func:`plot_training`.
+    """One panel of :func:`plot_training`."""
 
-    Args:
-        entry: of the curves.
-        title: above it.
-        share: whether the y axis goes from 0 to 100 %.
-        log: whether it is logarithmic.
-        dotted: further entry, and its name in the legend, drawn dotted in the colour of the first.
-        level: a value that is drawn as a dashed line, and its name.
-    """
-
-    entry: str
+    entry: str  # of the curves
     title: str
-    share: bool = False
-    log: bool = False
-    dotted: tuple[str, str] | None = None
-    level: tuple[float, str] | None = None
+    share: bool = False  # whether the y axis goes from 0 to 100 %
+    log: bool = False  # whether it is logarithmic
+    dotted: tuple[str, str] | None = None  # a further entry, and its name in the legend
+    level: tuple[float, str] | None = None  # of a dashed line, and its name
 
 
 def plot_training(
@@ -215,11 +180,7 @@ def plot_training(
 
 
 def learning_panels(max_steps: int) -> list[Panel]:
-    """Return the panels of figure 3.6: mazes solved in time, and the length of an episode.
-
-    Args:
-        max_steps: base steps at which an episode is cut off.
-    """
+    """Return the panels of figure 3.6: mazes solved in time, and the length of an episode."""
     return [
         Panel("solved_share", "test mazes solved in time", share=True),
         Panel("episode_steps", "base steps of an episode, mean", level=(max_steps, "cut off")),
@@ -227,11 +188,7 @@ def learning_panels(max_steps: int) -> list[Panel]:
 
 
 def solving_panels(script: float) -> list[Panel]:
-    """Return the panels of figure 4.10: the frames of an episode, and the share that is solved.
-
-    Args:
-        script: mean frames of a script on the shortest path, in the same mazes.
-    """
+    """Return the panels of figure 4.10: the frames of an episode, and the share that is solved."""
     level = (script, "script on the shortest path")
     return [
         Panel("frames", "frames of an episode, mean", level=level),
@@ -241,11 +198,6 @@ def solving_panels(script: float) -> list[Panel]:
 
 def plot_losses(history: Mapping[str, Sequence[float]], base_steps: int, path: Path) -> None:
     """Draw the four training curves of the worker and the discriminator's accuracy.
-
-    Args:
-        history: per update, as ``DIAYNTrainer.history``.
-        base_steps: base steps of the whole training, the x axis' end.
-        path: PNG to write.
 
     Reference:
         Dissertation, figures 4.6 to 4.9.

@@ -115,11 +115,6 @@ def write_goal_gif(
 def plot_macro_env(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) -> None:
     """Draw a state of Waterworld, and the Gridworld in which the manager plans from it.
 
-    Args:
-        env: draws the maze.
-        state: without batch dimensions.
-        path: PNG to write.
-
     Reference:
         Dissertation, figures 3.1 and 3.2.
     """
@@ -137,13 +132,6 @@ def plot_tile_search(
     env: WaterworldMazeEnv, state: TensorDictBase, search: Search, goals: Any, path: Path
 ) -> None:
     """Draw the search over tiles from a state: the tree, and the plan's options in the maze.
-
-    Args:
-        env: whose maze is planned in.
-        state: without batch dimensions.
-        search: of a planner over tiles, from this state alone.
-        goals: the centres of the tiles of its plan ``[L, 2]``, e.g. ``plan_goals(state[None])``.
-        path: PNG to write.
 
     Reference:
         Dissertation, figure 3.4.

@@ -59,14 +59,13 @@ class MapDrawing(Protocol):
     def picture(self, state: TensorDictBase, paths: Sequence[Path2D]) -> np.ndarray:
         """Return a picture of a state, uint8 ``[h, w, 3]``, with paths in the units of the axes."""
 
+    def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
+        """Return, for each panel of :func:`plot_skill_fan`, a drawing and ``num`` equal states."""
+
 
 @dataclass
 class WaterworldMap:
-    """Draws Waterworld's mazes, x to the right and y down, in tiles.
-
-    Args:
-        env: whose mazes the states index.
-    """
+    """Draws Waterworld's mazes, x to the right and y down, in tiles."""
 
     env: WaterworldMazeEnv
 
@@ -89,12 +88,7 @@ class WaterworldMap:
         return image
 
     def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
-        """Return an open room and a maze with states in their middle, for :func:`plot_skill_fan`.
-
-        Args:
-            num: of states in each.
-            maze: index of the maze.
-        """
+        """Return an open room and a maze, with states in their middle."""
         walls = self.env.mazes[maze]
         height, width = walls.shape
         center = torch.tensor([width / 2, height / 2])
@@ -112,11 +106,7 @@ class WaterworldMap:
 
 @dataclass
 class LabMap:
-    """Draws lab mazes in cells, x to the east and y to the north.
-
-    Args:
-        env: whose mazes the states index.
-    """
+    """Draws lab mazes in cells, x to the east and y to the north."""
 
     env: LabMazeEnv
 
@@ -150,15 +140,10 @@ class LabMap:
     def rooms(
         self, num: int, maze: int = 0, seed: int = 0
     ) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
-        """Return an open room and a maze with states in their middle, for :func:`plot_skill_fan`.
+        """Return an open room and a maze, with states in their middle.
 
         Each state has a heading of its own: a skill is a direction on the map, whichever way the
         player faces.
-
-        Args:
-            num: of states in each.
-            maze: index of the maze.
-            seed: of the headings.
         """
         generator = np.random.default_rng(seed)
         layout = self.env.layout
@@ -226,6 +211,10 @@ class FeatureMap:
         axes.plot(*self.points(state).tolist(), "o", color="black")
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
+        """Return states at the beginning of an episode, for :func:`plot_skill_fan`."""
+        return {"from a start": (self, self.env.reset().expand(num).clone())}
 
 
 @torch.no_grad()
@@ -304,7 +293,7 @@ def write_episode_gif(
     plan: Plan,
     path: str | Path,
     *,
-    steps_per_picture: int = 2,
+    steps_per_frame: int = 2,
 ) -> None:
     """Write an episode as a GIF: the plan pale, the way so far in the colours of its options.
 
@@ -314,7 +303,7 @@ def write_episode_gif(
         options: executed in each base step, ``[T]``.
         plan: without batch dimensions.
         path: file to write.
-        steps_per_picture: base steps from one picture to the next.
+        steps_per_frame: base steps from one picture to the next.
     """
     length = int(plan.lengths)
     colors = _colors(plan.options[:length].tolist())
@@ -323,19 +312,14 @@ def write_episode_gif(
     trail = torch.stack([drawing.points(state) for state in states]).numpy()
     taken = _colors(options)
     pictures = []
-    for step in steps_to_show(len(states) - 1, steps_per_picture):
+    for step in steps_to_show(len(states) - 1, steps_per_frame):
         walked = [(trail[: step + 1], taken[:step])] if step else []
         pictures.append(drawing.picture(states[step], [*paths, *walked]))
-    write_gif(pictures, path, milliseconds=drawing.milliseconds * steps_per_picture)
+    write_gif(pictures, path, milliseconds=drawing.milliseconds * steps_per_frame)
 
 
 def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 1, 2, 3)) -> None:
     """Draw mazes as text, goal "G" and walls "*", and below as they look from above.
-
-    Args:
-        env: whose mazes are drawn.
-        path: PNG to write.
-        mazes: indices.
 
     Reference:
         Dissertation, figure 4.4.
@@ -356,14 +340,7 @@ def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 
 
 
 def draw_walls(axes: Axes, walls: Any, *, north_up: bool = False, grid: bool = False) -> None:
-    """Draw walls as black squares, (x, y) in tiles.
-
-    Args:
-        axes: to draw in.
-        walls: bool ``[H, W]``, the first row at the top.
-        north_up: let y grow upwards.
-        grid: draw lines between the tiles.
-    """
+    """Draw walls as black squares, (x, y) in tiles."""
     walls = np.asarray(walls)
     height, width = walls.shape
     axes.imshow(
@@ -385,13 +362,7 @@ def draw_walls(axes: Axes, walls: Any, *, north_up: bool = False, grid: bool = F
 
 
 def legend_below(figure: Figure, legend: Legend, *, ncols: int) -> None:
-    """Move a panel's legend below the figure, as the legend of all panels.
-
-    Args:
-        figure: receives it.
-        legend: of one panel; it is removed there.
-        ncols: columns.
-    """
+    """Move a panel's legend below the figure, as the legend of all panels."""
     handles: Any = legend.legend_handles  # typed as if one could be None
     names = [text.get_text() for text in legend.get_texts()]
     legend.remove()

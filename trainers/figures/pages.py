@@ -19,29 +19,17 @@ _MEDIA = {".png": "image/png", ".gif": "image/gif"}
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table.
+    """A cell of a table."""
 
-    Args:
-        value: that is shown as :func:`plain` writes it.
-        beside: small words behind it.
-        below: small lines below it.
-        title: shown where the mouse rests.
-        kind: class of a value with a title.
-        code: whether it is typed.
-        link: address it leads to.
-        color: of a square before it.
-        number: set to the right. Default: if the value is a number.
-    """
-
-    value: Any
-    beside: str = ""
-    below: Sequence[str] = ()
-    title: str = ""
-    kind: str = ""
-    code: bool = False
-    link: str = ""
-    color: str = ""
-    number: bool | None = None
+    value: Any  # as `plain` writes it
+    beside: str = ""  # small words behind it
+    below: Sequence[str] = ()  # small lines below it
+    title: str = ""  # shown where the mouse rests
+    kind: str = ""  # class of a value with a title
+    code: bool = False  # whether it is typed
+    link: str = ""  # address it leads to
+    color: str = ""  # of a square before it
+    number: bool | None = None  # set to the right; None: if the value is a number
 
     def __post_init__(self) -> None:
         if self.number is None:
@@ -50,14 +38,10 @@ class Cell:
 
 
 class Table:
-    """A table; a column of numbers is set to the right, its head too.
+    """A table of cells or values; a column of numbers is set to the right, its head too.
 
-    Args:
-        rows: of cells or values.
-        head: of the columns. Default: none.
-        title: above it.
-        kind: ``"wide"`` scrolls where it is wider than the page, ``"stack"`` sets the third cell of
-            a row below the first two on a phone.
+    It scrolls where it is wider than the page; of kind ``"stack"``, it sets the third cell of a row
+    below the first two on a phone.
     """
 
     def __init__(
@@ -78,50 +62,29 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with its caption.
+    """A picture with its caption."""
 
-    Args:
-        source: address or embedded data.
-        alt: read out by screen readers.
-        caption: below it.
-        video: address of the same as a video.
-        broad: whether it scrolls on a phone instead of shrinking.
-    """
-
-    source: str
-    alt: str
+    source: str  # address or embedded data
+    alt: str  # read out by screen readers
     caption: str = ""
-    video: str = ""
-    broad: bool = False
+    video: str = ""  # address of the same as a video
+    broad: bool = False  # whether it scrolls on a phone instead of shrinking
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what stands below it, in the order of the fields; left out if that is nothing.
-
-    Args:
-        title: of the heading.
-        words: paragraphs.
-        link: address, and the words that lead to it.
-        code: lines as they are typed.
-        pictures: side by side.
-        panels: smaller pictures, side by side.
-        columns: tables, side by side.
-        tables: one below the other.
-        inside: sections within.
-        folded: open it on a click.
-    """
+    """A heading and the fields below it in their order; left out if they are empty."""
 
     title: str = ""
-    words: Sequence[str] = ()
-    link: tuple[str, str] | None = None
-    code: Sequence[str] = ()
-    pictures: Sequence[Picture] = ()
-    panels: Sequence[Picture] = ()
-    columns: Sequence[Table] = ()
-    tables: Sequence[Table] = ()
+    words: Sequence[str] = ()  # paragraphs
+    link: tuple[str, str] | None = None  # address, and the words that lead to it
+    code: Sequence[str] = ()  # lines as they are typed
+    pictures: Sequence[Picture] = ()  # side by side
+    panels: Sequence[Picture] = ()  # smaller ones
+    columns: Sequence[Table] = ()  # side by side
+    tables: Sequence[Table] = ()  # one below the other
     inside: Sequence[Section] = ()
-    folded: bool = False
+    folded: bool = False  # until a click
 
     @property
     def filled(self) -> bool:
@@ -132,13 +95,7 @@ class Section:
 
 
 def write_sections(path: str | Path, title: str, sections: Sequence[Section]) -> None:
-    """Write a page in one move.
-
-    Args:
-        path: file.
-        title: shown at the top and in the browser's tab.
-        sections: below it.
-    """
+    """Write a page in one move."""
     folder = FileSystemLoader(Path(__file__).parent)
     environment = Environment(
         loader=folder,
@@ -154,9 +111,6 @@ def write_sections(path: str | Path, title: str, sections: Sequence[Section]) ->
 
 def plain(value: Any) -> str:
     """Return a value as people read it: four digits, thousands apart.
-
-    Args:
-        value: numbers, texts, and lists of them.
 
     Example:
         >>> plain([1, 2.5, True]), plain(1234567.8)
@@ -176,13 +130,7 @@ def plain(value: Any) -> str:
 
 
 def picture(path: Path, caption: str = "", *, embed: bool) -> Picture:
-    """Return a picture, with a link to the video of the same name if there is one.
-
-    Args:
-        path: PNG or GIF.
-        caption: below it.
-        embed: put the file into the page; otherwise it must lie beside the page.
-    """
+    """Return a picture, with a link to the video of the same name if there is one."""
     ending = path.suffix.lower()
     video = path.with_suffix(".mp4")
     return Picture(
@@ -195,12 +143,7 @@ def picture(path: Path, caption: str = "", *, embed: bool) -> Picture:
 
 
 def drawing(svg: str, name: str) -> Picture:
-    """Return an SVG drawing, embedded as a picture: it can run nothing and styles nothing else.
-
-    Args:
-        svg: the document.
-        name: what it shows.
-    """
+    """Return an SVG drawing, embedded as a picture: it can run nothing and styles nothing else."""
     return Picture(_embedded(svg.encode(), "image/svg+xml"), name)
 
 

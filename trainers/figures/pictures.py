@@ -67,25 +67,13 @@ class Pictures:
 
 
 def save_figure(figure: Figure, path: str | Path, *, dpi: int = 110) -> None:
-    """Write a figure of matplotlib as PNG in one move.
-
-    Args:
-        figure: to write.
-        path: file.
-        dpi: pixels of an inch.
-    """
+    """Write a figure of matplotlib as PNG in one move."""
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=dpi, metadata=STAMP)
 
 
 def refuse_foreign(file: str | Path) -> None:
     """Refuse to replace a file that this package did not write.
-
-    Args:
-        file: that is about to be written; need not exist.
-
-    Raises:
-        ValueError: if it is another's, or a folder.
 
     Example:
         >>> refuse_foreign("nothing_there.html")

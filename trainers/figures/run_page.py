@@ -68,16 +68,7 @@ def write_page(
     pictures: Mapping[str, str],
     keys: Keys | None = None,
 ) -> None:
-    """Write a run's page, and beside it what it takes to write it again; everything is escaped.
-
-    Args:
-        path: file to write; pictures, curves and ``run.json`` lie beside it.
-        title: heading of the page.
-        metrics: figures by name; nested mappings become tables of their own. The entries
-            ``"config"`` and ``"versions"`` are shown where there is no ``run.json``.
-        pictures: caption of each picture file.
-        keys: default and meaning of the config's keys. Default: unknown.
-    """
+    """Write a run's page, and beside it what it takes to write it again; everything is escaped."""
     write_json(path.parent / "page.json", {"title": title, "pictures": dict(pictures)})
     run = read_run(path.parent) if is_run(path.parent) else RunFolder(path.parent)
     for name in ("config", "versions"):
@@ -88,19 +79,7 @@ def write_page(
 
 
 def write_run_page(run: RunFolder, out: str | Path | None = None) -> Path:
-    """Write the page of a run from what is in its folder, finished or not.
-
-    Args:
-        run: as it was read.
-        out: file to write; pictures are embedded then. Default: ``index.html`` in the folder,
-            beside its pictures.
-
-    Returns:
-        The file.
-
-    Raises:
-        ValueError: if ``out`` is the page of another run or a file that this package did not write.
-    """
+    """Write the page of a run from what is in its folder, finished or not."""
     say_damage(run)
     file = run.path / "index.html" if out is None else Path(out)
     if out is not None and file.name == "index.html" and is_run(file.parent):
@@ -120,12 +99,7 @@ def say_damage(*runs: RunFolder) -> None:
 
 
 def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
-    """Return what stands on the page of a run.
-
-    Args:
-        run: as it was read.
-        embed: put its pictures into the page; otherwise the page must lie beside them.
-    """
+    """Return what stands on the page of a run."""
     panels = []
     with left_out("the curves of the page"):
         from torchrl_hmcts.trainers.figures.curves import panel  # loads matplotlib
@@ -170,12 +144,7 @@ def damage_of(run: RunFolder) -> list[str]:
 
 
 def result_tables(metrics: Mapping[str, Any], prefix: str = "") -> list[Table]:
-    """Return figures as tables, one for each group; a mean with its quantiles is one row.
-
-    Args:
-        metrics: by name, nested.
-        prefix: of the names in the group, with a dot at its end.
-    """
+    """Return figures as tables, one for each group; a mean with its quantiles is one row."""
     rows: list[tuple[Any, Any]] = []
     inner: list[Table] = []
     heading = (prefix[:-1]).replace(".", ": ").replace("_", " ")

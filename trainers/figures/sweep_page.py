@@ -24,20 +24,7 @@ def write_sweep_page(
     importances: Mapping[str, float],
     command: str,
 ) -> Path:
-    """Write the page of a sweep, with Optuna's own pictures of its study.
-
-    Args:
-        folder: of the sweep.
-        study: of Optuna.
-        experiment: name of the experiment.
-        objective: figure that is improved; with a minus before it, less is better.
-        rows: the trials, best first.
-        importances: share of each key; may be empty.
-        command: that was given.
-
-    Returns:
-        The page.
-    """
+    """Write the page of a sweep, with Optuna's own pictures of its study."""
     folder = Path(folder)
     drawn = Pictures(folder)
     name = objective.removeprefix("-")

@@ -166,9 +166,6 @@ def read_run(path: str | Path) -> RunFolder:
 def is_run(path: str | Path) -> bool:
     """Return whether a folder is that of a run or of a sweep.
 
-    Args:
-        path: folder; need not exist.
-
     Example:
         >>> is_run("nowhere")
         False
@@ -177,11 +174,7 @@ def is_run(path: str | Path) -> bool:
 
 
 def read_curves(path: Path) -> dict[str, RunCurve]:
-    """Return the curves in a run's folder, those of the log while there is no ``curves.csv``.
-
-    Args:
-        path: the folder.
-    """
+    """Return the curves in a run's folder, those of the log while there is no ``curves.csv``."""
     points: dict[str, list[tuple[float, float]]] = {}
     label = "steps"
     if (path / "curves.csv").is_file():
@@ -213,14 +206,7 @@ def read_curves(path: Path) -> dict[str, RunCurve]:
 def start_record(
     experiment: str, config: Any, command: Sequence[str], facts: Mapping[str, Any]
 ) -> None:
-    """Write ``run.json`` into the folder of a run that begins, or is resumed.
-
-    Args:
-        experiment: its name.
-        config: with ``out``; written without the folders above it.
-        command: words of the command line.
-        facts: further entries, e.g. versions and machine.
-    """
+    """Write ``run.json`` into the folder of a run that begins or is resumed, without its path."""
     path = Path(config.out)
     path.mkdir(parents=True, exist_ok=True)
     resumed = getattr(config, "resume", False)
@@ -241,12 +227,7 @@ def start_record(
 
 
 def end_record(path: str | Path, status: str) -> None:
-    """Note in ``run.json`` how a run ended; one that has finished stays so.
-
-    Args:
-        path: folder of the run.
-        status: ``"finished"``, ``"stopped"``, ``"failed"`` or ``"given up"``.
-    """
+    """Note in ``run.json`` how a run ended: finished (it stays so), stopped, failed or given up."""
     file = Path(path) / "run.json"
     record = _json(file, [])
     if record and record.get("status") != "finished":
@@ -255,15 +236,7 @@ def end_record(path: str | Path, status: str) -> None:
 
 
 def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
-    """Add an evaluation to ``evaluation.json``; one with the same settings is replaced.
-
-    Args:
-        path: folder of the run.
-        evaluation: with the entry ``"changes"``, what differs from the run's config.
-
-    Returns:
-        The file.
-    """
+    """Add an evaluation to ``evaluation.json``; one with the same settings is replaced."""
     file = Path(path) / "evaluation.json"
     changes = evaluation.get("changes")
     with folder_locked(path, name=".evaluation.lock", wait=True):  # two evaluations at a time
@@ -271,6 +244,20 @@ def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
         others = [e for e in before if e.get("changes") != changes]
         write_json(file, {"evaluations": [*others, dict(evaluation)]})
     return file
+
+
+def flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return nested figures as one list, names joined by dots.
+
+    Example:
+        >>> flat({"seed": 1, "test": {"solved": 3}})
+        [('seed', 1), ('test.solved', 3)]
+    """
+    rows: list[tuple[str, Any]] = []
+    for name, value in metrics.items():
+        inside = isinstance(value, Mapping)
+        rows += flat(value, f"{prefix}{name}.") if inside else [(prefix + name, value)]
+    return rows
 
 
 def versions() -> dict[str, str]:
