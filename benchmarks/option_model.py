@@ -22,7 +22,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from real_episodes import EpisodesInEachMaze, act
 from torchrl.envs import EnvBase, TransformedEnv
+from waterworld_options import (
+    OptionModelConfig,
+    error_by_horizon,
+    make_model_env,
+    record_transitions,
+    train_option_model,
+)
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillPolicy
@@ -31,14 +39,6 @@ from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.experiments.skills import learn
-from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
-    OptionModelConfig,
-    error_by_horizon,
-    make_model_env,
-    record_transitions,
-    train_option_model,
-)
-from torchrl_hmcts.trainers.experiments.waterworld.real_episodes import EpisodesInEachMaze, act
 from torchrl_hmcts.transforms import OptionTransform
 
 OPTION_STEPS, GAMMA, TIME_LIMIT = 25, 0.99, 1_000

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment, find_experiment
-from torchrl_hmcts.trainers.experiments.registry import config_keys
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.runs.config import config_keys
 
 ALL = [*EXPERIMENTS.values()]
 
 
 @pytest.mark.parametrize("experiment", ALL, ids=lambda e: e.name)
 def test_every_key_of_an_experiment_has_a_default_and_a_sentence(experiment: Experiment) -> None:
-    meanings = field_docs(experiment.config_class)
-    for field in fields(experiment.config_class):
-        assert meanings[field.name].endswith("."), field.name
+    for name, (_, meaning) in config_keys(experiment.config_class).items():
+        assert meaning.endswith("."), name
     assert experiment.config_class().out == f"runs/{experiment.name}"
     assert callable(experiment.function)
 

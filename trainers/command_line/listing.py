@@ -7,7 +7,12 @@ from collections.abc import Sequence
 
 from torchrl_hmcts.trainers.command_line.running import missing, refuse
 from torchrl_hmcts.trainers.experiments.dissertation import FIGURES
-from torchrl_hmcts.trainers.experiments.registry import DEMO, EXPERIMENTS, find_experiment
+from torchrl_hmcts.trainers.experiments.registry import (
+    ALL_EXPERIMENTS,
+    EXPERIMENTS,
+    KITS,
+    find_experiment,
+)
 
 
 def show(words: Sequence[str]) -> int:
@@ -19,13 +24,13 @@ def show(words: Sequence[str]) -> int:
         if name in ("", "experiments"):
             print("experiments (their keys: hmcts list NAME):")
             print(summaries())
-            print("\nfigures of the dissertation: hmcts list figures")
+            print(f"\nkits (hmcts train kit=NAME): {', '.join(KITS)}")
+            print("figures of the dissertation: hmcts list figures")
         elif name == "figures":
             print(figures())
-        elif name == "demo":
-            print(DEMO.describe())
         else:
-            print(find_experiment(name).describe())
+            known = {**KITS, **ALL_EXPERIMENTS}
+            print(known[name].describe() if name in known else find_experiment(name).describe())
     except ModuleNotFoundError as error:
         return missing(error)
     except ValueError as error:

@@ -8,17 +8,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shlex
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError, config_keys
-from torchrl_hmcts.trainers.saving.files import left_out, write_csv
+from torchrl_hmcts.trainers.saving.files import left_out, remove, write_csv
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
@@ -162,15 +161,13 @@ def open_run(
     if outer is not None and outer.config is config:
         yield outer
         return
-    if hasattr(config, "check_inputs"):
-        config.check_inputs()
+    config.check_inputs()
     name = experiment or config.EXPERIMENT
     with contextlib.ExitStack() as stack:
         config = _claim(stack, config, name, fresh)
-        resumes = getattr(config, "resume", False) and has_checkpoint(config.out)
-        run = Run(config, name, resumes)
-        if getattr(config, "overwrite", False):
-            clear(run.path)
+        run = Run(config, name, config.resume and _has_checkpoint(config.out))
+        if config.overwrite:
+            _clear(run.path)
         start_record(name, config, command, {"versions": versions(), "machine": machine()})
         token = _current.set(run)
         stack.callback(_current.reset, token)
@@ -201,24 +198,17 @@ def _claim(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: boo
     for out in _names(config.out) if fresh else [config.out]:
         chosen = dataclasses.replace(config, out=out) if fresh else config
         try:
-            _check_folder(chosen, experiment)
-            # `resume` has one: a folder that it would make is refused above.
-            Path(out).mkdir(parents=True, exist_ok=True)
-            lock = folder_locked(out)
-            lock.__enter__()
+            with contextlib.ExitStack() as locked:
+                _check_folder(chosen, experiment)
+                # `resume` has one: a folder that it would make is refused above.
+                Path(out).mkdir(parents=True, exist_ok=True)
+                locked.enter_context(folder_locked(out))
+                _check_folder(chosen, experiment)  # another may have written there meanwhile
+                stack.push(locked.pop_all())
+            return chosen
         except (FolderRefused, FolderInUse):
-            if fresh:
-                continue
-            raise
-        stack.push(lock)
-        try:
-            _check_folder(chosen, experiment)  # another may have written there meanwhile
-        except FolderRefused:
             if not fresh:
                 raise
-            stack.pop_all().close()
-            continue
-        return chosen
     raise AssertionError("names never end")
 
 
@@ -237,12 +227,8 @@ def next_free(out: str) -> str:
         >>> next_free("runs/none_there")
         'runs/none_there'
     """
-    return next(name for name in _names(out) if not _exists(name))
-
-
-def _exists(name: str) -> bool:
-    path = Path(name)
-    return path.is_file() or (path.is_dir() and any(path.iterdir()))
+    paths = map(Path, _names(out))
+    return str(next(p for p in paths if not (p.is_file() or (p.is_dir() and any(p.iterdir())))))
 
 
 def _check_folder(config: Any, experiment: str) -> None:
@@ -252,10 +238,9 @@ def _check_folder(config: Any, experiment: str) -> None:
         raise FolderRefused(
             f"out={path} is a file. Name a folder, e.g. {_word('out', next_free(config.out))}."
         )
-    resume, overwrite = (getattr(config, key, False) for key in ("resume", "overwrite"))
-    if resume and overwrite:
+    if config.resume and config.overwrite:
         raise FolderRefused("resume=true continues a run, overwrite=true replaces it: choose one.")
-    if resume:
+    if config.resume:
         _check_resumable(config, experiment)
         return
     there = run_files(path)
@@ -267,7 +252,7 @@ def _check_folder(config: Any, experiment: str) -> None:
         run = read_run(path)
         if not (run.experiment or run.metrics):  # nothing in it can be read
             run = None
-    if overwrite and run is not None:
+    if config.overwrite and run is not None:
         return
     if run is None:
         what = "a sweep" if set(there) & set(_SWEEP) else "files of the names that a run writes"
@@ -290,13 +275,13 @@ def _check_resumable(config: Any, experiment: str) -> None:
     try:
         run = read_run(path)
     except ValueError:
-        if has_checkpoint(path):  # written from Python, by an older version
+        if _has_checkpoint(path):  # written from Python, by an older version
             return
         raise FolderRefused(
             f"There is no checkpoint in {str(path)!r}, and no run to continue. Leave resume out to "
             "begin one there, or name the folder of the run."
         ) from None
-    if not has_checkpoint(path) and run.metrics:
+    if not _has_checkpoint(path) and run.metrics:
         raise FolderRefused(
             f"There is no checkpoint in {str(path / 'checkpoints')!r}, but the figures of a run "
             "that has finished. Replace it with overwrite=true, or choose another folder, e.g. "
@@ -306,7 +291,7 @@ def _check_resumable(config: Any, experiment: str) -> None:
         raise FolderRefused(f"{path} holds a run of {run.experiment}, not of {experiment}.")
     changed = [
         f"{key} was {run.config[key]!r} and is {getattr(config, key)!r} here"
-        for key in getattr(config, "KEPT", ())
+        for key in config.KEPT
         if key in run.config and run.config[key] != getattr(config, key)
     ]
     if changed:
@@ -334,39 +319,24 @@ def run_files(path: Path) -> list[str]:
     return [name for name in names if name in ours or name.startswith("trial_")]
 
 
-def has_checkpoint(path: str | Path) -> bool:
-    """Return whether a run's folder has a checkpoint, whole or not.
-
-    Args:
-        path: of the run.
-    """
+def _has_checkpoint(path: str | Path) -> bool:
+    """Whether a run's folder has a checkpoint, whole or not."""
     folder = Path(path) / "checkpoints"
     return any(folder.glob("checkpoint-*")) or (folder / "run.pt").is_file()
 
 
-def clear(path: Path) -> None:
-    """Remove what a run wrote into its folder, and nothing else.
-
-    Args:
-        path: of the run.
-    """
+def _clear(path: Path) -> None:
+    """Remove what a run wrote into its folder, and nothing else."""
     run = RunFolder(path)
     with contextlib.suppress(ValueError):
         run = read_run(path)
     pictures = {name for name in run.pictures if Path(name).name == name}
     videos = {str(Path(name).with_suffix(".mp4")) for name in pictures if name.endswith(".gif")}
-    for name in {*_RECORDS, *_PICTURES, *pictures, *videos}:
-        (path / name).unlink(missing_ok=True)
-    for name in ("log", "tensorboard"):
-        shutil.rmtree(path / name, ignore_errors=True)
-    for name in ("checkpoints", "worker"):
-        folder = path / name
-        for pattern in _IN_CHECKPOINTS:
-            for entry in folder.glob(pattern):
-                if entry.is_dir() and not entry.is_symlink():
-                    shutil.rmtree(entry, ignore_errors=True)
-                else:
-                    entry.unlink(missing_ok=True)
+    for name in {*_RECORDS, *_PICTURES, *pictures, *videos, "log", "tensorboard"}:
+        remove(path / name)
+    for folder, pattern in product(("checkpoints", "worker"), _IN_CHECKPOINTS):
+        for entry in (path / folder).glob(pattern):
+            remove(entry)
 
 
 def resume_command(out: str | Path) -> str:
