@@ -92,9 +92,9 @@ def test_an_experiment_is_found_by_name() -> None:
     ],
 )
 def test_another_folder_is_advised_only_where_it_helps(message: str, helps: bool) -> None:
-    from torchrl_hmcts.trainers.command_line.running import _with_advice
+    from torchrl_hmcts.trainers.command_line.running import with_advice
 
-    advised = _with_advice(OSError(message), "hmcts train resume=runs/a")
+    advised = with_advice(message, "hmcts train resume=runs/a")
     advice = "Continue with: hmcts train resume=runs/a, or choose another folder with out=DIR."
     assert advised.endswith(advice) == helps
     assert ".." not in advised

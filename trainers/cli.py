@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from torchrl_hmcts.trainers.command_line.listing import summaries
+from torchrl_hmcts.trainers.command_line.running import Failure
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVEL_HELP
 from torchrl_hmcts.trainers.experiments.registry import DEMO
 
@@ -137,6 +138,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         status = run([*["-m"] * getattr(arguments, "many", False), *arguments.words])
         sys.stdout.flush()
+    except Failure as error:
+        print(error, file=sys.stderr)
+        return error.status
     except KeyboardInterrupt:  # in what is no run, e.g. `hmcts report`
         print(f"\nhmcts {arguments.verb}: stopped.", file=sys.stderr)
         return 130

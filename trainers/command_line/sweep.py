@@ -9,12 +9,11 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
+from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, said, told
 from torchrl_hmcts.trainers.command_line.words import parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, find_experiment
-from torchrl_hmcts.trainers.runs.config import ExperimentError, read_value
+from torchrl_hmcts.trainers.runs.config import read_value
 from torchrl_hmcts.trainers.saving.files import left_out, write_json
-from torchrl_hmcts.trainers.saving.locking import FolderInUse
 from torchrl_hmcts.trainers.saving.run_folder import shown_word
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled
 
@@ -23,7 +22,7 @@ _OWN = ("experiment", "trials", "objective", "storage", "prune", "out")
 
 def sweep(words: Sequence[str]) -> int:
     """Run trials until as many as asked for are finished, and write the page of the sweep."""
-    try:
+    with told("sweep", *WRONG_WORDS):
         own, rest = split_words(words, _OWN)
         if "experiment" not in own:
             raise ValueError(
@@ -54,18 +53,13 @@ def sweep(words: Sequence[str]) -> int:
             own.get("storage"),
         )
         study = plan.study()  # before any trial: says what is wrong with storage or folder
-    except ModuleNotFoundError as error:
-        return missing(error)
-    except (ValueError, TypeError) as error:
-        return refuse("sweep", error)
-    except OSError as error:
-        return fail("sweep", f"{error}. Choose another folder with out=DIR.")
     level = own.get("log_level", "info")
     line = ["hmcts", "sweep", *words]
     # Optuna says what came of each trial; what the trials say is for those who ask for it.
     quiet = contextlib.redirect_stdout(io.StringIO())
     try:
         with (
+            told("sweep", ValueError),
             signals_handled(),
             said(level),
             contextlib.nullcontext() if level == "debug" else quiet,
@@ -79,12 +73,6 @@ def sweep(words: Sequence[str]) -> int:
             file=sys.stderr,
         )
         return error.status if isinstance(error, Stopped) else 130
-    except ModuleNotFoundError as error:
-        return missing(error)
-    except (ExperimentError, FolderInUse) as error:
-        return fail("sweep", error)
-    except ValueError as error:
-        return refuse("sweep", error)
     print(_page(plan, study, line))
     return 0
 

@@ -9,7 +9,12 @@ from glob import escape, glob
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.command_line.running import missing, refuse, run_experiment
+from torchrl_hmcts.trainers.command_line.running import (
+    WRONG_WORDS,
+    Failure,
+    run_experiment,
+    told,
+)
 from torchrl_hmcts.trainers.command_line.words import expand, parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import (
     DEMO,
@@ -26,16 +31,15 @@ from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 def demo(words: Sequence[str]) -> int:
     """Run ``hmcts demo key=value ...``; return the exit status."""
-    resumed = [word for word in words if _names_folder(word)]
-    if resumed:
-        return refuse("demo", f"a demo is continued with: hmcts train {shlex.quote(resumed[0])}")
+    for word in filter(_names_folder, words):
+        raise Failure(f"hmcts demo: a demo is continued with: hmcts train {shlex.quote(word)}", 2)
     return _new("demo", DEMO, words, ["hmcts", "demo", *words])
 
 
 def train(words: Sequence[str]) -> int:
     """Run ``hmcts train experiment=NAME key=value ...`` or ``hmcts train resume=DIR``."""
     line = ["hmcts", "train", *words]
-    try:
+    with told("train", *WRONG_WORDS):
         own, rest = split_words(words, ["experiment", "kit"])
         many = "-m" in rest
         rest = [word for word in rest if word != "-m"]
@@ -44,7 +48,8 @@ def train(words: Sequence[str]) -> int:
             raise ValueError(f"one run at a time; got resume={resumed[0]} and {resumed[1]}.")
         named = [f"{key}={own[key]}" for key in ("experiment", "kit") if key in own]
         if not named and resumed:
-            return _continue(resumed[0], rest, own.get("log_level", "info"), line)
+            name, experiment, config = _continued(resumed[0], rest)
+            return run_experiment(name, experiment, config, line, own.get("log_level", "info"))
         if len(named) != 1:
             raise ValueError(
                 f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))} (all: hmcts "
@@ -59,10 +64,6 @@ def train(words: Sequence[str]) -> int:
         experiment = find_experiment(named[0].partition("=")[2], among)
         rest = [word for word in words if word not in (*named, "-m")]
         runs = expand(rest) if many else [rest]
-    except ModuleNotFoundError as error:
-        return missing(error)
-    except ValueError as error:
-        return refuse("train", error)
     name = f"train {named[0]}"
     if not many:
         return _new(name, experiment, rest, line)
@@ -80,16 +81,12 @@ def train(words: Sequence[str]) -> int:
 
 
 def _new(name: str, experiment: Experiment, words: Sequence[str], line: Sequence[str]) -> int:
-    try:
+    with told(name, *WRONG_WORDS):
         own, rest = split_words(words, [])
         config = parse_config(experiment, rest, others=["log_level"])
         fresh = False
         if not any(word.removeprefix("env.").startswith("out=") for word in rest):
             config, fresh = _default_folder(config)
-    except ModuleNotFoundError as error:
-        return missing(error)
-    except (ValueError, TypeError) as error:
-        return refuse(name, error)
     level = own.get("log_level", "info")
     return run_experiment(name, experiment, config, line, level, fresh=fresh)
 
@@ -121,7 +118,8 @@ def _fits(out: str, config: Any) -> bool:
     return all(saved.get(key, getattr(config, key)) == getattr(config, key) for key in config.KEPT)
 
 
-def _continue(folder: str, words: Sequence[str], level: str, line: Sequence[str]) -> int:
+def _continued(folder: str, words: Sequence[str]) -> tuple[str, Experiment, Any]:
+    """The command, the experiment and the configuration of a run that is continued."""
     others = [word for word in words if not _names_folder(word)]
     if others:
         raise ValueError(
@@ -131,7 +129,7 @@ def _continue(folder: str, words: Sequence[str], level: str, line: Sequence[str]
     experiment, config = load_config(read_run(home(folder)))
     config = dataclasses.replace(config, resume=True, overwrite=False)
     name = "demo" if experiment is DEMO else f"train experiment={experiment.name}"
-    return run_experiment(name, experiment, config, line, level)
+    return name, experiment, config
 
 
 def _names_folder(word: str) -> bool:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 from torchrl_hmcts.trainers.experiments.registry import Experiment
-from torchrl_hmcts.trainers.runs.config import PART, home, parse_overrides, unknown_key
+from torchrl_hmcts.trainers.runs.config import home, key_kinds, parse_overrides, unknown_key
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 LOG_LEVEL_HELP = (
@@ -39,7 +39,8 @@ def parse_config(
         >>> parse_config(DEMO, ["seed=3"]).seed
         3
     """
-    names = {field.name for field in fields(experiment.config_class) if field.type == PART}
+    kinds = key_kinds(experiment.config_class)
+    names = {name for name, kind in kinds.items() if kind == "dict"}
     chosen = [w for w in words if w.partition("=")[0].replace("/", ".").split(".")[0] in names]
     rest = [word for word in words if word not in chosen]
     config = parse_overrides(experiment.config_class, rest, base=base, others=others)

@@ -20,7 +20,6 @@ LOGGERS = ("csv", "tensorboard", "wandb")
 MAX_SEED = 2**32 - 1
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 BOOL_WORDS = (*_TRUE, *_FALSE)
-PART = "dict[str, Any]"  # annotation of a key that holds changes of a class's keywords
 
 
 class ExperimentError(ValueError):
@@ -65,8 +64,9 @@ class RunConfig:
     CHOICES: ClassVar[Mapping[str, Sequence[str]]] = {}
 
     def __post_init__(self) -> None:
+        kinds = key_kinds(type(self))
         for field in fields(self):
-            value = _checked(field.name, str(field.type), getattr(self, field.name))
+            value = _checked(field.name, kinds[field.name], getattr(self, field.name))
             if field.name in self.PATHS:
                 value = home(value)
             setattr(self, field.name, value)
@@ -119,7 +119,7 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         if not math.isfinite(value):
             raise ValueError(f"{name} must be a finite number; got {value!r}.")
         return float(value)
-    if kind == PART:
+    if kind == "dict":
         if not isinstance(value, Mapping):
             raise TypeError(f"{name} must be a dict of changes; got {value!r}.")
         return dict(value)
@@ -196,7 +196,7 @@ def parse_overrides(
         >>> parse_overrides(RunConfig, ["seed=1", "out=runs/one"]).out
         'runs/one'
     """
-    types = {field.name: str(field.type) for field in fields(config_class)}  # type: ignore[arg-type]
+    types = key_kinds(config_class)
     given: dict[str, Any] = {}
     for word in overrides:
         word = word.removeprefix("env.")
@@ -262,6 +262,22 @@ def unknown_key(key: str, known: Sequence[str]) -> str:
     """
     near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or list(known)
     return f"Unknown key {key!r}. Did you mean: {', '.join(near)}?"
+
+
+def key_kinds(config_class: type) -> dict[str, str]:
+    """Return the types of a configuration's keys: int, float, bool, str or dict.
+
+    Args:
+        config_class: a dataclass.
+
+    Example:
+        >>> key_kinds(RunConfig)["seed"]
+        'int'
+    """
+    kinds = {field.name: field.type for field in fields(config_class)}
+    return {
+        name: str(getattr(kind, "__name__", kind)).partition("[")[0] for name, kind in kinds.items()
+    }
 
 
 def config_keys(config_class: type) -> dict[str, tuple[Any, str]]:

@@ -21,7 +21,13 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError
 from sqlalchemy.pool import NullPool  # Optuna depends on it
 
-from torchrl_hmcts.trainers.runs.config import RunConfig, home, parse_overrides, read_value
+from torchrl_hmcts.trainers.runs.config import (
+    RunConfig,
+    home,
+    key_kinds,
+    parse_overrides,
+    read_value,
+)
 from torchrl_hmcts.trainers.runs.journal import CheckedJournal
 from torchrl_hmcts.trainers.runs.loggers import observed
 from torchrl_hmcts.trainers.runs.run import next_free, open_run, run_files
@@ -58,7 +64,7 @@ def parse_space(config_class: type, words: Sequence[str]) -> tuple[Space, list[s
         >>> space["seed"].choices, fixed
         ((3, 4), ['out=x'])
     """
-    types = {field.name: str(field.type) for field in dataclasses.fields(config_class)}
+    types = key_kinds(config_class)
     space: Space = {}
     fixed = []
     for word in words:
