@@ -215,7 +215,8 @@ def bare_methods(value: type) -> list[str]:
         function = getattr(method, "fget", None) or getattr(method, "__func__", method)
         own = str(getattr(inspect.unwrap(function), "__module__", "")).startswith("torchrl_hmcts")
         if not name.startswith("_") and inspect.isroutine(function) and own:
-            bare += [] if inspect.getdoc(getattr(value, name)) else [name]
+            over = [vars(base).get(name) for base in value.__mro__ if base is not torch.nn.Module]
+            bare += [] if any(getattr(method, "__doc__", None) for method in over) else [name]
     return bare
 
 

@@ -207,7 +207,7 @@ class FeatureMap:
         self.background(axes, state)
         for points, colors in paths:
             for line, color in zip(zip(points[:-1], points[1:], strict=True), colors, strict=True):
-                axes.plot(*np.array(line).T, color=np.asarray(color) / 255)
+                axes.plot(*np.array(line).T, color=np.asarray(color) / 255, linewidth=2.5)
         axes.plot(*self.points(state).tolist(), "o", color="black")
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()

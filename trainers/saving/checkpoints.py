@@ -203,7 +203,7 @@ class DurableRotation(CheckpointRotation):
             with tempfile.TemporaryFile(dir=self.directory):
                 pass
         except OSError as error:
-            raise type(error)(
+            raise OSError(
                 error.errno,
                 f"checkpoints cannot be written to {str(self.directory)!r} ({error.strerror}). "
                 "Choose a save_dir that can be written to",
