@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from maze_network import MazeNetwork
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -34,7 +35,6 @@ from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.experiments.skills import learn
-from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer, make_guided_planner
 
 OPTION_STEPS, RADIUS, GAMMA = 25, 0.7, 0.99  # those of the demo

@@ -66,7 +66,7 @@ def test_an_unknown_key_is_refused_with_the_nearest_ones(capsys):
         (["seed"], "no key=value"),
         (["mazes=many"], "many"),
         (["mazes=0"], "mazes must be at least 1; got 0"),
-        (["novelty_radius=0"], "novelty_radius must be above 0 tiles; got 0.0"),
+        (["novelty_radius=0"], "novelty_radius must be above 0; got 0.0"),
         (["gamma=1.5"], r"gamma must be in \(0, 1\]; got 1.5"),
         (["option_steps=-5"], "option_steps must be at least 1; got -5"),
     ],

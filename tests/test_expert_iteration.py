@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from maze_network import MazeNetwork, shortest_distances
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -24,10 +25,8 @@ from torchrl_hmcts.planners import (
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import (
     ExpertIterationTrainer,
-    MazeNetwork,
     SearchCollector,
     make_guided_planner,
-    shortest_distances,
 )
 
 

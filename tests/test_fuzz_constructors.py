@@ -270,7 +270,6 @@ GOOD: dict[str, Good] = {
         SharedRMSprop={"params": lambda: [nn.Parameter(torch.zeros(2))]},
         GrowSkills={"prior": lambda: modules.GrowingSkillPrior(4), "coverage": float},
         MazeView={"mazes": lambda: maze()},
-        MazeNetwork={"mazes": lambda: maze(), "channels": 2, "hidden": 2},
         DIAYNTrainer={
             "env": lambda: make_training_env(copies=1),
             "loss_module": lambda: skill_loss(),
@@ -305,7 +304,7 @@ GOOD: dict[str, Good] = {
 }
 COSTLY = {  # milliseconds each; the others take microseconds
     *("DIAYNTrainer", "HMCTSTrainer", "A3CTrainer", "ExpertIterationTrainer", "MCTSPlanner"),
-    *("WaterworldMazeEnv", "LabMazeEnv", "GridworldMazeEnv", "MazeNetwork", "MazeView"),
+    *("WaterworldMazeEnv", "LabMazeEnv", "GridworldMazeEnv", "MazeView"),
     *("DIAYNLoss", "DiscreteSkillSACLoss", "SkillSACLoss", "A3CLoss", "OptionModel"),
     *("IntraOptionQLoss", "OptionTerminationLoss", "ExpertIterationLoss", "SkillDynamicsLoss"),
 }

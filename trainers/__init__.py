@@ -58,10 +58,6 @@ if TYPE_CHECKING:
         make_goal_env,
         make_tile_planner,
     )
-    from torchrl_hmcts.trainers.experiments.waterworld.networks import (
-        MazeNetwork,
-        shortest_distances,
-    )
     from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
     from torchrl_hmcts.trainers.expert_iteration import (
         ExpertIterationTrainer,

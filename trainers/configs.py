@@ -1,7 +1,7 @@
 """Configs of every swappable class, in Hydra's store beside TorchRL's own groups.
 
 A config is made from the signature of its class: the same keywords, the same defaults. The meaning
-of a keyword stands in the docstring of the class, from which :func:`to_yaml` takes it.
+of a keyword stands in the docstring of the class, and nowhere else.
 
 Parts of a planner and of a loss go to their places by themselves: after ``planner=mcts``,
 ``tree_policy=puct`` is ``planner.tree_policy``; after ``loss=discrete_skill_sac``,
@@ -26,7 +26,6 @@ import functools
 import importlib
 import inspect
 import re
-import textwrap
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -175,54 +174,6 @@ def config_of(component: type, base: type = ComponentConfig) -> Any:
     return made
 
 
-def to_yaml(component: type) -> str:
-    """Write the config of a class as yaml: every key with its default, its meaning above it.
-
-    Args:
-        component: class with a config.
-
-    Example:
-        >>> from torchrl_hmcts.planners import UCT
-        >>> print(to_yaml(UCT))
-        # exploration constant, in units of the return. Default ``1.0``.
-        c: 1.0
-        _target_: torchrl_hmcts.trainers.parts.build
-        _component_: torchrl_hmcts.planners.UCT
-        <BLANKLINE>
-    """
-    meanings = argument_docs(component)
-    parts = []
-    fields = [f for f in dataclasses.fields(config_of(component)) if f.name != "_partial_"]
-    for field in sorted(fields, key=lambda f: f.name.startswith("_")):
-        if field.name in meanings:
-            parts.append(textwrap.indent(textwrap.fill(meanings[field.name], 96), "# "))
-        factory = field.default_factory
-        value = field.default if factory is dataclasses.MISSING else factory()
-        parts.append(OmegaConf.to_yaml({field.name: value}).rstrip())
-    return "\n".join(parts) + "\n"
-
-
-def argument_docs(component: type) -> dict[str, str]:
-    """Return the meaning of each argument from the docstring of a class.
-
-    Args:
-        component: class whose docstring has a section ``Args:``.
-
-    Example:
-        >>> from torchrl_hmcts.planners import UCT
-        >>> argument_docs(UCT)
-        {'c': 'exploration constant, in units of the return. Default ``1.0``.'}
-    """
-    text = inspect.cleandoc(component.__doc__ or "")
-    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
-    docs: dict[str, str] = {}
-    entry = r"^(\w+(?:, \w+)*)(?: \([^\n]*?\))?: (.*?)(?=^\w|\Z)"
-    body = textwrap.dedent(section[1]) if section else ""
-    for names, meaning in re.findall(entry, body, re.MULTILINE | re.DOTALL):
-        docs.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
-    return docs
-
-
 def register_configs() -> None:
     """Put all configs into Hydra's store; importing ``torchrl_hmcts.trainers.configs`` does it.
 
@@ -324,6 +275,7 @@ def compose_parts(
         2.5
     """
     config = {part: full(node) for part, node in own.items()}
+    known = [*_flat(config), *_choices(config)]
     overrides = []
     for word in words:
         key, separator, name = word.partition("=")
@@ -345,16 +297,15 @@ def compose_parts(
         if before.get("_component_") != path:  # the same class keeps its keywords
             needed = [n for n, p in _keywords(named(path)).items() if p.default is p.empty]
             where[last] = {n: before[n] for n in needed if n in before}
+            known += [f"{place}.{keyword}" for keyword in _keywords(named(path))]
             overrides.append(f"+{group}@{place}={name}")
     store = ConfigStore.instance()
     store.store(name="hmcts", node={"defaults": ["_self_"], **config})
     try:
         composed = _compose(overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        for word in words:
-            key = word.partition("=")[0]
-            known = [*_flat(config), *_choices(config)]
-            if "/" not in key and key not in known and not any(key.startswith(w) for w in known):
+        for key in (word.partition("=")[0] for word in words):
+            if "/" not in key and key not in known:
                 raise ValueError(unknown_key(key, known)) from None
         raise ValueError(" ".join(str(error).split()).partition(" full_key:")[0]) from None
     found = {part: _clean(part, composed[part], top=True) for part in config}
@@ -362,7 +313,7 @@ def compose_parts(
 
 
 def _compose(overrides: Sequence[str]) -> dict[str, Any]:
-    here = nullcontext() if GlobalHydra.instance().is_initialized() else initialize(None)
+    here = nullcontext() if GlobalHydra.instance().is_initialized() else initialize(version_base=None)
     with here:
         config = compose("hmcts", list(overrides))
     found: Any = OmegaConf.to_container(config, resolve=True)
