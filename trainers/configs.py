@@ -62,7 +62,7 @@ _PACKAGES: Mapping[str, Mapping[str, str]] = {
         "metra=METRAEncoderLoss",
     },
     "torchrl_hmcts.transforms": {
-        "transform": "diayn_reward=DIAYNReward DisplacementTransform OptionTransform "
+        "transform": "DisplacementTransform OptionTransform "
         "OptionRecorder SkillTransform SkillMaskTransform skill_reward=SkillReward StallTransform "
         "SubgoalTransform",
     },
@@ -70,7 +70,6 @@ _PACKAGES: Mapping[str, Mapping[str, str]] = {
         "planner": "mcts=MCTSPlanner",
         "tree_policy": "Gumbel PUCT torchrl_score=TorchRLScore UCT",
         "novelty": "radius=RadiusNovelty width=WidthNovelty",
-        "backup": "max=MaxBackup mean=MeanBackup",
         "final_choice": "BestPlan HighestValue MostVisited SampledVisits",
         "budget": "search=SearchBudget",
         "root_noise": "dirichlet=DirichletNoise",
@@ -80,8 +79,7 @@ _PACKAGES: Mapping[str, Mapping[str, str]] = {
         "rollout=RolloutEvaluator value=ValueEvaluator",
         "rollout": "tree=TreeRollout",
         "option_prior": "module=ModulePrior",
-        "control": "goals=GoalPlanner hierarchical=HierarchicalPolicy "
-        "model_based=ModelBasedControl",
+        "control": "goals=GoalPlanner hierarchical=HierarchicalPolicy",
     },
     "torchrl_hmcts.modules": {
         "model": "GaussianSkillActor SkillActionCritic SkillActor SkillCritic SkillDiscriminator "
@@ -313,7 +311,9 @@ def compose_parts(
 
 
 def _compose(overrides: Sequence[str]) -> dict[str, Any]:
-    here = nullcontext() if GlobalHydra.instance().is_initialized() else initialize(version_base=None)
+    here = (
+        nullcontext() if GlobalHydra.instance().is_initialized() else initialize(version_base=None)
+    )
     with here:
         config = compose("hmcts", list(overrides))
     found: Any = OmegaConf.to_container(config, resolve=True)

@@ -210,7 +210,9 @@ def plot_losses(history: Mapping[str, Sequence[float]], base_steps: int, path: P
     }
     if "discriminator_loss" not in history:  # another objective
         del titles["loss_discriminator"]
-        titles |= {k: k.replace("_", " ") for k in ("encoder_loss", "dynamics_loss") if k in history}
+        titles |= {
+            k: k.replace("_", " ") for k in ("encoder_loss", "dynamics_loss") if k in history
+        }
     figure = Figure(figsize=(9.6, 5.4), layout="constrained")
     for axes, (key, title) in zip(figure.subplots(2, 2).flat, titles.items(), strict=False):
         steps = np.linspace(0, base_steps, len(history[key]), endpoint=False)

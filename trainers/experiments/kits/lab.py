@@ -22,7 +22,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
 from torchrl_hmcts.modules import StallTermination
-from torchrl_hmcts.planners import ModelBasedControl
+from torchrl_hmcts.planners import HierarchicalPolicy
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.kits import Curve, Kit, LearnedSkills, Trial
 from torchrl_hmcts.trainers.experiments.kits.lab_script import ShortestPathScript
@@ -280,7 +280,7 @@ class LabMazeKit(Kit):
         starts = make_starts(real.base_env, config.seed)
         planner = self.make_planner(model)
         blind = plan_and_execute(planner, real, starts, group=self.group)
-        policy = ModelBasedControl(planner, env=real, replan_every=1)
+        policy = HierarchicalPolicy(planner, env=real, replan_every=1)
         episodes = [self._act(policy, real, group) for group in starts.split(self.group)]
         ok, gone, made = (torch.cat(column).numpy() for column in zip(*episodes, strict=True))
         return {
@@ -295,7 +295,7 @@ class LabMazeKit(Kit):
 
     @torch.no_grad()
     def _act(
-        self, policy: ModelBasedControl, real: TransformedEnv, starts: TensorDict
+        self, policy: HierarchicalPolicy, real: TransformedEnv, starts: TensorDict
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Whether each episode met the goal, its frames, and the plans that were made."""
         longest = -(-self.config.max_frames // self.config.option_frames)
