@@ -25,10 +25,10 @@ from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import (
     ExpertIterationTrainer,
     MazeNetwork,
-    SearchCollector,
     make_guided_planner,
     shortest_distances,
 )
+from torchrl_hmcts.trainers.expert_iteration import SearchCollector
 
 
 class TwoHeads(nn.Module):

@@ -21,9 +21,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 
+from torchrl_hmcts.trainers.collectors import CollectorError, RestartingCollector
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
-from torchrl_hmcts.trainers.restarting_collector import CollectorError, RestartingCollector
 
 BATCH, TOTAL = 64, 640
 
@@ -215,7 +215,7 @@ def kill() -> int:
 
 
 def train_and_kill(folder: Path, how: str) -> dict[str, Any]:
-    from torchrl_hmcts.trainers.ray_collector import make_ray_collector
+    from torchrl_hmcts.trainers.collectors import make_ray_collector
 
     torch.set_num_threads(1)
     trainer = make_trainer(folder, make_ray_collector)

@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchrl_hmcts.trainers.a3c.learner_processes import LearnerError
-    from torchrl_hmcts.trainers.a3c.shared_optimizers import (
-        SharedAdam,
-        SharedRMSprop,
-        share_optimizer,
-    )
+    from torchrl_hmcts.trainers.a3c.shared_optimizers import SharedRMSprop
     from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
+    from torchrl_hmcts.trainers.collectors import CollectorError
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
     from torchrl_hmcts.trainers.experiments.atari.agent import (
         AtariAgent,
@@ -59,11 +56,9 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
     from torchrl_hmcts.trainers.expert_iteration import (
         ExpertIterationTrainer,
-        SearchCollector,
         make_guided_planner,
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-    from torchrl_hmcts.trainers.restarting_collector import CollectorError
     from torchrl_hmcts.trainers.runs.config import DemoConfig
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
@@ -77,13 +72,10 @@ if TYPE_CHECKING:
         probe_controllability,
     )
     from torchrl_hmcts.trainers.skills.coverage import StateCoverage
-    from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
-    from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
+    from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
     from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
     from torchrl_hmcts.trainers.skills.termination import (
         TerminationConfig,
-        TerminationResult,
-        collect_option_steps,
         learn_termination,
         make_terminating_env,
     )
@@ -118,26 +110,20 @@ __all__ = [
     "GoalTrack",
     "GrowSkills",
     "HMCTSTrainer",
-    "HindsightTransitions",
     "LearnerError",
     "MazeNetwork",
-    "MazeView",
     "Options",
     "RepeatSource",
     "ResumableTrainer",
     "RunningEpisodes",
     "ScriptedExpert",
-    "SearchCollector",
     "SearchCoverage",
-    "SharedAdam",
     "SharedRMSprop",
     "SkillRewardHook",
     "StateCoverage",
     "TerminationConfig",
-    "TerminationResult",
     "TilePlanner",
     "WorkerSource",
-    "collect_option_steps",
     "learn_termination",
     "load_options",
     "make_goal_env",
@@ -145,11 +131,9 @@ __all__ = [
     "make_skill_optimizer",
     "make_terminating_env",
     "make_tile_planner",
-    "num_places",
     "plain_checkpoint",
     "probe_controllability",
     "run_goal_episodes",
-    "share_optimizer",
     "shortest_distances",
 ]
 
@@ -163,7 +147,7 @@ _MODULES = {
     "AtariSearch": "experiments.atari.agent",
     "BestSource": "experiments.atari.sources",
     "Candidate": "experiments.atari.goals",
-    "CollectorError": "restarting_collector",
+    "CollectorError": "collectors",
     "Controllability": "skills.controllability",
     "DIAYNSource": "experiments.atari.learned_sources",
     "DIAYNTrainer": "diayn",
@@ -183,27 +167,21 @@ _MODULES = {
     "GoalTrack": "experiments.waterworld.goal_episodes",
     "GrowSkills": "skills.growing",
     "HMCTSTrainer": "hmcts",
-    "HindsightTransitions": "skills.hindsight",
     "FolderInUse": "saving.locking",
     "LearnerError": "a3c.learner_processes",
     "MazeNetwork": "experiments.waterworld.networks",
-    "MazeView": "skills.hindsight",
     "Options": "experiments.atari.options",
     "RepeatSource": "experiments.atari.sources",
     "ResumableTrainer": "saving.resume",
     "RunningEpisodes": "saving.resume",
     "ScriptedExpert": "experiments.waterworld.scripted_expert",
-    "SearchCollector": "expert_iteration",
     "SearchCoverage": "skills.growing",
-    "SharedAdam": "a3c.shared_optimizers",
     "SharedRMSprop": "a3c.shared_optimizers",
     "SkillRewardHook": "skills.reward_hook",
     "StateCoverage": "skills.coverage",
     "TerminationConfig": "skills.termination",
-    "TerminationResult": "skills.termination",
     "TilePlanner": "experiments.waterworld.goal_planning",
     "WorkerSource": "experiments.atari.options",
-    "collect_option_steps": "skills.termination",
     "learn_termination": "skills.termination",
     "load_options": "experiments.atari.options",
     "make_goal_env": "experiments.waterworld.goal_planning",
@@ -211,11 +189,9 @@ _MODULES = {
     "make_skill_optimizer": "diayn",
     "make_terminating_env": "skills.termination",
     "make_tile_planner": "experiments.waterworld.goal_planning",
-    "num_places": "skills.growing",
     "plain_checkpoint": "saving.checkpoints",
     "probe_controllability": "skills.controllability",
     "run_goal_episodes": "experiments.waterworld.goal_episodes",
-    "share_optimizer": "a3c.shared_optimizers",
     "shortest_distances": "experiments.waterworld.networks",
 }
 

@@ -15,10 +15,9 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, real_number, whole_number
 
 
-@name_arguments
 class StateCoverage(TrainerHookBase):
     r"""Counts the distinct cells of an entry that were visited: lately, and since the start.
 
@@ -62,18 +61,10 @@ class StateCoverage(TrainerHookBase):
     def __init__(
         self, key: NestedKey = "displacement", *, cell_side: float = 0.5, window: int = 4_000
     ) -> None:
-        if not cell_side > 0.0:
-            raise ValueError(
-                f"StateCoverage needs cells of a positive side, in units of {key!r}; got "
-                f"cell_side={cell_side}."
-            )
-        if window < 1:
-            raise ValueError(
-                f"StateCoverage needs a window of at least one base step; got window={window}."
-            )
+        instance("StateCoverage", "key", key, str, tuple)
         self.key = unravel_key(("next", key))
-        self.cell_side = float(cell_side)
-        self.window = int(window)
+        self.cell_side = real_number("StateCoverage", "cell_side", cell_side, above=0.0)
+        self.window = whole_number("StateCoverage", "window", window, least=1)
         self._total: set[bytes] = set()
         self._recent: Counter[bytes] = Counter()
         self._batches: deque[list[bytes]] = deque()
@@ -114,7 +105,7 @@ class StateCoverage(TrainerHookBase):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Goes on from what :meth:`state_dict` returned."""
+        """Continues from what :meth:`state_dict` returned."""
         total, recent = (state_dict[name].numpy(force=True) for name in ("total", "recent"))
         self._size = total.shape[1]
         self._total = set(_as_bytes(total))

@@ -5,44 +5,31 @@ Letters: C copies, T base steps of each, *B batch of the tensordict, b batch of 
 
 from __future__ import annotations
 
-from operator import index
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import whole_number
 
 
-@name_arguments
 class MazeView(TensorDictModuleBase):
     r"""Writes what lies around the disc: where it is in its tile, how it moves, and the walls.
 
-    Args:
-        mazes (Tensor): bool ``[M, H, W]`` of the env that is viewed.
-        reach (int): tiles seen in each direction. Default 2.
-        out_key (NestedKey): entry written, float32 ``[*B, F]``. Default ``"view"``.
-
-    Reads ``"position"``, ``"velocity"`` and ``"maze_index"``. The F features are the position
-    within the tile (2, from -1 to 1), the velocity (2) and the walls of the surrounding
+    Reads ``"position"``, ``"velocity"`` and ``"maze_index"``. The features are the position within
+    the tile (2, from -1 to 1), the velocity (2) and the walls of the surrounding
     ``(2 reach + 1) ** 2`` tiles (1 is solid, as is all outside).
 
-    Raises:
-        ValueError: if ``reach`` is negative.
-
-    Example:
-        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
-        >>> env = WaterworldMazeEnv()
-        >>> MazeView(env.mazes)(env.reset())["view"].shape
-        torch.Size([29])
+    Args:
+        mazes: bool ``[M, H, W]`` of the env that is viewed.
+        reach: tiles seen in each direction. Default 2.
+        out_key: entry written, float32 ``[*B, F]``. Default ``"view"``.
     """
 
     def __init__(self, mazes: Tensor, *, reach: int = 2, out_key: NestedKey = "view") -> None:
         super().__init__()
-        if reach < 0:
-            raise ValueError(f"MazeView sees reach >= 0 tiles in each direction; got {reach}.")
+        reach = whole_number("MazeView", "reach", reach)
         self.reach = reach
         self.in_keys: list[NestedKey] = ["position", "velocity", "maze_index"]
         self.out_keys = [out_key]
@@ -69,13 +56,12 @@ class MazeView(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], view)
 
 
-@name_arguments
 class HindsightTransitions:
-    """Pieces of options from stored base steps, with targets that may have been reached.
+    r"""Pieces of options from stored base steps, with targets that may have been reached.
 
     A piece is ``every`` base steps of one option. Half of the targets are places that the same
     episode reached later, the others places it visited at any time. The reward of a piece is
-    :math:`\\gamma^i` if its base step ``i`` touches the target, which also terminates it.
+    :math:`\gamma^i` if its base step ``i`` touches the target, which also terminates it.
 
     Args:
         data: base transitions ``[C, T]`` with ``"skill"`` and ``"skill_step"``.
@@ -88,17 +74,6 @@ class HindsightTransitions:
 
     Raises:
         ValueError: if the data hold no whole piece.
-
-    Reference:
-        Andrychowicz et al., "Hindsight experience replay", 2017, arXiv 1707.01495.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
-        >>> env = make_training_env(copies=2)
-        >>> data = env.rollout(20, break_when_any_done=False)
-        >>> transitions = HindsightTransitions(data, MazeView(env.mazes), touch=1e-3)
-        >>> transitions.sample(64)["next", "duration"].unique().item()
-        5
     """
 
     def __init__(
@@ -141,7 +116,7 @@ class HindsightTransitions:
             )
         self.every, self.horizon, self.gamma = every, horizon, gamma
         self.touch = touch
-        self.generator = torch.Generator().manual_seed(index(seed))
+        self.generator = torch.Generator().manual_seed(seed)
 
     def sample(self, batch_size: int) -> TensorDict:
         """Return at most ``batch_size`` transitions ``[b]``, none of which begins at its target.

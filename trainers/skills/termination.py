@@ -6,7 +6,7 @@ Letters: C copies, T base steps of each.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
@@ -15,9 +15,9 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import MLP
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import (
     AnyTermination,
@@ -33,7 +33,6 @@ _STALL_TOLERANCE = 0.005  # tiles per base step, a twentieth of the top speed
 _EPISODE_STEPS = 200  # base steps in a maze before the next one
 
 
-@name_arguments
 @dataclass
 class TerminationConfig:
     """How a termination is learned.
@@ -47,7 +46,7 @@ class TerminationConfig:
     """
 
     base_steps: int = 20_000
-    """Base steps of options carried out in training mazes: all the experience there is."""
+    """Base steps of options executed in training mazes: all the experience there is."""
     copies: int = 32
     """Mazes played at once."""
     option_steps: int = 50
@@ -80,10 +79,12 @@ class TerminationConfig:
     """Of mazes, networks and batches."""
 
     def __post_init__(self) -> None:
-        whole = ("base_steps", "copies", "option_steps", "every", "horizon", "rounds")
-        for name in (*whole, "value_updates", "termination_updates", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        for column in fields(self):
+            name, value = column.name, getattr(self, column.name)
+            if isinstance(column.default, int):
+                whole_number("TerminationConfig", name, value, least=0 if name == "seed" else 1)
+            else:
+                real_number("TerminationConfig", name, value, least=0.0)
         if self.every > self.option_steps:
             raise ValueError(
                 f"Options of option_steps={self.option_steps} hold no piece of "
@@ -97,24 +98,11 @@ def collect_option_steps(
     config: TerminationConfig,
     mazes: Tensor | None = None,
 ) -> TensorDictBase:
-    """Let the worker carry out random options in random mazes.
-
-    Args:
-        worker: reads ``"velocity"`` and ``"skill"``, writes ``"action"``.
-        num_options: number of options.
-        config: of which ``base_steps``, ``copies``, ``option_steps`` and ``seed`` are used.
-        mazes: bool ``[M, H, W]``. Default: the training split.
+    """Let the worker execute random options in random mazes, of the training split by default.
 
     Returns:
         Base transitions ``[C, T]`` with the option under ``"skill"`` and the base steps it has
         taken before under ``"skill_step"``.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule
-        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> config = TerminationConfig(base_steps=40, copies=4)
-        >>> collect_option_steps(worker, 4, config).batch_size
-        torch.Size([4, 10])
     """
     env = TransformedEnv(
         WaterworldMazeEnv(
@@ -132,13 +120,7 @@ def collect_option_steps(
 
 @dataclass
 class TerminationResult:
-    """What :func:`learn_termination` returns.
-
-    Example:
-        >>> network = TerminationNetwork(29, 4, in_keys=["view"])
-        >>> TerminationResult(network, network, 20_000).base_steps
-        20000
-    """
+    """The outcome of :func:`learn_termination`."""
 
     network: TerminationNetwork
     """Reads ``"view"`` and ``"skill"``."""
@@ -166,7 +148,7 @@ def learn_termination(
     targets that were reached. The termination, which does not see the target, is then learned from
     states met under an option that was the best for its target where it began
     (:class:`~torchrl_hmcts.objectives.OptionTerminationLoss`): it ends options where, over all
-    targets, going on loses more than the deliberation cost, as at the mouth of a side passage.
+    targets, continuing loses more than the deliberation cost, as at the mouth of a side passage.
 
     Args:
         worker: reads ``"velocity"`` and ``"skill"``, writes ``"action"``.
@@ -198,11 +180,10 @@ def learn_termination(
     if data is None:
         data = collect_option_steps(worker, num_options, config, mazes)
     view = MazeView(mazes)
-    touch = WaterworldMazeEnv.PLAYER_RADIUS + WaterworldMazeEnv.TARGET_RADIUS
     transitions = HindsightTransitions(
         data,
         view,
-        touch=touch,
+        touch=WaterworldMazeEnv.PLAYER_RADIUS + WaterworldMazeEnv.TARGET_RADIUS,
         every=config.every,
         horizon=config.horizon,
         gamma=config.gamma,
@@ -225,33 +206,31 @@ def learn_termination(
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.termination_lr, fused=True)
     result = TerminationResult(network, values, data.numel())
 
-    def note(update: int, out: TensorDictBase) -> None:
+    def step(
+        part: LossModule, adam: torch.optim.Optimizer, name: str, batch: TensorDictBase, update: int
+    ) -> None:
+        out = part(batch)
+        adam.zero_grad()
+        out[name].backward()
+        adam.step()
         if progress is not None:
             progress(1)
         if update % 100 == 99:
-            for name, value in out.detach().items():
-                result.history.setdefault(name, []).append(float(value))
+            for key, value in out.detach().items():
+                result.history.setdefault(key, []).append(float(value))
 
     for _ in range(config.rounds):
         for update in range(config.value_updates):
-            out = value_loss(transitions.sample(config.batch_size))
-            value_optimizer.zero_grad()
-            out["loss_qvalue"].backward()
-            value_optimizer.step()
+            batch = transitions.sample(config.batch_size)
+            step(value_loss, value_optimizer, "loss_qvalue", batch, update)
             updater.step()
-            note(update, out)
         for update in range(config.termination_updates):
             batch = transitions.sample(config.batch_size)
             with torch.no_grad():
                 best = values(batch["begin"])["action_value"].argmax(-1)
             batch = batch[best == batch["skill"]]  # on-policy: options that would be chosen
-            if not len(batch):
-                continue
-            out = loss(batch)
-            optimizer.zero_grad()
-            out["loss_termination"].backward()
-            optimizer.step()
-            note(update, out)
+            if len(batch):
+                step(loss, optimizer, "loss_termination", batch, update)
     return result
 
 
@@ -277,7 +256,7 @@ def make_terminating_env(
         stall_steps: base steps in a row without movement that end an option; None for any number.
             From rest the disc does not move in its first base step, so at least 2.
         num_options: number of options.
-        max_steps: base steps of an option at most. Default: the 100 of the source.
+        max_steps: base steps of an option at most. Default: the dissertation's 100.
         gamma: discount per base step.
         seed: of the env.
 

@@ -17,6 +17,7 @@ from torchrl.record.loggers import Logger
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.objectives import DiscreteSkillSACLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.trainers.collectors import make_ray_collector
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer, Progress
 from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.experiments.lab.config import (
@@ -34,7 +35,6 @@ from torchrl_hmcts.trainers.experiments.lab.worker import (
     make_worker_loss,
 )
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-from torchrl_hmcts.trainers.ray_collector import make_ray_collector
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.skills.curves import Curves
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
