@@ -298,7 +298,9 @@ class A3CTrainer:
         self.log.start()
         self._next = {name: self._after(name) for name in self.intervals}
         self._accepted: LossModule | None = None  # what stop_when was content with
-        self._bar = self.progress(total=self.settings.total_frames) if self.progress else None
+        self._bar = None
+        if self.progress is not None:
+            self._bar = self.progress(total=self.settings.total_frames)
         try:
             if self.frames < self.settings.total_frames:
                 (self._watch if self.learners.number else self._run_here)()
