@@ -6,7 +6,7 @@ import contextlib
 
 import numpy as np
 
-from torchrl_hmcts.envs import atari_process  # noqa: F401
+from torchrl_hmcts.envs.atari import process  # noqa: F401
 from torchrl_hmcts.envs.atari.workers import SharedMLP
 
 with contextlib.suppress(ImportError):
