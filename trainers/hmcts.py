@@ -319,9 +319,8 @@ class _MacroEnvs:
                 "WaterworldMazeEnv()."
             )
         keys = None if recorder is None else recorder.trajectory_keys
-        make = partial(self.make_options, trajectory_keys=keys)
         args = (OptionTransform, worker, self.num_skills, self.option_steps)
-        options = made_by(make, _OWNER, "make_options", *args)
+        options = made_by(self.make_options, _OWNER, "make_options", *args, trajectory_keys=keys)
         return TransformedEnv(base, options if recorder is None else Compose(options, recorder))
 
     def recorded(

@@ -14,6 +14,7 @@ from torchrl_hmcts.processes import share
 
 # Those whose state after a step with zero gradients is the state they start from.
 _SHAREABLE = ("Adagrad", "Adam", "Adamax", "AdamW", "RMSprop", "SGD", "SharedRMSprop")
+_LARGEST = torch.finfo(torch.float32).max
 
 
 def share_optimizer(optimizer: Optimizer) -> Optimizer:
@@ -117,11 +118,11 @@ class SharedRMSprop(Optimizer):
         eps: float = 1e-5,
         weight_decay: float = 0.0,
     ) -> None:
-        real_number("SharedRMSprop", "lr", lr, least=0.0)
+        for name, value in (("lr", lr), ("weight_decay", weight_decay)):
+            real_number("SharedRMSprop", name, value, least=0.0, most=_LARGEST)
         if real_number("SharedRMSprop", "alpha", alpha, least=0.0) >= 1.0:
             raise ValueError(f"SharedRMSprop needs alpha < 1, its memory; got {alpha}.")
-        real_number("SharedRMSprop", "eps", eps, above=0.0)
-        real_number("SharedRMSprop", "weight_decay", weight_decay, least=0.0)
+        real_number("SharedRMSprop", "eps", eps, above=0.0, most=_LARGEST)
         try:
             groups = list(params)
         except (RuntimeError, TypeError) as error:
