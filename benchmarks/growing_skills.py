@@ -7,7 +7,7 @@ For every seed (0, 1, 2) five workers are trained with 40,000 base steps each in
 decides for itself (``GrowSkills``, room for 12); and 4 skills with that one's discriminator. The
 discriminator of the growing worker is linear without a bias: with one, a new skill can be told by
 staying where it is, since the old ones have left, and need not learn to go. Then each worker plans
-in the 342 test mazes, and its plans are carried out in a separate instance of the env. Coverage is
+in the 342 test mazes, and its plans are executed in a separate instance of the env. Coverage is
 the share of a maze's free tiles that a search of 2,000 simulated base steps reaches. What growing
 simulated in the training mazes to measure coverage is listed beside the training.
 """

@@ -22,20 +22,28 @@ import numpy as np
 from mazes import demo_loss, greedy, make_option_env, make_starts, planner
 from table import markdown, read_arguments, write
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 
-from torchrl_hmcts.envs import maze_pool
-from torchrl_hmcts.modules import TerminationNetwork
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
+from torchrl_hmcts.modules import (
+    AnyTermination,
+    LearnedTermination,
+    StallTermination,
+    TerminationNetwork,
+)
 from torchrl_hmcts.planners import SearchBudget
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
+from torchrl_hmcts.trainers.skills.hindsight import MazeView
 from torchrl_hmcts.trainers.skills.termination import (
     TerminationConfig,
     collect_option_steps,
     learn_termination,
-    make_terminating_env,
 )
+from torchrl_hmcts.transforms import OptionTransform, StallTransform
 
+STALL_TOLERANCE = 0.005  # tiles per base step, a twentieth of the top speed
 TUNING_LIMIT = 10_000  # simulated base steps of a search in training mazes
 SETTINGS: dict[str, list[dict[str, Any]]] = {
     "fixed 100": [{"radius": r} for r in (0.25, 0.35, 0.5, 0.7, 1.0, 1.4)],
@@ -50,6 +58,24 @@ SETTINGS: dict[str, list[dict[str, Any]]] = {
         {"radius": r, "deliberation_cost": xi} for r, xi in product((0.5, 0.7), (0.02, 0.04, 0.06))
     ],
 }
+
+
+def make_terminating_env(
+    worker: Any,
+    mazes: Tensor,
+    max_steps: int = 100,
+    *,
+    network: TerminationNetwork | None = None,
+    stall_steps: int = 3,
+) -> TransformedEnv:
+    """Waterworld with options that end when stuck, and where a network says so."""
+    base = WaterworldMazeEnv(mazes, observation=False)
+    conditions: list[Any] = [StallTermination(stall_steps)]
+    if network is not None:
+        seen = TensorDictSequential(MazeView(base.mazes), network)
+        conditions.append(LearnedTermination(seen, every=5))
+    options = OptionTransform(worker, 4, max_steps, termination=AnyTermination(*conditions))
+    return TransformedEnv(base, Compose(StallTransform("position", STALL_TOLERANCE), options))
 
 
 class Workers:
@@ -71,9 +97,8 @@ class Workers:
             config = TerminationConfig(seed=self.seed, deliberation_cost=cost, **self._options)
             if self._data is None:
                 self._data = collect_option_steps(self.worker, 4, config)
-            result = learn_termination(self.worker, 4, config, data=self._data)
-            self._learned[cost] = result.network
-            self.base_steps = result.base_steps
+            self._learned[cost], _ = learn_termination(self.worker, 4, config, data=self._data)
+            self.base_steps = self._data.numel()
             self.seconds += time.perf_counter() - begin
         return self._learned[cost]
 
@@ -83,9 +108,9 @@ class Workers:
             return make_option_env(self.worker, mazes, option_steps=steps)
         if variant.startswith("stall"):
             stall = setting["stall_steps"]
-            return make_terminating_env(self.worker, mazes, stall_steps=stall, max_steps=steps)
+            return make_terminating_env(self.worker, mazes, steps, stall_steps=stall)
         network = self.network(setting["deliberation_cost"])
-        return make_terminating_env(self.worker, mazes, network=network, max_steps=steps)
+        return make_terminating_env(self.worker, mazes, steps, network=network)
 
 
 def evaluate(

@@ -74,11 +74,7 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.skills.coverage import StateCoverage
     from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
     from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
-    from torchrl_hmcts.trainers.skills.termination import (
-        TerminationConfig,
-        learn_termination,
-        make_terminating_env,
-    )
+    from torchrl_hmcts.trainers.skills.termination import TerminationConfig, learn_termination
 
 __all__ = [
     "A3CTrainer",
@@ -129,7 +125,6 @@ __all__ = [
     "make_goal_env",
     "make_guided_planner",
     "make_skill_optimizer",
-    "make_terminating_env",
     "make_tile_planner",
     "plain_checkpoint",
     "probe_controllability",
@@ -187,7 +182,6 @@ _MODULES = {
     "make_goal_env": "experiments.waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
     "make_skill_optimizer": "diayn",
-    "make_terminating_env": "skills.termination",
     "make_tile_planner": "experiments.waterworld.goal_planning",
     "plain_checkpoint": "saving.checkpoints",
     "probe_controllability": "skills.controllability",

@@ -9,6 +9,7 @@ from types import NoneType
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, Transform
@@ -186,7 +187,8 @@ class DIAYNTrainer(OffPolicyTrainer):
             **trainer_kwargs,
         )
         self.seed = seed
-        self.register_op("post_optim_complete_log", log_curves)
+        self._latest: dict[str, float] = {}
+        self.register_op("post_optim_complete_log", self._log_curves)
         if not isinstance(self.collector, Collector):  # it has weights of its own
             self.register_op("post_steps", UpdateWeights(self.collector, 1))
         coverage.register(self)
@@ -208,10 +210,13 @@ class DIAYNTrainer(OffPolicyTrainer):
         """All logged values by name: per batch the mean over its updates of each curve."""
         return Curves(super().history)
 
+    def _log_curves(self, optim_steps: int, losses: TensorDictBase | None) -> dict[str, float]:
+        self._latest = log_curves(optim_steps, losses)
+        return self._latest
+
     def progress_figures(self) -> dict[str, str]:
         names = ("actor_loss", "critic_loss", "discriminator_loss", "discriminator_accuracy")
-        latest = {name: self._log_dict.get(name) for name in names}
-        return {name: f"{float(values[-1]):.3f}" for name, values in latest.items() if values}
+        return {name: f"{self._latest[name]:.3f}" for name in names if name in self._latest}
 
     @staticmethod
     def make_loss(

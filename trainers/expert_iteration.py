@@ -310,7 +310,6 @@ class ExpertIterationTrainer(OffPolicyTrainer):
             "solved": f"{counts.solved[-1]}/{searches}",
             "base_steps_per_search": f"{counts.base_steps[-1] / searches:.0f}",
         }
-        accuracy = self._log_dict.get("policy_accuracy")
-        if accuracy:
-            figures["policy_accuracy"] = f"{float(accuracy[-1]):.3f}"
+        for accuracy in self.history.get("policy_accuracy", [])[-1:]:
+            figures["policy_accuracy"] = f"{accuracy:.3f}"
         return figures

@@ -246,7 +246,6 @@ class HMCTSTrainer(OffPolicyTrainer):
 
     def _begin(self) -> None:
         """Before the first round: train on D, and test."""
-        self._stop_training = False
         if self.collector.round >= 0:  # it was resumed
             return
         if len(self.dataset):

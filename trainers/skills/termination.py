@@ -6,30 +6,24 @@ Letters: C copies, T base steps of each.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.modules import MLP
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
-from torchrl_hmcts.modules import (
-    AnyTermination,
-    LearnedTermination,
-    StallTermination,
-    TerminationNetwork,
-)
+from torchrl_hmcts.modules import TerminationNetwork
 from torchrl_hmcts.objectives import IntraOptionQLoss, OptionTerminationLoss
 from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
-from torchrl_hmcts.transforms import OptionTransform, SkillTransform, StallTransform
+from torchrl_hmcts.transforms import SkillTransform
 
-_STALL_TOLERANCE = 0.005  # tiles per base step, a twentieth of the top speed
 _EPISODE_STEPS = 200  # base steps in a maze before the next one
 
 
@@ -118,20 +112,6 @@ def collect_option_steps(
     return env.rollout(steps, worker, break_when_any_done=False)
 
 
-@dataclass
-class TerminationResult:
-    """The outcome of :func:`learn_termination`."""
-
-    network: TerminationNetwork
-    """Reads ``"view"`` and ``"skill"``."""
-    values: TensorDictModuleBase
-    """Reads ``"view"`` and ``"offset"`` (target minus position), writes ``"action_value"``."""
-    base_steps: int
-    """Base steps that were simulated for it."""
-    history: dict[str, list[float]] = field(default_factory=dict)
-    """Every 100 updates: losses and diagnostics, by name."""
-
-
 def learn_termination(
     worker: Callable[[TensorDictBase], TensorDictBase],
     num_options: int = 4,
@@ -140,7 +120,7 @@ def learn_termination(
     mazes: Tensor | None = None,
     data: TensorDictBase | None = None,
     progress: Callable[[int], Any] | None = None,
-) -> TerminationResult:
+) -> tuple[TerminationNetwork, dict[str, list[float]]]:
     """Learn when options should end, from random options and targets in hindsight.
 
     Values Q(s, o, target) are learned for options that end with the probability of the termination
@@ -160,7 +140,8 @@ def learn_termination(
         progress: called with 1 after every update, e.g. ``tqdm(...).update``.
 
     Returns:
-        Networks, history and the base steps it took.
+        The network, which reads ``"view"`` of a :class:`MazeView` and ``"skill"``; and losses and
+        diagnostics by name, every 100 updates.
 
     Reference:
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140; Harb et
@@ -172,8 +153,9 @@ def learn_termination(
         >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         >>> config = TerminationConfig(
         ...     base_steps=640, value_updates=2, termination_updates=2, copies=16)
-        >>> learn_termination(worker, 4, config).base_steps
-        640
+        >>> network, history = learn_termination(worker, 4, config)
+        >>> network.in_keys
+        ['view', 'skill']
     """
     config = TerminationConfig() if config is None else config
     mazes = maze_pool("train") if mazes is None else mazes
@@ -197,14 +179,23 @@ def learn_termination(
             in_keys=["view"],
             initial_probability=config.initial_probability,
         )
-        values = _make_values(view.num_features, num_options)
+        values = TensorDictModule(
+            MLP(
+                in_features=view.num_features + 2,
+                out_features=num_options,
+                num_cells=[128, 128],
+                activation_class=torch.nn.ReLU,
+            ),
+            in_keys=["view", "offset"],  # the offset: target minus position
+            out_keys=["action_value"],
+        )
     value_loss = IntraOptionQLoss(values, network, gamma=config.gamma)
     updater = SoftUpdate(value_loss, tau=config.tau)
     loss = OptionTerminationLoss(network, values, deliberation_cost=config.deliberation_cost)
     # The losses hold the parameters: those of the networks are the same tensors.
     value_optimizer = torch.optim.Adam(value_loss.parameters(), lr=config.value_lr, fused=True)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.termination_lr, fused=True)
-    result = TerminationResult(network, values, data.numel())
+    history: dict[str, list[float]] = {}
 
     def step(
         part: LossModule, adam: torch.optim.Optimizer, name: str, batch: TensorDictBase, update: int
@@ -217,7 +208,7 @@ def learn_termination(
             progress(1)
         if update % 100 == 99:
             for key, value in out.detach().items():
-                result.history.setdefault(key, []).append(float(value))
+                history.setdefault(key, []).append(float(value))
 
     for _ in range(config.rounds):
         for update in range(config.value_updates):
@@ -231,63 +222,4 @@ def learn_termination(
             batch = batch[best == batch["skill"]]  # on-policy: options that would be chosen
             if len(batch):
                 step(loss, optimizer, "loss_termination", batch, update)
-    return result
-
-
-def make_terminating_env(
-    worker: Any,
-    mazes: Tensor | None = None,
-    *,
-    network: TerminationNetwork | None = None,
-    every: int = 5,
-    stall_steps: int | None = 3,
-    num_options: int = 4,
-    max_steps: int = 100,
-    gamma: float = 0.99,
-    seed: int | None = None,
-) -> TransformedEnv:
-    """Build a Waterworld whose options end by themselves, for planning and for acting.
-
-    Args:
-        worker: reads ``"velocity"`` and ``"skill"``, writes ``"action"``.
-        mazes: bool ``[M, H, W]``. Default: the training split.
-        network: ends an option where it says so, see :func:`learn_termination`. Default: none.
-        every: base steps between two questions to the network.
-        stall_steps: base steps in a row without movement that end an option; None for any number.
-            From rest the disc does not move in its first base step, so at least 2.
-        num_options: number of options.
-        max_steps: base steps of an option at most. Default: the dissertation's 100.
-        gamma: discount per base step.
-        seed: of the env.
-
-    Returns:
-        The macro environment, stateless and without batch size.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule
-        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> make_terminating_env(worker).rollout(2)["next", "duration"].shape
-        torch.Size([2, 1])
-    """
-    base = WaterworldMazeEnv(mazes, observation=False, seed=seed)
-    conditions: list[Callable[[TensorDictBase], Tensor]] = []
-    transforms: list[Any] = []
-    if stall_steps is not None:
-        transforms.append(StallTransform("position", _STALL_TOLERANCE))
-        conditions.append(StallTermination(stall_steps))
-    if network is not None:
-        seen = TensorDictSequential(MazeView(base.mazes), network)
-        conditions.append(LearnedTermination(seen, every=every))
-    termination = AnyTermination(*conditions) if conditions else None
-    transforms.append(OptionTransform(worker, num_options, max_steps, gamma, termination))
-    return TransformedEnv(base, Compose(*transforms))
-
-
-def _make_values(num_features: int, num_options: int) -> TensorDictModule:
-    network = MLP(
-        in_features=num_features + 2,
-        out_features=num_options,
-        num_cells=[128, 128],
-        activation_class=torch.nn.ReLU,
-    )
-    return TensorDictModule(network, in_keys=["view", "offset"], out_keys=["action_value"])
+    return network, history
