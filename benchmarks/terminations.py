@@ -35,8 +35,8 @@ from torchrl_hmcts.modules import (
 )
 from torchrl_hmcts.planners import SearchBudget
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
-from torchrl_hmcts.trainers.skills.hindsight import MazeView
 from torchrl_hmcts.trainers.skills.termination import (
+    MazeView,
     TerminationConfig,
     collect_option_steps,
     learn_termination,
