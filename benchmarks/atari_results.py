@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.figures.atari_results import (
+from torchrl_hmcts.trainers.figures.atari_scores import (
     RUNNING,
     TABLE_5_1,
     aggregate,
@@ -27,7 +27,7 @@ from torchrl_hmcts.trainers.figures.atari_results import (
     best_source,
     human_normalised,
 )
-from torchrl_hmcts.trainers.runs.folder import read_curves
+from torchrl_hmcts.trainers.saving.run_folder import read_curves
 
 UCT_SOURCE = "primitive actions, UCT"
 BEST = "the best of each game"

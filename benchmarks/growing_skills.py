@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 from mazes import greedy, make_option_env, make_starts, planner
+from skill_figures import search_coverage
 from table import markdown, read_arguments, write
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
@@ -38,7 +39,6 @@ from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers import DIAYNTrainer, GrowSkills, SearchCoverage
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
 from torchrl_hmcts.trainers.runs.config import DemoConfig
 from torchrl_hmcts.transforms import DisplacementTransform, SkillMaskTransform, SkillTransform
 

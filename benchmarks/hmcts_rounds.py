@@ -25,7 +25,7 @@ from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
-from torchrl_hmcts.trainers.figures.solving_curves import plot_solving_curves
+from torchrl_hmcts.trainers.figures.curves import Panel, plot_training
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 
 make_env = partial(WaterworldMazeEnv, observation=False)
@@ -124,8 +124,15 @@ def main() -> None:
             seeds.append(learn(args, seed, dataset))
             print(name, seed, seeds[-1]["final"]["solved"], flush=True)
     write(args, {"arguments": vars(args), "runs": runs})
-    plot_solving_curves(
+    steps = Panel(
+        "base_steps",
+        "base steps to solve a maze, mean",
+        log=True,
+        dotted=("executed_steps", "executed only"),
+    )
+    plot_training(
         {name: [run["test_curve"] for run in seeds] for name, seeds in runs.items()},
+        [steps, Panel("solved", "mazes solved", share=True)],
         args.out.with_suffix(".png"),
         title=f"Algorithm 3 in Waterworld: {args.test_rounds} held-out mazes, "
         + (f"{len(args.seeds)} seeds (mean, range)" if len(args.seeds) > 1 else "one seed"),

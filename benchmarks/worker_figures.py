@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from mazes import RADIUS, greedy, make_option_env, make_starts, solve
+from skill_figures import search_coverage, skill_figures
 from table import markdown, read_arguments, write
 
 from torchrl_hmcts.envs import maze_pool
@@ -22,7 +23,6 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import spread
 from torchrl_hmcts.trainers.experiments.demo import train_worker
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
 from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
 
 

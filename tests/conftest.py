@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import os
 import random
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # before anything imports matplotlib
-
-sys.path.insert(0, str(Path(__file__).parent))  # what several test files share
 
 import hypothesis
 import numpy as np

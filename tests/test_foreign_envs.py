@@ -103,7 +103,7 @@ def test_a_random_opponent_at_tic_tac_toe_hardly_ever_wins_and_no_move_is_illega
     assert won >= 15  # a random player who moves first wins 58 % of its games
 
 
-def test_a_winning_move_is_found_whatever_the_opponent_would_answer() -> None:
+def test_a_winning_move_is_found_for_every_answer_of_the_opponent() -> None:
     env = TicTacToeEnv(single_player=True)
     td = env.reset()
     # Ours are 1: two in the top row, the third square is free.

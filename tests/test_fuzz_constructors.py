@@ -242,7 +242,6 @@ GOOD: dict[str, Good] = {
             "num_options": 4,
             "max_steps": 5,
         },
-        DIAYNReward={"discriminator": lambda: discriminator(), "num_skills": 4},
         SkillReward={"objective": lambda: objectives.SkillDiscriminatorLoss(discriminator())},
         SkillMaskTransform={"prior": lambda: modules.GrowingSkillPrior(4)},
         SkillTransform={"num_skills": 4},

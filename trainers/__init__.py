@@ -62,11 +62,8 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.runs.config import DemoConfig
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
-    from torchrl_hmcts.trainers.saving.resume import (
-        GeneratorStates,
-        ResumableTrainer,
-        RunningEpisodes,
-    )
+    from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+    from torchrl_hmcts.trainers.saving.run_state import GeneratorStates, RunningEpisodes
     from torchrl_hmcts.trainers.skills.controllability import (
         Controllability,
         probe_controllability,
@@ -150,7 +147,7 @@ _MODULES = {
     "DistilledSource": "experiments.atari.learned_sources",
     "DurableRotation": "saving.checkpoints",
     "ExpertIterationTrainer": "expert_iteration",
-    "GeneratorStates": "saving.resume",
+    "GeneratorStates": "saving.run_state",
     "GoalEpisodes": "experiments.waterworld.goal_episodes",
     "FineTunedSource": "experiments.atari.trained_sources",
     "OptionGoals": "experiments.atari.trained_sources",
@@ -168,7 +165,7 @@ _MODULES = {
     "Options": "experiments.atari.options",
     "RepeatSource": "experiments.atari.sources",
     "ResumableTrainer": "saving.resume",
-    "RunningEpisodes": "saving.resume",
+    "RunningEpisodes": "saving.run_state",
     "ScriptedExpert": "experiments.waterworld.scripted_expert",
     "SearchCoverage": "skills.growing",
     "SharedRMSprop": "a3c.shared_optimizers",

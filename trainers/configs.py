@@ -68,7 +68,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
     },
     "torchrl_hmcts.transforms": {
         "transform": {
-            "diayn_reward": "DIAYNReward",
             "displacement": "DisplacementTransform",
             "option": "OptionTransform",
             "option_recorder": "OptionRecorder",

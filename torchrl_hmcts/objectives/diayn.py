@@ -58,10 +58,9 @@ class DIAYNLoss(_WithDiscriminator, DiscreteSkillSACLoss):
 
     It is a :class:`DiscreteSkillSACLoss` with a :class:`SkillDiscriminatorLoss`. The reward
     :math:`r` is the entry ``("next", "reward")``: put a
-    :class:`~torchrl_hmcts.transforms.SkillReward` with ``loss.objective`` (or a
-    :class:`~torchrl_hmcts.transforms.DIAYNReward`) on the replay buffer. It runs with
-    ``SoftUpdate``, ``Trainer`` and ``SACTrainer`` unchanged. No loss sends gradients into the
-    parameters of another.
+    :class:`~torchrl_hmcts.transforms.SkillReward` with ``loss.objective`` on the replay buffer. It
+    runs with ``SoftUpdate``, ``Trainer`` and ``SACTrainer`` unchanged. No loss sends gradients into
+    the parameters of another.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy pi(a | s, z), e.g. a

@@ -38,7 +38,6 @@ from torchrl_hmcts.trainers.experiments.atari.trials import RememberedTrials
 from torchrl_hmcts.trainers.experiments.atari.tuning import Tuned, tune_search
 from torchrl_hmcts.trainers.experiments.registry import ExperimentError
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
@@ -47,6 +46,7 @@ from torchrl_hmcts.trainers.saving.checkpoints import (
     read_state,
 )
 from torchrl_hmcts.trainers.saving.files import left_out, write_csv
+from torchrl_hmcts.trainers.saving.run_folder import versions
 
 TOY: dict[str, Any] = {
     "frames": 20_000,

@@ -1,4 +1,4 @@
-"""Chapter 5: scores in seven games, ours beside the source's and the baselines' of its Table A.1.
+"""Chapter 5: scores in seven games beside the dissertation's (Tables 5.1 and A.1).
 
 Runs of the experiment ``atari`` have in ``metrics.json`` the entries ``game``, ``protocol``
 (``"deterministic"`` or ``"sticky"``), ``seed``, ``score_max``, ``score_final`` and ``frames``, and
@@ -21,16 +21,16 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from torchrl_hmcts.trainers.figures.curve_panels import GROUP_COLORS
-from torchrl_hmcts.trainers.figures.dissertation import Sources, find_figure
+from torchrl_hmcts.trainers.figures.curves import legend_of_all, style
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
-from torchrl_hmcts.trainers.figures.page_parts import Html, Number, page, plain, table, text
-from torchrl_hmcts.trainers.figures.pictures import save_figure
-from torchrl_hmcts.trainers.runs.folder import RunCurve
+from torchrl_hmcts.trainers.figures.pages import Cell, Section, Table, plain, write_sections
+from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 from torchrl_hmcts.trainers.saving.files import write_text
+from torchrl_hmcts.trainers.saving.run_folder import RunCurve, RunFolder
 
+Row = Mapping[str, Any]
+"""Summary of a run."""
 _FEW = 30
 RUNNING = "score_of_the_running_episode"
 """The curve of the running score."""
@@ -91,9 +91,6 @@ TABLE_A_1 = {
 def best_baseline(game: str) -> tuple[str, float]:
     """Return the best algorithm of Table A.1 in a game, and its mean score.
 
-    Args:
-        game: e.g. ``"Breakout"``.
-
     Example:
         >>> best_baseline("Breakout")
         ('deepq', 131.46)
@@ -101,58 +98,35 @@ def best_baseline(game: str) -> tuple[str, float]:
     return max(((name, row[game]) for name, row in TABLE_A_1.items()), key=lambda pair: pair[1])
 
 
-def summaries(sources: Sources) -> list[dict[str, Any]]:
-    """Return the summaries of the runs given, else those of ``docs/results/atari``.
-
-    Args:
-        sources: of the figures.
-    """
-    runs = []
-    for run in sources.of("atari"):
-        if "game" in {**run.config, **run.metrics}:
-            runs.append({**run.config, **run.metrics, "curves": run.curves})
-    folder = sources.result("atari")
-    if runs or folder is None:
-        return runs
-    for file in sorted(folder.glob("*.json")):
-        rows = json.loads(file.read_text(encoding="utf-8"))
-        for row in rows if isinstance(rows, list) else []:
+def read_scores(runs: Sequence[RunFolder], results: Path | None) -> list[dict[str, Any]]:
+    """Return the summaries of the runs given, else those of the measured results."""
+    rows = [
+        {**run.config, **run.metrics, "curves": run.curves}
+        for run in runs
+        if "game" in {**run.config, **run.metrics}
+    ]
+    for file in sorted(results.glob("*.json")) if results is not None and not rows else []:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        for row in content if isinstance(content, list) else []:
             curves = {
                 name: RunCurve(name, curve["step"], curve["value"], "steps")
                 for name, curve in row.get("curves", {}).items()
             }
-            runs.append({**row, "curves": curves})
-    return runs
+            rows.append({**row, "curves": curves})
+    return rows
 
 
-def by_protocol(rows: Sequence[Mapping[str, Any]], game: str) -> dict[str, list[Mapping[str, Any]]]:
+def by_protocol(rows: Sequence[Row], game: str) -> dict[str, list[Row]]:
     """Return the summaries of a game, by protocol."""
-    groups: dict[str, list[Mapping[str, Any]]] = {}
+    groups: dict[str, list[Row]] = {}
     for row in rows:
         if row.get("game") == game:
             groups.setdefault(str(row.get("protocol", "deterministic")), []).append(row)
     return groups
 
 
-def _by_source(
-    groups: Mapping[str, list[Mapping[str, Any]]],
-) -> dict[str, list[Mapping[str, Any]]]:
-    """Split the runs of a protocol by where their options come from, if from several sources."""
-    split: dict[str, list[Mapping[str, Any]]] = {}
-    for protocol, rows in groups.items():
-        found = sorted({str(row.get("source", "")) for row in rows})
-        for source in found:
-            name = protocol if len(found) == 1 else f"{protocol}, options: {source}"
-            split[name] = [row for row in rows if str(row.get("source", "")) == source]
-    return split
-
-
-def human_normalised(row: Mapping[str, Any], key: str) -> float:
+def human_normalised(row: Row, key: str) -> float:
     """Return a run's score in units of what a human scores more than random play.
-
-    Args:
-        row: summary of a run.
-        key: ``"score_max"`` or ``"score_final"``.
 
     Reference:
         Mnih et al., "Human-level control through deep reinforcement learning", 2015.
@@ -168,11 +142,8 @@ def human_normalised(row: Mapping[str, Any], key: str) -> float:
 def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
     """Return the interquartile mean over games and seeds with its stratified 95 % interval.
 
-    Each game counts as much as another, however many seeds it has.
-
-    Args:
-        scores: human-normalised, of the seeds of each game.
-        draws: resamples of the seeds within each game, from a fixed seed.
+    Each game counts as much as another, however many seeds it has: ``scores`` are human-normalised,
+    of the seeds of each game.
 
     Reference:
         Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
@@ -197,16 +168,12 @@ def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[fl
     return middle, float(low), float(high)
 
 
-def best_source(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def best_source(rows: Sequence[Row]) -> list[Row]:
     """Return the runs of the source of options that scored highest among the runs of a game.
-
-    Args:
-        rows: summaries of one game and protocol.
 
     Example:
         >>> rows = [{"source": "goals", "score_max": 3.0}, {"source": "repeat", "score_max": 7.0}]
-        >>> best_source([*rows, {"source": "repeat", "score_max": 1.0}]) == [rows[1], {
-        ...     "source": "repeat", "score_max": 1.0}]
+        >>> best_source(rows) == rows[1:]
         True
     """
     if not rows:
@@ -220,15 +187,10 @@ def over_seeds(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves that begin and end at different steps together.
 
-    A seed counts from its first value on, since looking for options takes some longer than others,
-    and keeps its last value to the end.
-
-    Args:
-        curves: one per seed, S of them.
-        from_start: count steps from the first of each curve, and a seed only as long as it goes.
-
-    Returns:
-        Steps ``[G]`` and values ``[S, G]``, NaN where a seed does not count.
+    Returns steps ``[G]`` and values ``[S, G]``, NaN where a seed does not count. A seed counts from
+    its first value on, since looking for options takes some longer than others, and keeps its last
+    value to the end; with ``from_start``, steps count from the first of each curve, and a seed only
+    as long as it goes.
 
     Example:
         >>> one = RunCurve("x", [0, 10, 20], [0, 1, 2], "steps")
@@ -248,71 +210,41 @@ def over_seeds(
     return steps, np.stack(values)
 
 
-def draw_game(sources: Sources, path: Path, name: str) -> str:
+def draw_game(rows: Sequence[Row], path: Path, game: str) -> str:
     """Draw the scores in a game against emulated steps: mean, least and largest over the seeds.
 
-    Args:
-        sources: of the figures.
-        path: PNG to write.
-        name: of the figure, which says the game.
-
-    Returns:
-        The caption.
-
-    Raises:
-        MissingData: if there is no run with curves.
+    Returns the caption; it is empty, and nothing is drawn, without a run that has curves.
 
     Reference:
         Dissertation, figures 5.1 to 5.7.
     """
-    figure = find_figure(name)
-    game = figure.argument
-    groups = {
-        protocol: [row for row in rows if row.get("curves")]
-        for protocol, rows in by_protocol(summaries(sources), game).items()
-    }
-    groups = _by_source({protocol: rows for protocol, rows in groups.items() if rows})
+    groups: dict[str, list[Row]] = {}
+    for protocol, members in by_protocol([r for r in rows if r.get("curves")], game).items():
+        sources = sorted({str(row.get("source", "")) for row in members})
+        for source in sources:
+            name = protocol if len(sources) == 1 else f"{protocol}, options: {source}"
+            groups[name] = [row for row in members if str(row.get("source", "")) == source]
     if not groups:
-        raise figure.how_to_get_data(f"there is no run of {game} with its curves.")
+        return ""
+    running = any(RUNNING in row["curves"] for members in groups.values() for row in members)
     shown = Figure(figsize=(10.0, 4.6), layout="constrained")
-    panels = shown.subplots(1, 2)
-    colors = dict(zip(groups, itertools.cycle(GROUP_COLORS), strict=False))
-    running = any(RUNNING in row["curves"] for rows in groups.values() for row in rows)
-    all_steps = "emulated steps, those in which options were looked for included"
-    titles = {
-        RUNNING if running else "score": "score of the episode being played"
-        if running
-        else "score of an episode",
-        "score_max": "highest score so far",
-    }
-    for axes, (entry, title) in zip(panels, titles.items(), strict=True):
-        for protocol, color in colors.items():
-            curves = [row["curves"][entry] for row in groups[protocol] if entry in row["curves"]]
+    left, right = shown.subplots(1, 2)
+    for axes, entry in ((left, RUNNING if running else "score"), (right, "score_max")):
+        for (protocol, members), color in zip(groups.items(), itertools.cycle(COLORS)):
+            curves = [row["curves"][entry] for row in members if entry in row["curves"]]
             if curves:
                 _draw_protocol(axes, entry, protocol, curves, color)
-        axes.set_title(title, fontsize=10, loc="left")
-        axes.grid(alpha=0.25)
         axes.set_xlim(left=0)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.spines[["top", "right"]].set_visible(False)
-    source, (algorithm, baseline) = TABLE_5_1[game], best_baseline(game)
-    panels[1].axhline(
-        source.score, color="#111827", linestyle="--", linewidth=1.4, label="the source's highest"
-    )
-    panels[0].axhline(
-        baseline, color="#71717a", linestyle=":", linewidth=1.4, label=f"{algorithm} (Table A.1)"
-    )
-    handles = {
-        label: handle
-        for axes in panels
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    shown.legend(
-        handles.values(), handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9
-    )
-    panels[0].set_xlabel("emulated steps since the options were found" if running else all_steps)
-    panels[1].set_xlabel(all_steps)
+    all_steps = "emulated steps, those in which options were looked for included"
+    style(left, f"score of {'the episode being played' if running else 'an episode'}", short=True)
+    left.set_xlabel("emulated steps since the options were found" if running else all_steps)
+    algorithm, baseline = best_baseline(game)
+    left.axhline(baseline, color="#71717a", linestyle=":", label=f"{algorithm} (Table A.1)")
+    style(right, "highest score so far", short=True)
+    right.set_xlabel(all_steps)
+    highest = TABLE_5_1[game].score
+    right.axhline(highest, color="#111827", linestyle="--", label="the dissertation's highest")
+    legend_of_all(shown, ncols=3)
     shown.suptitle(game, fontsize=11, x=0.01, ha="left")
     save_figure(shown, path)
     return (
@@ -341,142 +273,102 @@ def _draw_protocol(
     )
 
 
-def write_table(sources: Sources, path: Path, name: str) -> str:
-    """Write Table 5.1 with our scores beside the source's, as a page and as Markdown beside it.
-
-    Args:
-        sources: of the figures.
-        path: HTML to write.
-        name: of the table.
-
-    Returns:
-        What to say about it.
-
-    Raises:
-        MissingData: if there is no run.
+def write_table(rows: Sequence[Row], path: Path) -> str:
+    """Write Table 5.1 with our scores beside it, as a page and as Markdown beside that.
 
     Reference:
         Dissertation, tables 5.1 and A.1.
     """
-    rows = summaries(sources)
-    if not rows:
-        raise find_figure(name).how_to_get_data("there is no run of atari.")
     protocols = sorted({str(row.get("protocol", "deterministic")) for row in rows})
-    head = ["game", "source: highest", "source: skills, steps", "best of Table A.1"]
+    ours = {
+        (game, protocol): best_source(by_protocol(rows, game).get(protocol, []))
+        for protocol in protocols
+        for game in TABLE_5_1
+    }
+    head = ["game", "dissertation: highest", "its skills, steps", "best of Table A.1"]
     for protocol in protocols:
         head += [f"ours, {protocol}: highest", f"ours, {protocol}: at the end", "seeds"]
     cells = []
     for game, source in TABLE_5_1.items():
         algorithm, baseline = best_baseline(game)
-        line: list[Any] = [
-            game,
-            source.score,
-            f"{source.num_skills}, {source.option_steps}",
-            Number(f"{text(baseline)} <small>{text(algorithm)}</small>"),
-        ]
-        groups = by_protocol(rows, game)
+        skills = f"{source.num_skills}, {source.option_steps}"
+        line: list[Any] = [game, source.score, skills, Cell(baseline, beside=algorithm)]
         for protocol in protocols:
-            group = best_source(groups.get(protocol, []))
-            highest = [float(row["score_max"]) for row in group if "score_max" in row]
-            line.append(max(highest) if highest else "-")
-            line.append(_interval([float(r["score_final"]) for r in group if "score_final" in r]))
-            line.append(len(group))
+            runs = ours[game, protocol]
+            line.append(max((float(r["score_max"]) for r in runs if "score_max" in r), default="-"))
+            line.append(_interval([float(r["score_final"]) for r in runs if "score_final" in r]))
+            line.append(len(runs))
         cells.append(line)
-    ours = {
-        protocol: [best_source(by_protocol(rows, game).get(protocol, [])) for game in TABLE_5_1]
-        for protocol in protocols
-    }
-    how = [
-        [game, protocol, *_how(group)]
-        for protocol in protocols
-        for game, group in zip(TABLE_5_1, ours[protocol], strict=True)
-        if group
-    ]
     means = [
-        [protocol, text(key.replace("score_", "")), *_aggregated(ours[protocol], key)]
+        [protocol, key.replace("score_", ""), *_aggregated(ours, protocol, key)]
         for protocol in protocols
         for key in ("score_max", "score_final")
     ]
-    baselines = [
-        [algorithm, *(row[game] for game in TABLE_5_1)] for algorithm, row in TABLE_A_1.items()
-    ]
-    note = (
-        "The source gives the highest score of training, with the best of a grid of skills and "
-        "steps. Ours are of the source of options that scored highest in a game; scores at the end "
-        "are means over its seeds with 95 % bootstrap intervals."
-    )
-    write_text(
-        path,
-        page(
-            "Table 5.1",
-            Html(f'<p class="lead">{text(note)}</p>'),
-            table(cells, head),
-            Html("<h2>What they took</h2>"),
-            table(how, _HOW),
-            Html("<h2>Human-normalised scores of all games</h2>"),
-            table(means, ["protocol", "score", "interquartile mean", "95 % interval", "games"]),
-            Html("<h2>Table A.1: means of OpenAI Baselines, as the source gives them</h2>"),
-            table(baselines, ["", *TABLE_5_1]),
+    took = [[*names, *what_it_took(runs)] for names, runs in ours.items() if runs]
+    baselines = [[name, *(row[game] for game in TABLE_5_1)] for name, row in TABLE_A_1.items()]
+    table = Table(cells, head)
+    words = ["protocol", "score", "interquartile mean", "95 % interval", "games"]
+    sections = [
+        Section(words=[_NOTE], tables=[table]),
+        Section("What they took", tables=[Table(took, _TOOK)]),
+        Section("Human-normalised scores of all games", tables=[Table(means, words)]),
+        Section(
+            "Table A.1: means of OpenAI Baselines, as the dissertation gives them",
+            tables=[Table(baselines, ["", *TABLE_5_1])],
         ),
-    )
-    markdown = [" | ".join(head), " | ".join("---" for _ in head)]
-    markdown += [" | ".join(_as_plain(cell) for cell in line) for line in cells]
-    text_file = path.with_suffix(".md")
-    write_text(text_file, "\n".join(f"| {line} |" for line in markdown) + "\n")
-    return f"Table 5.1 with {len(rows)} run(s) of ours; as Markdown: {text_file.name}."
+    ]
+    write_sections(path, "Table 5.1", sections)
+    text = path.with_suffix(".md")
+    lines = [[f"{plain(cell.value)} {cell.beside}".strip() for cell in row] for row in table.rows]
+    rule = ["---"] * len(head)
+    write_text(text, "".join(f"| {' | '.join(line)} |\n" for line in [head, rule, *lines]))
+    return f"Table 5.1 with {len(rows)} run(s) of ours; as Markdown: {text.name}."
 
 
-_HOW = (
+_NOTE = (
+    "The dissertation gives the highest score of training, with the best of a grid of skills and "
+    "steps. Ours are of the source of options that scored highest in a game; scores at the end are "
+    "means over its seeds with 95 % bootstrap intervals."
+)
+_TOOK = (
     "game", "protocol", "options from", "options, steps", "frames, all kinds",
     "frames per decision", "seconds",
 )  # fmt: skip
 
 
-def _how(group: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """What the runs of a game took: means over the seeds."""
-    first = group[0]
+def what_it_took(runs: Sequence[Row]) -> list[Any]:
+    """Return what the runs of a game took, means over the seeds, in the order of the table."""
+    first = runs[0]
 
     def mean(key: str) -> Any:
-        values = [float(row[key]) for row in group if row.get(key) is not None]
+        values = [float(row[key]) for row in runs if row.get(key) is not None]
         return round(sum(values) / len(values)) if values else "-"
 
     per_decision = mean("frames_per_decision")
     if per_decision == "-" and first.get("episodes"):  # a run of before it was written
-        decisions = sum(int(e["decisions"]) for row in group for e in row["episodes"])
+        decisions = sum(int(e["decisions"]) for row in runs for e in row["episodes"])
         spent = ("frames_finding_options", "frames_tuning")
-        frames = sum(row["frames"] - sum(row.get(key, 0) for key in spent) for row in group)
+        frames = sum(row["frames"] - sum(row.get(key, 0) for key in spent) for row in runs)
         per_decision = round(frames / max(1, decisions))
     found = f"{len(first.get('options', []))}, {first.get('option_steps', '-')}"
     return [first.get("source", "-"), found, mean("frames"), per_decision, mean("seconds")]
 
 
-def _aggregated(groups: Sequence[Sequence[Mapping[str, Any]]], key: str) -> list[Any]:
+def _aggregated(ours: Mapping[tuple[str, str], list[Row]], protocol: str, key: str) -> list[Any]:
     """The interquartile mean over all games with its interval, if every game has two seeds."""
-    scores = [[human_normalised(row, key) for row in group if key in row] for group in groups]
+    groups = [runs for (_, name), runs in ours.items() if name == protocol]
+    scores = [[human_normalised(row, key) for row in runs if key in row] for runs in groups]
     scores = [seeds for seeds in scores if seeds]
     if not scores:
         return ["-", "-", 0]
     middle, low, high = aggregate(scores)
     several = min(map(len, scores)) > 1  # one run of a game says nothing about others of it
-    return [
-        f"{middle:.2f}",
-        f"{low:.2f} to {high:.2f}" if several else "a game has one seed",
-        len(scores),
-    ]
+    interval = f"{low:.2f} to {high:.2f}" if several else "a game has one seed"
+    return [f"{middle:.2f}", interval, len(scores)]
 
 
-def _interval(values: list[float]) -> Html | str:
+def _interval(values: list[float]) -> Cell:
     if not values:
-        return "-"
-    mean = bootstrap(values)
-    shown = text(plain(mean.middle))
-    if mean.count > 1:
-        shown += f" <small>{text(mean.low)} to {text(mean.high)}</small>"
-    return Number(shown)
-
-
-def _as_plain(cell: Any) -> str:
-    words = plain(cell)
-    for tag in ("<small>", "</small>"):
-        words = words.replace(tag, "")
-    return words
+        return Cell("-")
+    mean, low, high = bootstrap(values)
+    return Cell(mean, beside=f"{plain(low)} to {plain(high)}" if len(values) > 1 else "")

@@ -16,15 +16,19 @@ from __future__ import annotations
 
 import csv
 import math
+import os
+import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
 from pathlib import Path, PurePath
 from typing import Any
 
-from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, Experiment
+from torchrl_hmcts import __version__
 from torchrl_hmcts.trainers.saving.files import left_out, read_json, write_json
 from torchrl_hmcts.trainers.saving.locking import folder_locked, is_locked
 
+_PACKAGES = ("torch", "torchrl", "tensordict", "numpy")
 _NAME_COLUMNS = ("name", "curve")
 _STEP_LABELS = {
     "frames": "base steps",
@@ -61,6 +65,7 @@ class RunFolder:
         pictures: captions by file; only files that are there.
         curves: by name.
         damage: a sentence for each file that cannot be read; its content is empty.
+        keys: default and meaning of each key of its experiment, where these are known.
 
     Example:
         >>> RunFolder(Path("runs/one"), {"config": {"seed": 3}}).seed
@@ -75,6 +80,7 @@ class RunFolder:
     pictures: dict[str, str] = field(default_factory=dict)
     curves: dict[str, RunCurve] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
+    keys: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -132,7 +138,7 @@ def read_run(path: str | Path) -> RunFolder:
         )
     if not record:  # of a run that was not started by the command line
         config = metrics.get("config", {})
-        record = {"experiment": _guess(config), "config": config}
+        record = {"config": config}
         record["versions"] = metrics.get("versions", {})
     page = _json(path / "page.json", damage, pictures=dict, title=str)
     captions = page.get("pictures")
@@ -160,9 +166,6 @@ def read_run(path: str | Path) -> RunFolder:
 def is_run(path: str | Path) -> bool:
     """Return whether a folder is that of a run or of a sweep.
 
-    Args:
-        path: folder; need not exist.
-
     Example:
         >>> is_run("nowhere")
         False
@@ -171,11 +174,7 @@ def is_run(path: str | Path) -> bool:
 
 
 def read_curves(path: Path) -> dict[str, RunCurve]:
-    """Return the curves in a run's folder, those of the log while there is no ``curves.csv``.
-
-    Args:
-        path: the folder.
-    """
+    """Return the curves in a run's folder, those of the log while there is no ``curves.csv``."""
     points: dict[str, list[tuple[float, float]]] = {}
     label = "steps"
     if (path / "curves.csv").is_file():
@@ -204,47 +203,10 @@ def read_curves(path: Path) -> dict[str, RunCurve]:
     return curves
 
 
-def load_config(run: RunFolder) -> tuple[Experiment, Any]:
-    """Return the experiment of a run and its configuration, with ``out`` at the folder.
-
-    Args:
-        run: of :func:`read_run`.
-
-    Raises:
-        ValueError: if ``run.json`` is damaged, or the experiment is unknown or no longer has one of
-            the keys.
-    """
-    for sentence in run.damage:
-        if "run.json" in sentence:
-            raise ValueError(sentence)
-    if run.experiment not in ALL_EXPERIMENTS:
-        raise ValueError(
-            f"{run.path} does not say which experiment it is of (run.json). Experiments: "
-            f"{', '.join(ALL_EXPERIMENTS)}."
-        )
-    experiment = ALL_EXPERIMENTS[run.experiment]
-    known = {field.name for field in fields(experiment.config_class)}
-    unknown = sorted(set(run.config) - known)
-    if unknown:
-        raise ValueError(
-            f"{run.path} was made with keys that experiment={experiment.name} no longer has: "
-            f"{', '.join(unknown)}. Use the version that made it: {run.record.get('versions')}."
-        )
-    config = experiment.config_class(**{**run.config, "out": str(run.path)})
-    return experiment, config
-
-
 def start_record(
     experiment: str, config: Any, command: Sequence[str], facts: Mapping[str, Any]
 ) -> None:
-    """Write ``run.json`` into the folder of a run that begins, or is resumed.
-
-    Args:
-        experiment: its name.
-        config: with ``out``; written without the folders above it.
-        command: words of the command line.
-        facts: further entries, e.g. versions and machine.
-    """
+    """Write ``run.json`` into the folder of a run that begins or is resumed, without its path."""
     path = Path(config.out)
     path.mkdir(parents=True, exist_ok=True)
     resumed = getattr(config, "resume", False)
@@ -265,12 +227,7 @@ def start_record(
 
 
 def end_record(path: str | Path, status: str) -> None:
-    """Note in ``run.json`` how a run ended; one that has finished stays so.
-
-    Args:
-        path: folder of the run.
-        status: ``"finished"``, ``"stopped"``, ``"failed"`` or ``"given up"``.
-    """
+    """Note in ``run.json`` how a run ended: finished (it stays so), stopped, failed or given up."""
     file = Path(path) / "run.json"
     record = _json(file, [])
     if record and record.get("status") != "finished":
@@ -279,15 +236,7 @@ def end_record(path: str | Path, status: str) -> None:
 
 
 def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
-    """Add an evaluation to ``evaluation.json``; one with the same settings is replaced.
-
-    Args:
-        path: folder of the run.
-        evaluation: with the entry ``"changes"``, what differs from the run's config.
-
-    Returns:
-        The file.
-    """
+    """Add an evaluation to ``evaluation.json``; one with the same settings is replaced."""
     file = Path(path) / "evaluation.json"
     changes = evaluation.get("changes")
     with folder_locked(path, name=".evaluation.lock", wait=True):  # two evaluations at a time
@@ -295,6 +244,42 @@ def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
         others = [e for e in before if e.get("changes") != changes]
         write_json(file, {"evaluations": [*others, dict(evaluation)]})
     return file
+
+
+def flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return nested figures as one list, names joined by dots.
+
+    Example:
+        >>> flat({"seed": 1, "test": {"solved": 3}})
+        [('seed', 1), ('test.solved', 3)]
+    """
+    rows: list[tuple[str, Any]] = []
+    for name, value in metrics.items():
+        inside = isinstance(value, Mapping)
+        rows += flat(value, f"{prefix}{name}.") if inside else [(prefix + name, value)]
+    return rows
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a run's figures depend on, by package.
+
+    Example:
+        >>> sorted(versions())
+        ['numpy', 'python', 'tensordict', 'torch', 'torchrl', 'torchrl_hmcts']
+    """
+    found = {name: metadata.version(name) for name in _PACKAGES}
+    return {"torchrl_hmcts": __version__, **found, "python": platform.python_version()}
+
+
+def machine() -> dict[str, Any]:
+    """Return what a run's times depend on; nothing that names the machine or its folders.
+
+    Example:
+        >>> sorted(machine())
+        ['cpus', 'platform']
+    """
+    kind = f"{platform.system()} {platform.machine()}".strip()
+    return {"cpus": os.cpu_count(), "platform": kind}
 
 
 def shown_path(value: str) -> str:
@@ -317,16 +302,6 @@ def shown_word(word: str) -> str:
     """
     key, separator, value = word.partition("=")
     return f"{key}={shown_path(value)}" if separator else shown_path(word)
-
-
-def _guess(config: Mapping[str, Any]) -> str:
-    """The experiment whose keys are these."""
-    fitting = []
-    for experiment in ALL_EXPERIMENTS.values():
-        known = {field.name for field in fields(experiment.config_class)}
-        if config and set(config) <= known:
-            fitting.append((len(known), experiment.name))
-    return min(fitting)[1] if fitting else ""
 
 
 def _json(path: Path, damage: list[str], **kinds: type) -> dict[str, Any]:

@@ -43,15 +43,6 @@ def skill_figures(
         For each number of steps, ``"accuracy"`` (of the discriminator at that step),
         ``"accuracy_until"`` (mean over all steps up to it), ``"displacement"`` (mean per skill,
         ``[Z][2]``, tiles) and ``"angle"`` (smallest between two of these, degrees).
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule
-        >>> from torchrl_hmcts.envs import maze_pool
-        >>> from torchrl_hmcts.modules import SkillDiscriminator
-        >>> push = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> figures = skill_figures(push, SkillDiscriminator(2, 4), maze_pool("test")[:20])
-        >>> figures[25]["angle"] > 60
-        True
     """
     num_mazes = len(mazes)
     env = WaterworldMazeEnv(mazes, observation=False, max_steps=10**9)
@@ -88,12 +79,7 @@ def skill_figures(
 
 
 def smallest_angle(vectors: Tensor) -> float:
-    """Return the smallest angle between two of the vectors ``[Z, 2]``, in degrees.
-
-    Example:
-        >>> smallest_angle(torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]))
-        90.0
-    """
+    """Return the smallest angle between two of the vectors ``[Z, 2]``, in degrees."""
     unit = torch.nn.functional.normalize(vectors.double(), dim=-1)
     cosine = (unit @ unit.T).fill_diagonal_(-1.0)
     return math.degrees(math.acos(float(cosine.max().clamp(-1.0, 1.0))))
@@ -111,17 +97,6 @@ def search_coverage(search: Search, env: WaterworldMazeEnv) -> Tensor:
 
     Returns:
         float ``[B]``, one per root.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-        >>> from tensordict.nn import TensorDictModule
-        >>> push = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> env = make_option_env(push, seed=0)
-        >>> budget = SearchBudget(expansions=60, until_plan=False)
-        >>> planner = MCTSPlanner(env, novelty=RadiusNovelty("position", 0.7), budget=budget)
-        >>> bool(search_coverage(planner.search(env.reset()), env.base_env)[0] > 0.5)
-        True
     """
     states = search.tree.states
     assert states is not None
