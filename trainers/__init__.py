@@ -12,12 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchrl_hmcts.trainers.a3c.learner_processes import LearnerError
-    from torchrl_hmcts.trainers.a3c.shared_optimizers import (
-        SharedAdam,
-        SharedRMSprop,
-        share_optimizer,
-    )
+    from torchrl_hmcts.trainers.a3c.shared_optimizers import SharedRMSprop
     from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
+    from torchrl_hmcts.trainers.collectors import CollectorError
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
     from torchrl_hmcts.trainers.experiments.atari.agent import (
         AtariAgent,
@@ -61,11 +58,9 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
     from torchrl_hmcts.trainers.expert_iteration import (
         ExpertIterationTrainer,
-        SearchCollector,
         make_guided_planner,
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-    from torchrl_hmcts.trainers.restarting_collector import CollectorError
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
     from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
@@ -75,16 +70,9 @@ if TYPE_CHECKING:
         probe_controllability,
     )
     from torchrl_hmcts.trainers.skills.coverage import StateCoverage
-    from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
-    from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
+    from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
     from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
-    from torchrl_hmcts.trainers.skills.termination import (
-        TerminationConfig,
-        TerminationResult,
-        collect_option_steps,
-        learn_termination,
-        make_terminating_env,
-    )
+    from torchrl_hmcts.trainers.skills.termination import TerminationConfig, learn_termination
 
 
 def _places() -> dict[str, str]:

@@ -28,6 +28,7 @@ from torchrl_hmcts.modules import (
 )
 from torchrl_hmcts.objectives import SkillObjective
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.trainers.collectors import make_ray_collector
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.kits import (
@@ -40,7 +41,6 @@ from torchrl_hmcts.trainers.experiments.kits import (
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, SkillsConfig
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.trainers.parts import build, merged
-from torchrl_hmcts.trainers.ray_collector import make_ray_collector
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
