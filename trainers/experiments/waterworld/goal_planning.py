@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv
 from torchrl_hmcts.planners import (
     GoalPlanner,
@@ -76,7 +76,6 @@ def make_tile_planner(env: WaterworldMazeEnv, **planner_kwargs: Any) -> GoalPlan
     return GoalPlanner(MCTSPlanner(macro_env, **settings), to_macro, in_keys=_IN_KEYS)
 
 
-@name_arguments
 class TilePlanner:
     r"""The manager of :func:`make_tile_planner` without tensordicts: a tenth of the time per plan.
 
@@ -109,7 +108,8 @@ class TilePlanner:
     in_keys = list(_IN_KEYS)
 
     def __init__(self, env: WaterworldMazeEnv, *, leaves_per_wave: int = 16) -> None:
-        self.leaves_per_wave = leaves_per_wave
+        leaves = whole_number("TilePlanner", "leaves_per_wave", leaves_per_wave, least=1)
+        self.leaves_per_wave = leaves
         self.width = env.width
         self.moves = tile_moves(env.mazes.cpu())  # [M, T, A]
         tiles = np.arange(env.height * env.width)
