@@ -18,13 +18,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from table import markdown, read_arguments
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.trainers.experiments.kits.lab import LabMazeKit, wrong_models
@@ -129,33 +129,28 @@ def compare(config: LabMazeConfig, args: argparse.Namespace, parts: Parts, name:
 
 def table(results: dict[str, Any]) -> str:
     """The figures in Markdown."""
-    lines = [
-        "| worker, seed, mazes | solved at the first trial | frames to the goal, mean | script "
-        "| ratio | simulated frames, mean | expansions, mean (max) | planning, CPU s a maze |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, x in results.items():
-        if " size " in name:
-            lines.append(
-                f"| {name} | {x['solved']} of {x['mazes']} | {x['frames']['mean']:,.0f} | "
-                f"{x['script_frames']['mean']:,.0f} | {x['frames_over_script']:.2f} | "
-                f"{x['simulated_frames']['mean']:,.0f} | "
-                f"{x['expansions']['mean']:,.0f} ({x['expansions_max']:,}) | "
-                f"{x['plan_cpu_seconds']['mean']:.2f} |"
-            )
-    lines += [
-        "",
-        "| worker, seed, real env | solved by planning again | by the first plan alone "
-        "| frames, mean | plans, mean |",
-        "|---|---|---|---|---|",
-    ]
-    for name, x in results.items():
-        if "wrong model" in name:
-            lines.append(
-                f"| {name} | {x['solved']} of {x['mazes']} | {x['solved_by_the_first_plan']} | "
-                f"{x['frames']['mean']:,.0f} | {x['num_plans']['mean']:.1f} |"
-            )
-    return "\n".join(lines)
+    solved = {
+        "worker, seed, mazes": lambda row: row[0],
+        "solved at the first trial": lambda row: f"{row[1]['solved']} of {row[1]['mazes']}",
+        "frames to the goal, mean": lambda row: f"{row[1]['frames']['mean']:,.0f}",
+        "script": lambda row: f"{row[1]['script_frames']['mean']:,.0f}",
+        "ratio": lambda row: f"{row[1]['frames_over_script']:.2f}",
+        "simulated frames, mean": lambda row: f"{row[1]['simulated_frames']['mean']:,.0f}",
+        "expansions, mean (max)": lambda row: (
+            f"{row[1]['expansions']['mean']:,.0f} ({row[1]['expansions_max']:,})"
+        ),
+        "planning, CPU s a maze": lambda row: f"{row[1]['plan_cpu_seconds']['mean']:.2f}",
+    }
+    wrong = {
+        "worker, seed, real env": lambda row: row[0],
+        "solved by planning again": lambda row: f"{row[1]['solved']} of {row[1]['mazes']}",
+        "by the first plan alone": lambda row: row[1]["solved_by_the_first_plan"],
+        "frames, mean": lambda row: f"{row[1]['frames']['mean']:,.0f}",
+        "plans, mean": lambda row: f"{row[1]['num_plans']['mean']:.1f}",
+    }
+    sizes = [row for row in results.items() if " size " in row[0]]
+    models = [row for row in results.items() if "wrong model" in row[0]]
+    return f"{markdown(sizes, solved)}\n\n{markdown(models, wrong)}"
 
 
 def _short(result: dict[str, Any]) -> str:
@@ -164,19 +159,17 @@ def _short(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--mazes", type=int, default=200, help="test mazes of up to 15 x 15")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[9, 15, 31])
-    parser.add_argument("--large-mazes", type=int, default=40, help="test mazes of larger sizes")
-    parser.add_argument("--wrong-models", type=int, default=4, help="of four, two signs each")
-    parser.add_argument("--out", type=Path, default=Path("labmaze.json"))
-    parser.add_argument("--work", type=Path, default=Path("runs/labmaze_benchmark"))
-    parser.add_argument("--quick", action="store_true", help="one seed, one size, 20 mazes")
-    args = parser.parse_args()
-    if args.quick:
-        args.seeds, args.sizes, args.mazes, args.wrong_models = args.seeds[:1], [9], 20, 2
-    torch.set_num_threads(1)
+    args = read_arguments(
+        __doc__,
+        {"seeds": [0], "sizes": [9], "mazes": 20, "wrong_models": 2},
+        seeds=[0, 1, 2],
+        mazes=(200, "test mazes of up to 15 x 15"),
+        sizes=[9, 15, 31],
+        large_mazes=(40, "test mazes of larger sizes"),
+        wrong_models=(4, "of four, two signs each"),
+        work="runs/labmaze_benchmark",
+    )
+    args.out, args.work = args.out or Path("labmaze.json"), Path(args.work)
     known = ("seeds", "out", "work")  # more seeds may join what is there
     parts = Parts(args.out, {k: v for k, v in vars(args).items() if k not in known})
     configs = [LabMazeConfig(seed=seed) for seed in args.seeds]
@@ -202,4 +195,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
