@@ -36,7 +36,7 @@ from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
-from torchrl_hmcts.trainers.saving.worker_file import load_networks
+from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 
 _GOAL_KEYS = (
     *("num_goals", "goal_met_threshold", "goal_divergence_threshold"),
@@ -99,7 +99,7 @@ def _run(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
     history = trainer.train()
     train_seconds = time.perf_counter() - begin
     logger.close()
-    run.save_worker(loss, trainer.frames)
+    save_worker(run.path, loss, trainer.frames)
     steps = {True: history["eval_frames"], False: history["frames"]}
     curves = {k: (steps[k.startswith("eval_")], values) for k, values in history.items()}
     run.write_curves(curves, "base_steps")

@@ -44,7 +44,7 @@ from torchrl_hmcts.trainers.parts import build, merged
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
-from torchrl_hmcts.trainers.saving.worker_file import load_networks
+from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 from torchrl_hmcts.trainers.skills.curves import Curves
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
@@ -85,7 +85,7 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
     )
     logger.close()
     if learned.loss is not None:
-        run.save_worker(learned.loss, learned.worker_step)
+        save_worker(run.path, learned.loss, learned.worker_step)
     train_seconds = time.perf_counter() - begin
     trial = solve(kit, learned.worker, say=print)
     metrics: dict[str, Any] = {

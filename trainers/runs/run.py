@@ -77,17 +77,6 @@ class Run:
         """The command that continues the run exactly."""
         return resume_command(self.config.out)
 
-    def save_worker(self, loss_module: Any, step: int) -> None:
-        """Write the networks of the worker that the page shows.
-
-        Args:
-            loss_module: holds them.
-            step: base steps of training that they have seen.
-        """
-        from torchrl_hmcts.trainers.saving.worker_file import save_worker
-
-        save_worker(self.path, loss_module, step)
-
     def write_curves(
         self, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], steps: str
     ) -> None:
