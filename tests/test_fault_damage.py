@@ -274,17 +274,14 @@ def test_a_damaged_file_is_refused_or_read_as_it_was_saved(
 
 
 def main() -> None:
-    count = int(sys.argv[1])
-    figures: dict[str, Any] = {}
+    count, figures = int(sys.argv[1]), {}
     torch.set_num_threads(1)
     for kind in KINDS:
         begin = time.process_time()
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
-            counts = damage(kind, Path(folder) / "run", count)
-        figures[kind.__name__] = {
-            **dict(sorted(counts.items())),
-            "cpu_seconds": round(time.process_time() - begin, 1),
-        }
+            counts = dict(sorted(damage(kind, Path(folder) / "run", count).items()))
+        seconds = round(time.process_time() - begin, 1)
+        figures[kind.__name__] = {**counts, "cpu_seconds": seconds}
     print(json.dumps({"cases_of_each_kind": count, "kinds": figures}))
 
 

@@ -46,7 +46,7 @@ from torchrl.trainers.algorithms.configs.objectives import LossConfig
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS
-from torchrl_hmcts.trainers.parts import named
+from torchrl_hmcts.trainers.parts import constructors, keywords_of, named
 from torchrl_hmcts.trainers.runs.config import unknown_key
 
 _TARGET = "torchrl_hmcts.trainers.parts.build"
@@ -56,7 +56,7 @@ _PLAIN = (bool, int, float, str)  # types that Hydra checks; any other may be a 
 # Classes by group. Where no name is given, it is that of the class in snake case, less the group.
 _PACKAGES: Mapping[str, Mapping[str, str]] = {
     "torchrl_hmcts.objectives": {
-        "loss": "A3CLoss ContinuousDIAYNLoss DIAYNLoss DiscreteSkillSACLoss ExpertIterationLoss "
+        "loss": "A3CLoss DIAYNLoss DiscreteSkillSACLoss ExpertIterationLoss "
         "IntraOptionQLoss OptionModelLoss OptionTerminationLoss SkillPriorLoss SkillSACLoss",
         "objective": "dads=SkillDynamicsLoss diayn=SkillDiscriminatorLoss lsd=LSDEncoderLoss "
         "metra=METRAEncoderLoss",
@@ -82,7 +82,7 @@ _PACKAGES: Mapping[str, Mapping[str, str]] = {
         "control": "goals=GoalPlanner hierarchical=HierarchicalPolicy",
     },
     "torchrl_hmcts.modules": {
-        "model": "GaussianSkillActor SkillActionCritic SkillActor SkillCritic SkillDiscriminator "
+        "model": "SkillActionCritic SkillActor SkillCritic SkillDiscriminator "
         "SkillDynamics SkillEncoder SkillPolicy TerminationNetwork",
         "skill_prior": "fixed=FixedSkillPrior growing=GrowingSkillPrior learned=LearnedSkillPrior",
         "termination": "learned=LearnedTermination stall=StallTermination",
@@ -163,7 +163,7 @@ def config_of(component: type, base: type = ComponentConfig) -> Any:
     hints = _hints(component)
     fields: list[Any] = [
         (name, hints.get(name, Any), _as_field(parameter.default))
-        for name, parameter in _keywords(component).items()
+        for name, parameter in keywords_of(component).items()
     ]
     fields += [("_component_", str, path), ("_target_", str, _TARGET)]
     made = dataclasses.make_dataclass(f"{component.__name__}Config", fields, bases=(base,))
@@ -206,25 +206,19 @@ def _public_path(component: type) -> str:
     return f"{component.__module__}.{component.__qualname__}"
 
 
-def _keywords(component: type) -> dict[str, inspect.Parameter]:
-    """The parameters of a constructor that have a name of their own."""
-    parameters = inspect.signature(component.__init__).parameters  # type: ignore[misc]
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return {n: p for n, p in parameters.items() if n != "self" and p.kind not in variable}
-
-
 def _hints(component: type) -> dict[str, Any]:
     """The annotations that Hydra can check: plain types and None; others are left to the class."""
-    try:
-        hints = typing.get_type_hints(component.__init__)  # type: ignore[misc]
-    except NameError:  # a name that only type checkers import
-        return {}
     checked = {}
-    for name, hint in hints.items():
-        parts = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-        plain = [part for part in parts if part is not types.NoneType]
-        if len(plain) == 1 and plain[0] in _PLAIN:
-            checked[name] = hint
+    for init in constructors(component):
+        try:
+            hints = typing.get_type_hints(init)
+        except NameError:  # a name that only type checkers import
+            continue
+        for name, hint in hints.items():
+            parts = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+            plain = [part for part in parts if part is not types.NoneType]
+            if len(plain) == 1 and plain[0] in _PLAIN:
+                checked.setdefault(name, hint)
     return checked
 
 
@@ -293,9 +287,9 @@ def compose_parts(
             raise ValueError(f"Unknown {group} {name!r}. Did you mean: {names}?")
         before, path = where[last] or {}, COMPONENTS[group][name]
         if before.get("_component_") != path:  # the same class keeps its keywords
-            needed = [n for n, p in _keywords(named(path)).items() if p.default is p.empty]
+            needed = [n for n, p in keywords_of(named(path)).items() if p.default is p.empty]
             where[last] = {n: before[n] for n in needed if n in before}
-            known += [f"{place}.{keyword}" for keyword in _keywords(named(path))]
+            known += [f"{place}.{keyword}" for keyword in keywords_of(named(path))]
             overrides.append(f"+{group}@{place}={name}")
     store = ConfigStore.instance()
     store.store(name="hmcts", node={"defaults": ["_self_"], **config})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ def build(_component_: str, **keywords: Any) -> Any:
         UCT(c=0.5)
     """
     component = named(_component_)
-    parameters = inspect.signature(component.__init__).parameters
+    parameters = keywords_of(component)
     if "critic_network" not in parameters and "qvalue_network" in parameters:
         critic = keywords.pop("critic_network", None)
         if critic is not None:
@@ -52,6 +52,44 @@ def named(path: str) -> Any:
     """
     module, _, name = path.rpartition(".")
     return getattr(importlib.import_module(module), name)
+
+
+def constructors(component: type) -> Iterator[Any]:
+    """Yield the constructor of a class, and where it takes ``**keywords`` those they are for.
+
+    Args:
+        component: a class.
+    """
+    for cls in component.__mro__:
+        init = vars(cls).get("__init__")
+        if init is None:
+            continue
+        if cls is not component and not cls.__module__.startswith("torchrl_hmcts"):
+            return
+        yield init
+        kinds = [parameter.kind for parameter in inspect.signature(init).parameters.values()]
+        if inspect.Parameter.VAR_KEYWORD not in kinds:
+            return
+
+
+def keywords_of(component: type) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a constructor that have a name of their own.
+
+    Args:
+        component: a class.
+
+    Example:
+        >>> from torchrl_hmcts.planners import UCT
+        >>> keywords_of(UCT)["c"].default
+        1.0
+    """
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    found: dict[str, inspect.Parameter] = {}
+    for init in constructors(component):
+        for name, parameter in inspect.signature(init).parameters.items():
+            if name != "self" and parameter.kind not in variable:
+                found.setdefault(name, parameter)
+    return found
 
 
 def merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
