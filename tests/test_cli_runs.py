@@ -35,17 +35,6 @@ def test_a_run_records_experiment_config_command_versions_and_machine(run: Path)
     assert str(run.parent) not in (run / "run.json").read_text()
 
 
-def test_a_demo_is_tested_again_in_other_mazes(tmp_path) -> None:
-    out = tmp_path / "demo"
-    assert main(["demo", "toy=true", f"out={out}", "log_level=warning"]) == 0
-    solved = json.loads((out / "metrics.json").read_text())["solved"]
-    assert main(["evaluate", f"run={out}"]) == 0
-    assert main(["evaluate", f"run={out}", "expansions=1", "seed=1"]) == 0
-    same, fewer = json.loads((out / "evaluation.json").read_text())["evaluations"]
-    assert same["results"]["test"]["solved"] == solved
-    assert fewer["results"]["test"]["expansions"]["mean"] <= 4.0  # leaves of one wave
-
-
 def test_values_are_logged_as_csv_while_it_trains(run: Path) -> None:
     with (run / "log" / "scalars" / "eval_solved_share.csv").open() as file:
         logged = [(int(step), float(value)) for step, value in csv.reader(file)]

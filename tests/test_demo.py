@@ -37,14 +37,9 @@ def test_the_demo_writes_its_metrics_and_pictures(demo):
     assert set(names) <= set(metrics)
     assert metrics["seed"] == 3
     assert metrics["mazes"] == 3
-    for name in ("index.html", "losses.png", "skills.png", "search.png", "episode.gif"):
-        assert (out / name).stat().st_size > 1000, name
-
-
-def test_the_page_shows_every_picture_of_the_run(demo):
-    out, _ = demo
     page = (out / "index.html").read_text()
     for name in ("losses.png", "skills.png", "search.png", "episode.gif"):
+        assert (out / name).stat().st_size > 1000, name
         assert f'src="{name}"' in page
 
 
@@ -53,11 +48,6 @@ def test_the_same_seed_gives_the_same_figures(demo, tmp_path):
     assert main(["demo", "seed=3", f"out={tmp_path}", "toy=true"]) == 0
     second = json.loads((tmp_path / "metrics.json").read_text())
     np.testing.assert_equal(without_times(second), without_times(first))
-
-
-def test_an_unknown_key_is_refused_with_the_nearest_ones(capsys):
-    assert main(["demo", "mazse=3"]) == 2
-    assert "Did you mean: mazes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
