@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, said, told
+from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
 from torchrl_hmcts.trainers.command_line.words import parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import load_config, recognise
 from torchrl_hmcts.trainers.runs.config import home
@@ -42,7 +42,7 @@ def evaluate(words: Sequence[str]) -> int:
         changed.check_inputs()
     if is_locked(run.path):
         print(f"{run.path} is still running: its newest checkpoint is tested.", file=sys.stderr)
-    with told("evaluate", ValueError), said(own.get("log_level", "info")):
+    with told("evaluate", ValueError), printing(own.get("log_level", "info")):
         results = function(changed)
     evaluation: dict[str, Any] = {
         "changes": changes,

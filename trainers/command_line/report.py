@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, Failure, said, told
+from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, Failure, printing, told
 from torchrl_hmcts.trainers.command_line.words import folders_of, split_words
 from torchrl_hmcts.trainers.experiments.registry import recognise
 from torchrl_hmcts.trainers.runs.config import home
@@ -20,7 +20,7 @@ def report(words: Sequence[str]) -> int:
         own, rest = split_words(words, _OWN)
         own |= {key: home(own[key]) for key in ("out", "results") if key in own}
         folders = folders_of(rest, _OWN)
-        with said(own.get("log_level", "info")):
+        with printing(own.get("log_level", "info")):
             (_figure if "figure" in own else _pages)(own, folders)
     return 0
 

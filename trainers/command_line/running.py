@@ -103,12 +103,12 @@ def run_experiment(
         experiment: what to run.
         config: its configuration.
         words: the whole command line, for the record.
-        log_level: how much is said.
+        log_level: how much is printed.
         fresh: no folder was named: take the first of ``out``, ``out_2``, ... that holds nothing.
     """
     resume: list[str] = []  # how to continue, once there is a run
     try:
-        with told(name, resume=resume), said(log_level), signals_handled():
+        with told(name, resume=resume), printing(log_level), signals_handled():
             _ = experiment.function
             with open_run(config, experiment=experiment.name, command=words, fresh=fresh) as run:
                 resume.append(run.resume_command)
@@ -134,8 +134,8 @@ def _saved(out: str) -> str:
 
 
 @contextlib.contextmanager
-def said(log_level: str) -> Iterator[None]:
-    """Say as much as the level allows while in the context; warnings and errors always come.
+def printing(log_level: str) -> Iterator[None]:
+    """Print as much as the level allows in the context; warnings and errors always come.
 
     Args:
         log_level: one of ``LOG_LEVELS``.

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, said, told
+from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
 from torchrl_hmcts.trainers.command_line.words import parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, find_experiment
 from torchrl_hmcts.trainers.runs.config import read_value
@@ -61,7 +61,7 @@ def sweep(words: Sequence[str]) -> int:
         with (
             told("sweep", ValueError),
             signals_handled(),
-            said(level),
+            printing(level),
             contextlib.nullcontext() if level == "debug" else quiet,
         ):
             study = plan.start(trials)

@@ -14,7 +14,7 @@ from torchrl_hmcts.trainers.runs.config import home, key_kinds, parse_overrides,
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 LOG_LEVEL_HELP = (
-    "log_level=debug|info|warning|error: how much is said (default info; with warning\n"
+    "log_level=debug|info|warning|error: how much is printed (default info; with warning\n"
     "  and error no progress is shown either)."
 )
 
@@ -133,7 +133,7 @@ def folders_of(words: Sequence[str], own: Sequence[str]) -> list[str]:
 
 
 def set_log_level(level: str) -> bool:
-    """Set how much this process says; return whether progress is shown.
+    """Set how much this process prints; return whether progress is shown.
 
     Args:
         level: one of ``LOG_LEVELS``.

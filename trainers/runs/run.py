@@ -1,4 +1,4 @@
-"""A run and its folder: claimed before anything is written, locked, recorded, never overwritten.
+"""A run and its folder: taken before anything is written, locked, recorded, never overwritten.
 
 Every command that writes a run opens it here: :func:`open_run`.
 """
@@ -126,7 +126,7 @@ _current: ContextVar[Run | None] = ContextVar("run", default=None)
 def open_run(
     config: Any, *, experiment: str = "", command: Sequence[str] = (), fresh: bool = False
 ) -> Iterator[Run]:
-    """Claim a folder for a run, and note in its ``run.json`` how what is done there ends.
+    """Take a folder for a run, and note in its ``run.json`` how what is done there ends.
 
     Whatever can be refused is refused before anything is written: packages and inputs that are
     missing, a folder in use, one that holds a run (unless ``config`` says ``resume`` or
@@ -153,7 +153,7 @@ def open_run(
     config.check_inputs()
     name = experiment or config.EXPERIMENT
     with contextlib.ExitStack() as stack:
-        config = _claim(stack, config, name, fresh)
+        config = _take(stack, config, name, fresh)
         run = Run(config, name, config.resume and _has_checkpoint(config.out))
         if config.overwrite:
             _clear(run.path)
@@ -182,7 +182,7 @@ def _recorded(path: Path) -> Iterator[None]:
     end_record(path, "finished")
 
 
-def _claim(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool) -> Any:
+def _take(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool) -> Any:
     """Lock the folder of a configuration, or with ``fresh`` the first free one; return it."""
     for out in _names(config.out) if fresh else [config.out]:
         chosen = dataclasses.replace(config, out=out) if fresh else config

@@ -120,7 +120,7 @@ class LabMazeKit(Kit):
     """DeepMind Lab's mazes: skills walk, an option ends at a wall, a maze is its goal reached.
 
     The worker sees how it moves and where east is, the discriminator the displacement in cells:
-    skills are directions on the map, whatever way the player faces.
+    skills are directions on the map, whichever way the player faces.
 
     Example:
         >>> kit = LabMazeKit(LabMazeConfig(mazes=3))

@@ -37,7 +37,7 @@ def make_tile_planner(env: WaterworldMazeEnv, **planner_kwargs: Any) -> GoalPlan
 
     A tile is searched once, and again when a shorter way to it is found (:class:`RadiusNovelty`
     with ``shorter_paths``), until nothing is left to find: the plan is then a shortest path in
-    tiles, whatever the order of the search.
+    tiles, in any order of the search.
 
     Args:
         env: Waterworld, or another env with such a state and ``mazes``.
