@@ -119,7 +119,7 @@ def demo(folder: Path) -> Kind:
 
 def _atari_run(folder: Path) -> Any:
     from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
-    from torchrl_hmcts.trainers.experiments.atari.run import AtariRun
+    from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun
 
     pytest.importorskip("ale_py")
     config = AtariConfig(
@@ -155,7 +155,7 @@ def checkpoint_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_run(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.run import load_run
+    from torchrl_hmcts.trainers.experiments.atari.episodes import load_run
 
     rotation = DurableRotation(folder / "checkpoints")
     state = _atari_run(folder)
@@ -164,7 +164,7 @@ def atari_run(folder: Path) -> Kind:
 
 
 def atari_run_of_older_versions(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.run import load_run
+    from torchrl_hmcts.trainers.experiments.atari.episodes import load_run
 
     path = folder / "checkpoints" / "run.pt"
     path.parent.mkdir(parents=True)
@@ -173,11 +173,11 @@ def atari_run_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_trials(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.trials import RememberedTrials, Trial
+    from torchrl_hmcts.trainers.experiments.atari.memory import Trial, TrialMemory
 
     folder.mkdir(parents=True)
     path = folder / "trials.json"
-    make = partial(RememberedTrials, None, path, {"game": "Pong", "seed": 0})
+    make = partial(TrialMemory, path, {"game": "Pong", "seed": 0})
     for i in range(20):
         make().remember(f"key {i}", Trial(float(i), 300 + i, 7_000))
 

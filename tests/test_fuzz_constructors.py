@@ -241,7 +241,7 @@ GOOD: dict[str, Good] = {
         SearchGuide={"num_options": 3, "hidden": (4,), "buffer_size": 8},
         OptionGoals={"goals": [0, 2]},
         AtariSearch={},
-        GoalSearch={},
+        RuleSource={},
         DemoConfig={},
         TerminationConfig={},
         StateCoverage={},
@@ -288,9 +288,8 @@ COSTLY = {  # milliseconds each; the others take microseconds
 }
 EXCLUDED = {  # why public names are not fuzzed here
     "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
-    "Evaluation "
-    "GoalEpisodes GoalTrack  AtariProgress Candidate Options Controllability",
-    "a protocol": "NoveltyTest PlansGoals OptionWorker WorkerSource",
+    "Evaluation GoalEpisodes GoalTrack Options Controllability",
+    "a protocol": "NoveltyTest PlansGoals OptionWorker",
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
@@ -299,8 +298,7 @@ EXCLUDED = {  # why public names are not fuzzed here
     "hands its arguments to SkillReward": "SkillRewardHook",
     "searches from any object": "ReferenceSearch",
     "belongs to an Atari game": "ByteGoal FollowGoals JoinedWorkers OccasionalAction AtariAgent "
-    "GoalFinder ActionSetSource ActionSource BestSource RepeatSource GoalSource DIAYNSource "
-    "DistilledSource FineTunedSource RetrainedSource",
+    "AtariKit TrainedSource",
     "the arguments of TorchRL's ValueEstimatorBase": "NStepReturn",
     "an exception": "CollectorError FolderInUse LearnerError SnapshotError",
     "takes other parts, whose types it checks": "GeneratorStates RunningEpisodes "

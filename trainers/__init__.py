@@ -16,34 +16,13 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
     from torchrl_hmcts.trainers.collectors import CollectorError
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
-    from torchrl_hmcts.trainers.experiments.atari.agent import (
-        AtariAgent,
-        AtariProgress,
-        AtariSearch,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.goals import (
-        Candidate,
-        GoalFinder,
-        GoalSearch,
-    )
+    from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch
+    from torchrl_hmcts.trainers.experiments.atari.fine_tuning import OptionGoals
     from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
-    from torchrl_hmcts.trainers.experiments.atari.learned_sources import (
-        DIAYNSource,
-        DistilledSource,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.options import Options, WorkerSource, load_options
-    from torchrl_hmcts.trainers.experiments.atari.sources import (
-        ActionSetSource,
-        ActionSource,
-        BestSource,
-        GoalSource,
-        RepeatSource,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.trained_sources import (
-        FineTunedSource,
-        OptionGoals,
-        RetrainedSource,
-    )
+    from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
+    from torchrl_hmcts.trainers.experiments.atari.options import Options
+    from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
+    from torchrl_hmcts.trainers.experiments.atari.sources import TrainedSource
     from torchrl_hmcts.trainers.experiments.settings import DemoConfig
     from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
         GoalEpisodes,
