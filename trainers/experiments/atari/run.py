@@ -16,7 +16,6 @@ from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun, load_run, trials_file
 from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
 from torchrl_hmcts.trainers.saving.files import left_out, write_csv
