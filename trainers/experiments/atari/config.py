@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass, fields
 
-from torchrl_hmcts.trainers.experiments.registry import ExperimentError
-from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
+from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
 
 @dataclass
@@ -87,6 +85,7 @@ class AtariConfig(RunConfig):
     toy: bool = False
     """A run of seconds, to see that everything works."""
 
+    EXPERIMENT = "atari"
     FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
     PATHS = ("out", "options_from")
     CHOICES = {
@@ -108,7 +107,7 @@ class AtariConfig(RunConfig):
         "num_processes": -1,
     }
     ABOVE_ZERO = ("ratio", "c", "trial_ratio")
-    TOY: ClassVar[dict[str, Any]] = {
+    TOY = {
         "frames": 20_000,
         "max_episode_frames": 2_000,
         "source": "repeat",
@@ -144,22 +143,3 @@ class AtariConfig(RunConfig):
                 f"options_from={self.options_from} is no run of this experiment: it has no folder "
                 "checkpoints. Name a folder that hmcts train experiment=atari wrote."
             )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, least in self.LEAST.items():
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}.")
-        for name in self.ABOVE_ZERO:
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")
-        if not 0.0 < self.gamma <= 1.0:
-            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")
-        for name, choices in self.CHOICES.items():
-            value = getattr(self, name)
-            if value not in choices:
-                raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
-
-    def sized(self) -> AtariConfig:
-        """Return the configuration that is run: with ``toy`` a small one."""
-        return replace(self, **self.TOY) if self.toy else self
