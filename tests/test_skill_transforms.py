@@ -283,7 +283,7 @@ def test_bad_arguments_are_refused_with_their_value() -> None:
         SkillTransform(2, 0)
     with pytest.raises(ValueError, match=r"shape \(2,\)"):
         SkillTransform(2, prior=[0.2, 0.3, 0.5])
-    with pytest.raises(ValueError, match="none is negative"):
+    with pytest.raises(ValueError, match="none negative"):
         SkillTransform(2, prior=[-1.0, 1.0])
     with pytest.raises(ValueError, match="SkillTransform has 2 skills.*over 4"):
         SkillTransform(2, prior=FixedSkillPrior(4))
