@@ -49,10 +49,6 @@ KNOWN = {
     "trainers.runs.sweep": "experiments",
 }
 KNOWN_CIRCLES = {
-    "planners.mcts planners.growth",
-    "planners.search planners.scored_descent",
-    "planners.tree planners.drawing",
-    "planners.tree planners.export",
     *(f"envs.gym.snapshots envs.gym.{n}" for n in "atari box2d minigrid mujoco tables".split()),
 }
 
