@@ -12,20 +12,17 @@ from when all are at work. It is a figure of an idle machine.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import platform
 import time
-from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from table import markdown, read_arguments, write
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
@@ -61,15 +58,12 @@ def make_loss(inputs: int, actions: int, width: int, seed: int, **settings: Any)
 
     def network(outputs: int, gain: float) -> nn.Module:
         layers: list[nn.Module] = []
-        for fan_in in (inputs, width):
-            linear = nn.Linear(fan_in, width)
-            nn.init.orthogonal_(linear.weight, 2.0**0.5)
+        for fan_in, fan_out in ((inputs, width), (width, width), (width, outputs)):
+            linear = nn.Linear(fan_in, fan_out)
+            nn.init.orthogonal_(linear.weight, gain if fan_out == outputs else 2.0**0.5)
             nn.init.zeros_(linear.bias)
             layers += [linear, nn.Tanh()]
-        head = nn.Linear(width, outputs)
-        nn.init.orthogonal_(head.weight, gain)
-        nn.init.zeros_(head.bias)
-        return nn.Sequential(*layers, head)
+        return nn.Sequential(*layers[:-1])
 
     actor = ProbabilisticActor(
         TensorDictModule(network(actions, 0.01), ["observation"], ["logits"]),
@@ -170,51 +164,36 @@ def asynchrony(repeats: int, window_seconds: float) -> dict[str, Any]:
     }
 
 
-def table(results: Mapping[str, Any]) -> str:
-    """Both figures as markdown."""
-    lines = ["| CartPole-v1, seed | mean return of 100 episodes | frames | seconds |"]
-    lines.append("|---|---|---|---|")
-    for run in results.get("cartpole", ()):
-        lines.append(
-            f"| {run['seed']} | {run['mean_return']} | {run['frames']:,} | {run['seconds']} |"
-        )
-    speed = results.get("asynchrony")
-    if speed:
-        one, two = (np.median(speed[f"base_steps_per_second_of_{n}"]) for n in (1, 2))
-        lines += ["", "| learners | base steps per second (median) | ratio |", "|---|---|---|"]
-        lines += [f"| 1 | {one:,.0f} | 1 |", f"| 2 | {two:,.0f} | {speed['ratio']} |"]
-    return "\n".join(lines)
+COLUMNS = {
+    "CartPole-v1, seed": lambda run: run["seed"],
+    "mean return of 100 episodes": lambda run: run["mean_return"],
+    "frames": lambda run: f"{run['frames']:,}",
+    "seconds": lambda run: run["seconds"],
+}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--only", choices=["cartpole", "asynchrony"])
-    parser.add_argument("--repeats", type=int, default=5, help="of one and two learners in turn")
-    parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--quick", action="store_true", help="to see that it works")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    args = read_arguments(
+        __doc__,
+        {"seeds": [0]},
+        seeds=[0, 1, 2],
+        only=(None, "cartpole or asynchrony"),
+        repeats=(5, "of one and two learners in turn"),
+    )
     results: dict[str, Any] = {}
-    if arguments.only != "asynchrony":
-        results["cartpole"] = []
-        for seed in arguments.seeds[:1] if arguments.quick else arguments.seeds:
-            quick = {"total_frames": 5_000} if arguments.quick else {}
-            results["cartpole"].append(run := solve_cartpole(seed, **quick))
-            print(
-                {key: run[key] for key in ("seed", "mean_return", "frames", "seconds")}, flush=True
-            )
-    if arguments.only != "cartpole":
-        repeats, seconds = (1, 3.0) if arguments.quick else (arguments.repeats, 20.0)
-        results["asynchrony"] = asynchrony(repeats, seconds)
-    seeds = " ".join(map(str, arguments.seeds))
+    if args.only != "asynchrony":
+        frames = {"total_frames": 5_000} if args.quick else {}
+        results["cartpole"] = [solve_cartpole(seed, **frames) for seed in args.seeds]
+        print(markdown(results["cartpole"], COLUMNS))
+    if args.only != "cartpole":
+        results["asynchrony"] = asynchrony(*((1, 3.0) if args.quick else (args.repeats, 20.0)))
+        ratio = results["asynchrony"]["ratio"]
+        print(f"two learners: {ratio} times the base steps per second of one (median)")
+    seeds = " ".join(map(str, args.seeds))
     results["command"] = f"python benchmarks/a3c_figures.py --seeds {seeds}"
     results["versions"] = {"python": platform.python_version(), "torch": torch.__version__}
     results["cores"] = os.cpu_count()
-    print(table(results))
-    if arguments.out:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(results, indent=1) + "\n")
+    write(args, results)
 
 
 if __name__ == "__main__":

@@ -7,21 +7,21 @@ For every seed (0, 1, 2) five workers are trained with 40,000 base steps each in
 decides for itself (``GrowSkills``, room for 12); and 4 skills with that one's discriminator. The
 discriminator of the growing worker is linear without a bias: with one, a new skill can be told by
 staying where it is, since the old ones have left, and need not learn to go. Then each worker plans
-in the 342 test mazes, and its plans are carried out in a separate instance of the env. Coverage is
+in the 342 test mazes, and its plans are executed in a separate instance of the env. Coverage is
 the share of a maze's free tiles that a search of 2,000 simulated base steps reaches. What growing
 simulated in the training mazes to measure coverage is listed beside the training.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
+from mazes import greedy, make_option_env, make_starts, planner
 from skill_figures import search_coverage
+from table import markdown, read_arguments, write
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 
@@ -37,22 +37,14 @@ from torchrl_hmcts.modules import (
 from torchrl_hmcts.modules.skill_mlp import SkillNetwork
 from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers import DIAYNTrainer, GrowSkills, SearchCoverage
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
-from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
-from torchrl_hmcts.transforms import (
-    DisplacementTransform,
-    SkillMaskTransform,
-    SkillTransform,
-)
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.transforms import DisplacementTransform, SkillMaskTransform, SkillTransform
 
 ROOM = 12
 NO_BIAS = "-no-bias"
 WORKERS = ["2", "4", "8", "4" + NO_BIAS, "grown"]
-COVERAGE_BASE_STEPS = 2_000
 COVERAGE_MAZES = 40
 
 
@@ -65,12 +57,11 @@ def macro_env(worker: Any, split: str, prior: SkillPrior) -> TransformedEnv:
 
 def coverage_planner(env: TransformedEnv) -> MCTSPlanner:
     """Searches a fixed number of base steps, apart by the radius of the demo."""
-    config = DemoConfig()
     return MCTSPlanner(
         env,
-        novelty=RadiusNovelty("position", config.novelty_radius, max_relaxations=0),
-        budget=SearchBudget(base_steps=COVERAGE_BASE_STEPS, until_plan=False),
-        leaves_per_wave=config.leaves_per_wave,
+        novelty=RadiusNovelty("position", DemoConfig().novelty_radius, max_relaxations=0),
+        budget=SearchBudget(base_steps=2_000, until_plan=False),
+        leaves_per_wave=4,
         seed=0,
     )
 
@@ -91,136 +82,88 @@ def make_loss_without_bias(
         )
 
 
-def train(
-    worker_name: str, seed: int, base_steps: int
-) -> tuple[SkillPolicy, SkillPrior, dict[str, Any]]:
+def train(name: str, seed: int, base_steps: int) -> tuple[SkillPolicy, SkillPrior, dict[str, Any]]:
     """Train a worker: ``"4"`` skills, ``"4-no-bias"``, or ``"grown"``."""
-    config = DemoConfig()
     begin = time.perf_counter()
-    prior: SkillPrior
-    if worker_name == "grown":
-        prior = GrowingSkillPrior(ROOM, num_active=2)
-    else:
-        prior = FixedSkillPrior(int(worker_name.removesuffix(NO_BIAS)))
+    growing = GrowingSkillPrior(ROOM, num_active=2) if name == "grown" else None
     # None draws the random numbers that the demo draws: its workers are those of the fixed rows.
-    live = prior if isinstance(prior, GrowingSkillPrior) else None
+    prior = growing or FixedSkillPrior(int(name.removesuffix(NO_BIAS)))
     env = TransformedEnv(
         WaterworldMazeEnv(observation=False, batch_size=[32], max_steps=400),
-        Compose(
-            SkillTransform(prior.num_skills, config.skill_steps, prior=live),
-            DisplacementTransform(),
-        ),
+        Compose(SkillTransform(prior.num_skills, 50, prior=growing), DisplacementTransform()),
     )
-    if worker_name == "grown" or worker_name.endswith(NO_BIAS):
-        loss = make_loss_without_bias(env, prior.num_skills, live, seed)
+    if growing is not None or name.endswith(NO_BIAS):
+        loss = make_loss_without_bias(env, prior.num_skills, growing, seed)
     else:
-        loss = DIAYNTrainer.make_loss(env, prior.num_skills, seed=seed, prior=live)
-    trainer = DIAYNTrainer(
-        env,
-        loss,
-        total_frames=base_steps,
-        frames_per_batch=FRAMES_PER_BATCH,
-        seed=seed,
-    )
-    worker = SkillPolicy(loss.actor_network, deterministic=True)
+        loss = DIAYNTrainer.make_loss(env, prior.num_skills, seed=seed)
+    trainer = DIAYNTrainer(env, loss, total_frames=base_steps, seed=seed)
+    worker = greedy(loss)
     growth: dict[str, Any] = {"history": None, "coverage_base_steps": 0}
-    if isinstance(prior, GrowingSkillPrior):
+    if growing is not None:
         env_of_search = macro_env(worker, "train", prior)
         starts = make_starts(env_of_search.base_env, COVERAGE_MAZES, seed)
         coverage = SearchCoverage(coverage_planner(env_of_search), starts, prior)
-        grow = GrowSkills(prior, coverage)
+        grow = GrowSkills(growing, coverage)
         grow.register(trainer)
-        trainer.train()
-        growth = {
-            "history": grow.history,
-            "dropped": grow.dropped,
-            "coverage_base_steps": coverage.base_steps,
-        }
-    else:
-        trainer.train()
+    trainer.train()
+    if growing is not None:
+        growth = {"history": grow.history, "dropped": grow.dropped}
+        growth["coverage_base_steps"] = coverage.base_steps
     growth["train_seconds"] = round(time.perf_counter() - begin, 1)
     return worker, prior, growth
 
 
-def measure(worker_name: str, seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
+def measure(name: str, seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     """Train one worker and take all figures."""
-    config = DemoConfig()
-    worker, prior, growth = train(worker_name, seed, base_steps)
+    worker, prior, growth = train(name, seed, base_steps)
     env, real = (macro_env(worker, "test", prior) for _ in range(2))
     starts = make_starts(env.base_env, num_mazes, seed)
     starts.set("action_mask", prior.active().expand(num_mazes, prior.num_skills).clone())
-    planner = MCTSPlanner(
-        env,
-        novelty=RadiusNovelty("position", config.novelty_radius, shorter_paths=True),
-        budget=SearchBudget(expansions=config.expansions),
-        leaves_per_wave=config.leaves_per_wave,
-        seed=0,
-    )
-    solved = plan_and_execute(planner, real, starts)
+    results = plan_and_execute(planner(env, DemoConfig().novelty_radius, seed=0), real, starts)
     wide = coverage_planner(env)
-    coverage = torch.cat(
-        [search_coverage(wide.search(group), env.base_env) for group in starts.split(38)]
-    )
+    coverage = [search_coverage(wide.search(group), env.base_env) for group in starts.split(38)]
     return {
-        "skills": worker_name,
+        "skills": name,
         "skills_at_the_end": int(prior.active().sum()),
         "seed": seed,
         "train_base_steps": base_steps,
         **growth,
-        "coverage": spread(coverage.numpy()),
-        "mazes": solved.summary(),
+        "coverage": spread(torch.cat(coverage).numpy()),
+        "mazes": results.summary(),
     }
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The figures as a markdown table."""
-    head = [
-        "skills",
-        "seed",
-        "at the end",
-        "solved",
-        "simulated base steps, mean / median (95 %)",
-        "executed base steps, median (95 %)",
-        "coverage, mean",
-        "training base steps + simulated for coverage",
-    ]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
-    for row in rows:
-        simulated, executed = (row["mazes"][k] for k in ("simulated_steps", "episode_steps"))
-        cells = [
-            row["skills"],
-            row["seed"],
-            row["skills_at_the_end"],
-            f"{row['mazes']['solved']} of {row['mazes']['starts']}",
-            f"{simulated['mean']:,.0f} / {simulated['median']:,.0f} ({simulated['p95']:,.0f})",
-            f"{executed['median']:,.0f} ({executed['p95']:,.0f})",
-            f"{row['coverage']['mean']:.3f}",
-            f"{row['train_base_steps']:,} + {row['coverage_base_steps']:,}",
-        ]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+COLUMNS = {
+    "skills": lambda row: row["skills"],
+    "seed": lambda row: row["seed"],
+    "at the end": lambda row: row["skills_at_the_end"],
+    "solved": lambda row: "{solved} of {starts}".format(**row["mazes"]),
+    "simulated base steps, mean / median (95 %)": lambda row: (
+        "{mean:,.0f} / {median:,.0f} ({p95:,.0f})".format(**row["mazes"]["simulated_steps"])
+    ),
+    "executed base steps, median (95 %)": lambda row: "{median:,.0f} ({p95:,.0f})".format(
+        **row["mazes"]["episode_steps"]
+    ),
+    "coverage, mean": lambda row: f"{row['coverage']['mean']:.3f}",
+    "training base steps + simulated for coverage": lambda row: (
+        f"{row['train_base_steps']:,} + {row['coverage_base_steps']:,}"
+    ),
+}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--skills", nargs="+", default=WORKERS, help="of: " + ", ".join(WORKERS))
-    parser.add_argument("--base-steps", type=int, default=40_000)
-    parser.add_argument("--mazes", type=int, default=342)
-    parser.add_argument("--quick", action="store_true", help="one seed, 4 and grown, 38 mazes")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    args = parser.parse_args()
-    if args.quick:
-        args.seeds, args.skills, args.mazes = [0], ["4", "grown"], 38
-    torch.set_num_threads(1)
+    quick = {"seeds": [0], "skills": ["4", "grown"], "mazes": 38}
+    skills = (WORKERS, "of: " + ", ".join(WORKERS))
+    args = read_arguments(
+        __doc__, quick, seeds=[0, 1, 2], skills=skills, base_steps=40_000, mazes=342
+    )
     rows = []
-    for skills in args.skills:
+    for name in args.skills:
         for seed in args.seeds:
-            rows.append(measure(skills, seed, args.base_steps, args.mazes))
+            rows.append(measure(name, seed, args.base_steps, args.mazes))
             print(json.dumps(rows[-1]), flush=True)
-    print(table(rows))
-    if args.out is not None:
-        args.out.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+    print(markdown(rows, COLUMNS))
+    write(args, {"rows": rows})
 
 
 if __name__ == "__main__":

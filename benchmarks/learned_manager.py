@@ -6,7 +6,7 @@
 
 For each seed: train the demo's worker, train prior and value by expert iteration in the training
 mazes, and plan in the test mazes with the plain planner, with distance as the value, and with what
-was learned, after each iteration. Plans are carried out in another env. All base steps simulated
+was learned, after each iteration. Plans are executed in another env. All base steps simulated
 for training are counted and shown beside. CPU seconds are of this process alone.
 """
 
@@ -17,26 +17,24 @@ import copy
 import json
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from maze_network import MazeNetwork
+from mazes import RADIUS, demo_loss, greedy, make_option_env, make_starts, planner
+from table import markdown, read_arguments, write
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from torchrl_hmcts.envs import maze_pool
-from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
-from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
-from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer, make_guided_planner
-from torchrl_hmcts.trainers.runs.config import DemoConfig
 
-OPTION_STEPS, RADIUS, GAMMA = 25, 0.7, 0.99  # those of the demo
+GAMMA = 0.99  # the demo's
 MAIN = "learned, expand one, novelty 0.2"  # the one that is followed over the iterations
 
 
@@ -47,12 +45,6 @@ class Closeness:
 
     def __call__(self, td: TensorDictBase) -> Tensor:
         return GAMMA ** (15.0 * (td["position"] - td["target"]).norm(dim=-1))
-
-
-def plain_planner(env: EnvBase, leaves: int = 4) -> MCTSPlanner:
-    novelty = RadiusNovelty("position", RADIUS, shorter_paths=True)
-    budget = SearchBudget(expansions=1_000)
-    return MCTSPlanner(env, novelty=novelty, leaves_per_wave=leaves, budget=budget)
 
 
 def fixed_planners(env: EnvBase) -> dict[str, MCTSPlanner]:
@@ -68,8 +60,8 @@ def fixed_planners(env: EnvBase) -> dict[str, MCTSPlanner]:
         )
 
     return {
-        "plain, 4 leaves a wave": plain_planner(env, 4),
-        "plain, 1 leaf a wave": plain_planner(env, 1),
+        "plain, 4 leaves a wave": planner(env),
+        "plain, 1 leaf a wave": planner(env, leaves=1),
         "distance, expand all": closeness("all", 1_000),
         "distance, expand one": closeness("one", 4_000),
     }
@@ -90,15 +82,15 @@ def learned_planners(env: EnvBase, network: MazeNetwork) -> dict[str, MCTSPlanne
     }
 
 
-def measure(planner: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> dict[str, Any]:
-    """Plan from all starts and carry the plans out; search alone once more, for the time."""
-    planner.search(starts[:1])  # compiles the kernels
-    results = plan_and_execute(planner, real, starts)
+def measure(searcher: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> dict[str, Any]:
+    """Plan from all starts and execute the plans; search alone once more, for the time."""
+    searcher.search(starts[:1])  # compiles the kernels
+    results = plan_and_execute(searcher, real, starts)
     few = starts[:: max(1, len(starts) // 40)]  # one maze after the other, as an agent meets them
     seconds = []
-    for i in range(len(few)):
+    for start in few.split(1):
         begin = time.process_time()
-        planner.search(few[i : i + 1])
+        searcher.search(start)
         seconds.append(time.process_time() - begin)
     return {
         **results.summary(),
@@ -111,21 +103,16 @@ def measure(planner: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> dict
 
 def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
     begin = time.process_time()
-    if args.worker_weights is None:
-        _, loss = train_worker(DemoConfig(seed=seed))
-    else:
-        loss = load_worker(args.worker_weights.format(seed=seed))
-    worker = SkillPolicy(loss.actor_network, deterministic=True)
+    worker = greedy(demo_loss(seed, args.worker_weights))
     worker_seconds = time.process_time() - begin
     test = maze_pool("test")
-    kwargs = {"option_steps": OPTION_STEPS, "gamma": GAMMA}
-    simulator, real = (make_option_env(worker, test, **kwargs) for _ in range(2))
+    simulator, real = (make_option_env(worker, test) for _ in range(2))
     starts = make_starts(simulator.base_env, args.mazes, seed)
-    training_env = make_option_env(worker, **kwargs)
+    training_env = make_option_env(worker)
 
     torch.manual_seed(seed)
     network = MazeNetwork(maze_pool("train"), gamma=GAMMA)
-    first = plain_planner(training_env, 1)
+    first = planner(training_env, leaves=1)
     first.search(training_env.reset().unsqueeze(0))  # compiles the kernels
     learned: list[dict[str, Any]] = []
     trainer = ExpertIterationTrainer(
@@ -141,20 +128,19 @@ def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
         iterations=args.iterations,
         searches_per_iteration=args.searches,
         updates_per_iteration=args.updates,
-        progress=tqdm_or_none(),
+        progress=tqdm if sys.stderr.isatty() else None,
         seed=seed,
     )
-    clock = {"begin": time.process_time(), "seconds": 0.0}
+    begin = time.process_time()
     snapshots: list[MazeNetwork] = []
 
     def keep() -> None:
-        clock["seconds"] = time.process_time() - clock["begin"]
         snapshots.append(copy.deepcopy(network))
         collector = trainer.collector
         learned.append(
             {
                 "iteration": len(learned),
-                "training_cpu_seconds": round(clock["seconds"], 1),
+                "training_cpu_seconds": round(time.process_time() - begin, 1),
                 "training_searches": args.searches,
                 "training_solved": collector.solved[-1],
                 "training_base_steps": collector.base_steps[-1],
@@ -167,16 +153,16 @@ def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
     trainer.train()
     print(json.dumps(learned, indent=1), flush=True)
     rows: dict[str, Any] = {}
-    for name, planner in fixed_planners(simulator).items():
-        rows[name] = measure(planner, real, starts)
+    for name, searcher in fixed_planners(simulator).items():
+        rows[name] = measure(searcher, real, starts)
         report(seed, name, rows[name])
     for i, snapshot in enumerate(snapshots):
         on_test = snapshot.on(test)
-        for name, planner in learned_planners(simulator, on_test).items():
+        for name, searcher in learned_planners(simulator, on_test).items():
             if i < len(snapshots) - 1 and name != MAIN:
                 continue
             key = f"{name}, iteration {i}"
-            rows[key] = measure(planner, real, starts)
+            rows[key] = measure(searcher, real, starts)
             report(seed, key, rows[key])
     return {
         "worker_cpu_seconds": round(worker_seconds, 1),
@@ -184,22 +170,6 @@ def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
         "history": trainer.history,
         "planners": rows,
     }
-
-
-def load_worker(path: str) -> Any:
-    """Read a worker's loss that was trained before; only to try this script out quickly."""
-    from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-    from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
-
-    loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=0)
-    loss.load_state_dict(torch.load(path, weights_only=True))
-    return loss
-
-
-def tqdm_or_none() -> Any:
-    from tqdm import tqdm
-
-    return tqdm if sys.stderr.isatty() else None
 
 
 def report(seed: int, name: str, row: dict[str, Any]) -> None:
@@ -212,71 +182,68 @@ def report(seed: int, name: str, row: dict[str, Any]) -> None:
     )
 
 
+def pooled(runs: dict[str, Any], name: str) -> dict[str, Any]:
+    """The rows of a planner, of all seeds, and their simulated base steps in one array."""
+    rows = [run["planners"][name] for run in runs.values()]
+    return {
+        "name": name,
+        "rows": rows,
+        "simulated": np.concatenate([row["simulated"] for row in rows]),
+        "mean": lambda key, figure: np.mean([row[key][figure] for row in rows]),
+    }
+
+
 def table(runs: dict[str, Any]) -> str:
-    """All seeds together as a Markdown table: medians over all mazes, worst seed's solved."""
-    head = (
-        "| planner | solved, by seed | simulations | simulated base steps (mean; p95) | "
-        "expansions | CPU ms a maze | episode base steps (mean) | against plain |"
-    )
-    lines = [head, "|---|---|---|---|---|---|---|---|"]
-    seeds = list(runs)
-    reference = "plain, 4 leaves a wave"
-    for name in runs[seeds[0]]["planners"]:
-        rows = [runs[s]["planners"][name] for s in seeds]
-        base = [runs[s]["planners"][reference] for s in seeds]
-
-        def mean(key: str, figure: str, rows: list[Any] = rows) -> float:
-            return float(np.mean([row[key][figure] for row in rows]))
-
-        simulated = np.concatenate([row["simulated"] for row in rows])
-        plain = np.concatenate([row["simulated"] for row in base])
-        lines.append(
-            f"| {name} | {', '.join(str(row['solved']) for row in rows)} of {rows[0]['starts']} | "
-            f"{mean('simulations', 'median'):.0f} | {np.median(simulated):.0f} "
-            f"({simulated.mean():.0f}; {np.percentile(simulated, 95):.0f}) | "
-            f"{mean('expansions', 'median'):.0f} | "
-            f"{1e3 * mean('cpu_seconds_alone', 'median'):.0f} | "
-            f"{mean('episode_steps', 'median'):.0f} ({mean('episode_steps', 'mean'):.0f}) | "
-            f"{np.median(simulated) / np.median(plain):.2f} |"
-        )
-    lines += ["", "| iteration | training base steps, so far | a search | CPU s, so far |"]
-    lines.append("|---|---|---|---|")
-    for i in range(len(runs[seeds[0]]["iterations"])):
-        its = [runs[s]["iterations"][i] for s in seeds]
-
-        def mean_of(key: str, its: list[Any] = its) -> float:
-            return float(np.mean([it[key] for it in its]))
-
-        lines.append(
-            f"| {i} | {mean_of('training_base_steps_so_far'):,.0f} | "
-            f"{mean_of('training_base_steps_per_search'):,.0f} | "
-            f"{mean_of('training_cpu_seconds'):.0f} |"
-        )
-    return "\n".join(lines)
+    """All seeds together as markdown: medians over all mazes, each seed's solved."""
+    first = next(iter(runs.values()))
+    plain = np.median(pooled(runs, "plain, 4 leaves a wave")["simulated"])
+    planners = {
+        "planner": lambda p: p["name"],
+        "solved, by seed": lambda p: (
+            f"{', '.join(str(r['solved']) for r in p['rows'])} of {p['rows'][0]['starts']}"
+        ),
+        "simulations": lambda p: f"{p['mean']('simulations', 'median'):.0f}",
+        "simulated base steps (mean; p95)": lambda p: (
+            f"{np.median(p['simulated']):.0f} ({p['simulated'].mean():.0f}; "
+            f"{np.percentile(p['simulated'], 95):.0f})"
+        ),
+        "expansions": lambda p: f"{p['mean']('expansions', 'median'):.0f}",
+        "CPU ms a maze": lambda p: f"{1e3 * p['mean']('cpu_seconds_alone', 'median'):.0f}",
+        "episode base steps (mean)": lambda p: (
+            f"{p['mean']('episode_steps', 'median'):.0f} ({p['mean']('episode_steps', 'mean'):.0f})"
+        ),
+        "against plain": lambda p: f"{np.median(p['simulated']) / plain:.2f}",
+    }
+    iterations = {
+        "iteration": lambda its: its[0]["iteration"],
+        "training base steps, so far": lambda its: (
+            f"{np.mean([it['training_base_steps_so_far'] for it in its]):,.0f}"
+        ),
+        "a search": lambda its: (
+            f"{np.mean([it['training_base_steps_per_search'] for it in its]):,.0f}"
+        ),
+        "CPU s, so far": lambda its: f"{np.mean([it['training_cpu_seconds'] for it in its]):.0f}",
+    }
+    followed = zip(*(run["iterations"] for run in runs.values()), strict=True)
+    rows = [pooled(runs, name) for name in first["planners"]]
+    return markdown(rows, planners) + "\n\n" + markdown(followed, iterations)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--mazes", type=int, default=342)
-    parser.add_argument("--iterations", type=int, default=4)
-    parser.add_argument("--searches", type=int, default=400, help="training mazes an iteration")
-    parser.add_argument("--updates", type=int, default=200, help="updates an iteration")
-    parser.add_argument("--quick", action="store_true", help="60 mazes, 2 iterations")
-    parser.add_argument("--worker-weights", help="state dict of a worker's loss, with {seed}")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    args = parser.parse_args()
-    if args.quick:
-        args.mazes, args.iterations = 60, 2
-    torch.set_num_threads(1)
+    args = read_arguments(
+        __doc__,
+        {"mazes": 60, "iterations": 2},
+        seeds=[0],
+        mazes=342,
+        iterations=4,
+        searches=(400, "training mazes an iteration"),
+        updates=(200, "updates an iteration"),
+        worker_weights=(None, "state dict of a worker's loss, with {seed}"),
+    )
     runs = {str(seed): run(seed, args) for seed in args.seeds}
     text = table(runs)
     print(text)
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments = {k: str(v) if isinstance(v, Path) else v for k, v in vars(args).items()}
-        figures = {"arguments": arguments, "table": text.splitlines(), "seeds": runs}
-        args.out.write_text(json.dumps(figures, indent=1) + "\n")
+    write(args, {"arguments": vars(args), "table": text.splitlines(), "seeds": runs})
 
 
 if __name__ == "__main__":

@@ -18,26 +18,24 @@ import argparse
 import dataclasses
 import json
 import time
-from pathlib import Path
 from typing import Any
 
 import torch
+from mazes import demo_loss, greedy, make_option_env, planner
+from real_episodes import EpisodesInEachMaze, act
+from table import markdown, read_arguments, write
 from torchrl.envs import EnvBase, TransformedEnv
-
-from torchrl_hmcts.envs import maze_pool
-from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillPolicy
-from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.experiments.demo import train_worker
-from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
+from waterworld_options import (
     OptionModelConfig,
     error_by_horizon,
     make_model_env,
     record_transitions,
     train_option_model,
 )
-from torchrl_hmcts.trainers.experiments.waterworld.real_episodes import EpisodesInEachMaze, act
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+
+from torchrl_hmcts.envs import maze_pool
+from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillPolicy
+from torchrl_hmcts.planners import HierarchicalPolicy, SearchBudget
 from torchrl_hmcts.transforms import OptionTransform
 
 OPTION_STEPS, GAMMA, TIME_LIMIT = 25, 0.99, 1_000
@@ -45,14 +43,8 @@ OPTION_STEPS, GAMMA, TIME_LIMIT = 25, 0.99, 1_000
 
 def make_policy(env: EnvBase, args: argparse.Namespace) -> HierarchicalPolicy:
     """Plan again after every option."""
-    planner = MCTSPlanner(
-        env,
-        gamma=GAMMA,
-        novelty=RadiusNovelty("position", 0.7, shorter_paths=True),
-        leaves_per_wave=4,
-        budget=SearchBudget(expansions=args.expansions, improve_expansions=args.improve),
-    )
-    return HierarchicalPolicy(planner, replan_every=1)
+    budget = SearchBudget(expansions=args.expansions, improve_expansions=args.improve)
+    return HierarchicalPolicy(planner(env, budget=budget, gamma=GAMMA), replan_every=1)
 
 
 def make_real(worker: SkillPolicy, args: argparse.Namespace, seed: int) -> TransformedEnv:
@@ -73,8 +65,7 @@ def make_memory(model: OptionModel, args: argparse.Namespace) -> OptionMemory:
 
 def run_seed(seed: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """All rows of one seed."""
-    _, loss = train_worker(DemoConfig(seed=seed))
-    worker = SkillPolicy(loss.actor_network, deterministic=True)
+    worker = greedy(demo_loss(seed))
     rows: list[dict[str, Any]] = []
 
     def report(name: str, env: EnvBase, **figures: Any) -> None:
@@ -128,59 +119,48 @@ def run_seed(seed: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as a markdown table, seeds side by side."""
-    lines = [
-        "| planned in | base steps recorded | solved, by seed | share | base steps of an episode, "
-        "median | error after 1, 2, 4, 8 options, tiles |",
-        "|---|---|---|---|---|---|",
-    ]
-    groups: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["name"], round(row["base_steps"], -4)), []).append(row)
-    for (name, _), group in groups.items():
-        solved = " ".join(f"{row['solved']}/{row['mazes']}" for row in group)
-        share = sum(row["solved"] for row in group) / sum(row["mazes"] for row in group)
-        steps = " ".join(f"{row['episode_steps']['median']:.0f}" for row in group)
-        recorded = " ".join(f"{row['base_steps']:,}" for row in group)
-        errors = [row["error_by_horizon"] for row in group if "error_by_horizon" in row]
-        means = [
-            f"{sum(e[i] for e in errors) / len(errors):.2f}"
-            for i in (0, 1, 3, 7)
-            if errors and i < min(map(len, errors))
-        ]
-        lines.append(
-            f"| {name} | {recorded} | {solved} | {100 * share:.1f} % | {steps} "
-            f"| {', '.join(means)} |"
-        )
-    return "\n".join(lines)
+def error_means(group: list[dict[str, Any]]) -> str:
+    errors = [row["error_by_horizon"] for row in group if "error_by_horizon" in row]
+    reached = min(map(len, errors), default=0)
+    return ", ".join(
+        f"{sum(e[i] for e in errors) / len(errors):.2f}" for i in (0, 1, 3, 7) if i < reached
+    )
+
+
+COLUMNS = {
+    "planned in": lambda group: group[0]["name"],
+    "base steps recorded": lambda group: " ".join(f"{r['base_steps']:,}" for r in group),
+    "solved, by seed": lambda group: " ".join(f"{r['solved']}/{r['mazes']}" for r in group),
+    "share": lambda group: (
+        f"{100 * sum(r['solved'] for r in group) / sum(r['mazes'] for r in group):.1f} %"
+    ),
+    "base steps of an episode, median": lambda group: " ".join(
+        f"{r['episode_steps']['median']:.0f}" for r in group
+    ),
+    "error after 1, 2, 4, 8 options, tiles": error_means,
+}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--mazes", type=int, default=342)
-    parser.add_argument(
-        "--base-steps", type=int, nargs="+", default=[20_000, 50_000, 100_000, 200_000]
+    quick = {"seeds": [0], "mazes": 30, "base_steps": [50_000], "updates": 500}
+    args = read_arguments(
+        __doc__,
+        quick,
+        seeds=[0, 1, 2],
+        mazes=342,
+        base_steps=[20_000, 50_000, 100_000, 200_000],
+        updates=4_000,
+        expansions=(300, "of a search"),
+        improve=(30, "expansions after the first plan"),
+        memory_radius=(0.5, "tiles, tiles per second"),
+        max_options=(60, "of an episode"),
     )
-    parser.add_argument("--updates", type=int, default=4_000)
-    parser.add_argument("--expansions", type=int, default=300, help="of a search")
-    parser.add_argument("--improve", type=int, default=30, help="expansions after the first plan")
-    parser.add_argument("--memory-radius", type=float, default=0.5, help="tiles, tiles per second")
-    parser.add_argument("--max-options", type=int, default=60, help="of an episode")
-    parser.add_argument("--quick", action="store_true", help="1 seed, 30 mazes, few updates")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    if args.quick:
-        args.seeds, args.mazes, args.base_steps, args.updates = args.seeds[:1], 30, [50_000], 500
-
     rows = [row for seed in args.seeds for row in run_seed(seed, args)]
-    arguments = {k: str(v) if isinstance(v, Path) else v for k, v in vars(args).items()}
-    if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps({"arguments": arguments, "rows": rows}, indent=2) + "\n")
-    print(table(rows))
+    write(args, {"arguments": vars(args), "rows": rows})
+    groups: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["name"], round(row["base_steps"], -4)), []).append(row)
+    print(markdown(groups.values(), COLUMNS))
 
 
 if __name__ == "__main__":

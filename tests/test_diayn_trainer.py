@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import (
-    LazyTensorStorage,
-    ReplayBuffer,
-    TensorDictReplayBuffer,
-)
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.objectives import DiscreteSACLoss, SoftUpdate
 from torchrl.record import CSVLogger
@@ -25,6 +22,7 @@ from torchrl.trainers import (
     Trainer,
 )
 from torchrl.trainers.algorithms import SACTrainer
+from trainer_parts import Bars, weights
 
 from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, METRAEncoderLoss
@@ -36,6 +34,8 @@ from torchrl_hmcts.transforms import (
     SkillReward,
     SkillTransform,
 )
+
+CURVES = ("actor_loss", "critic_1_loss", "critic_2_loss", "discriminator_loss", "entropy")
 
 
 def make_env(copies: int = 32) -> TransformedEnv:
@@ -50,55 +50,26 @@ def make_trainer(seed: int = 0, **kwargs: Any) -> DIAYNTrainer:
     return DIAYNTrainer(env, loss, seed=seed, **{"total_frames": 192, **kwargs})
 
 
-def weights(trainer: DIAYNTrainer) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in trainer.loss_module.parameters()])
-
-
-class Bar:
-    """A progress bar that remembers what it was told."""
-
-    def __init__(self, total: int) -> None:
-        self.total, self.n, self.figures, self.closed = total, 0, {}, False
-
-    def update(self, n: int) -> None:
-        self.n += n
-
-    def set_postfix(self, *, refresh: bool, **figures: str) -> None:
-        self.figures = figures
-
-    def close(self) -> None:
-        self.closed = True
-
-
-def test_three_batches_train_every_network_and_log_the_four_curves() -> None:
-    bars: list[Bar] = []
-
-    def progress(total: int) -> Bar:
-        bars.append(Bar(total))
-        return bars[-1]
-
-    trainer = make_trainer(progress=progress)
+def test_three_batches_train_every_network_log_the_curves_and_store_what_is_read() -> None:
+    bars = Bars()
+    trainer = make_trainer(progress=bars)
     before = {k: v.clone() for k, v in trainer.loss_module.state_dict().items()}
     trainer.train()
     after = trainer.loss_module.state_dict()
-    still = [k for k in before if torch.equal(before[k], after[k]) and before[k].ndim > 1]
-    assert still == []
+    assert [k for k in before if torch.equal(before[k], after[k]) and before[k].ndim > 1] == []
     history = trainer.history
-    for curve in ("actor_loss", "critic_1_loss", "critic_2_loss", "discriminator_loss"):
+    for curve in (*CURVES, "discriminator_accuracy", "state_coverage"):
         assert len(history[curve]) == 3
-    for curve in ("discriminator_accuracy", "entropy", "state_coverage"):
-        assert len(history[curve]) == 3
-    assert len(trainer.replay_buffer) == 192
     assert history["optim_steps"] == [3, 6, 9]
     (bar,) = bars
     assert (bar.total, bar.n, bar.closed) == (192, 192, True)
     assert "discriminator_accuracy" in bar.figures
-
-
-def test_curves_are_found_by_the_names_of_the_loss_too() -> None:
-    trainer = make_trainer()
-    trainer.train()
-    history = trainer.history
+    stored = trainer.replay_buffer.storage[:]
+    assert len(stored) == 192
+    assert ("next", "displacement") in stored.keys(True)
+    assert ("next", "position") not in stored.keys(True)
+    assert not stored["next", "done"].any()  # no truncation is invented
+    # Curves are found by the names of the loss too.
     assert history["qvalue_loss_1"] == history["critic_2_loss"]
     assert "qvalue_loss_1" not in list(history)
     total = np.add(history["critic_1_loss"], history["critic_2_loss"])
@@ -107,29 +78,21 @@ def test_curves_are_found_by_the_names_of_the_loss_too() -> None:
         history["speed"]
 
 
-def train_with_logger(folder: Path, **kwargs: Any) -> DIAYNTrainer:
-    logger = CSVLogger("run", str(folder))
-    trainer = make_trainer(logger=logger, **kwargs)
+@pytest.mark.parametrize(("interval", "logged"), [(0, [64, 128, 192]), (100, [128])])
+def test_curves_reach_a_logger_with_base_steps_as_x(
+    interval: int, logged: list[int], tmp_path: Path
+) -> None:
+    logger = CSVLogger("run", str(tmp_path))
+    trainer = make_trainer(logger=logger, log_interval=interval)
     trainer.train()
     for file in logger.experiment.files.values():  # TorchRL leaves them to the garbage collector
         file.close()
-    return trainer
-
-
-def test_curves_reach_a_logger_with_base_steps_as_x(tmp_path: Path) -> None:
-    trainer = train_with_logger(tmp_path)
-    for curve in ("actor_loss", "critic_1_loss", "critic_2_loss", "discriminator_loss", "entropy"):
-        rows = np.loadtxt(tmp_path / "run" / "scalars" / f"{curve}.csv", delimiter=",")
-        assert rows[:, 0].tolist() == [64, 128, 192]
-        assert np.allclose(rows[:, 1], trainer.history[curve])
-    seen = np.loadtxt(tmp_path / "run" / "scalars" / "state_coverage.csv", delimiter=",")
-    assert seen[:, 1].tolist() == trainer.history["state_coverage"]
-
-
-def test_a_log_interval_thins_out_what_the_logger_gets(tmp_path: Path) -> None:
-    train_with_logger(tmp_path, log_interval=100)
-    rows = np.loadtxt(tmp_path / "run" / "scalars" / "entropy.csv", delimiter=",", ndmin=2)
-    assert rows[:, 0].tolist() == [128]
+    for curve in (*CURVES, "state_coverage"):
+        file = tmp_path / "run" / "scalars" / f"{curve}.csv"
+        rows = np.loadtxt(file, delimiter=",", ndmin=2)
+        assert rows[:, 0].tolist() == logged
+        values = [trainer.history[curve][step // 64 - 1] for step in logged]
+        assert np.allclose(rows[:, 1], values)
 
 
 def test_coverage_counts_the_cells_of_the_entry_it_is_given() -> None:
@@ -149,27 +112,14 @@ def visit(coverage: StateCoverage, *cells: tuple[float, float]) -> tuple[float, 
 
 def test_coverage_forgets_what_left_the_window_but_not_since_the_start() -> None:
     coverage = StateCoverage(cell_side=0.5, window=4)
+    coverage.load_state_dict(StateCoverage().state_dict())  # of one that has seen nothing
     assert visit(coverage, (0.1, 0.1), (0.6, 0.1)) == (2, 2)
     assert visit(coverage, (0.4, 0.4), (-0.1, 0.1)) == (3, 3)  # -0.1 is in the cell below 0
     assert visit(coverage, (0.1, 0.1), (0.1, 0.1)) == (2, 3)  # (0.6, 0.1) is forgotten
-    state = coverage.state_dict()
     copy = StateCoverage(cell_side=0.5, window=4)
-    copy.load_state_dict(state)
+    copy.load_state_dict(coverage.state_dict())
     for counter in (coverage, copy):
         assert visit(counter, (0.9, 0.1), (5.0, 5.0)) == (3, 4)
-
-
-def test_coverage_before_any_step_is_saved_and_loaded() -> None:
-    coverage = StateCoverage()
-    coverage.load_state_dict(StateCoverage().state_dict())
-    assert visit(coverage, (0.0, 0.0)) == (1, 1)
-
-
-def test_cells_without_extent_are_refused() -> None:
-    with pytest.raises(ValueError, match="cell_side=0"):
-        StateCoverage(cell_side=0)
-    with pytest.raises(ValueError, match="window=0"):
-        StateCoverage(window=0)
 
 
 def test_another_objective_trains_in_the_same_trainer() -> None:
@@ -179,18 +129,17 @@ def test_another_objective_trains_in_the_same_trainer() -> None:
     before = {name: p.detach().clone() for name, p in loss.named_parameters()}
     trainer = DIAYNTrainer(env, loss, total_frames=128, seed=0)
     trainer.train()
-    still = [name for name, p in loss.named_parameters() if torch.equal(p, before[name])]
     # The bias of the encoder's last layer cancels in what METRA looks at, phi(s') - phi(s).
-    assert len(still) == 1
-    assert still[0].startswith("objective.encoder")
-    assert still[0].endswith("bias")
+    (still,) = [name for name, p in loss.named_parameters() if torch.equal(p, before[name])]
+    assert still.startswith("objective.encoder")
+    assert still.endswith("bias")
     assert len(trainer.history["encoder_loss"]) == 2
     # Nothing of a discriminator is left; coverage is counted where the encoder looks.
     assert not [name for name in trainer.history if "discriminator" in name]
     assert trainer.history["state_coverage_total"][-1] >= 32
 
 
-def test_a_loss_without_objective_is_refused() -> None:
+def test_what_cannot_be_trained_is_refused() -> None:
     env = make_env()
     nets = DIAYNTrainer.make_loss(env, 4)
     loss = DiscreteSACLoss(
@@ -198,17 +147,21 @@ def test_a_loss_without_objective_is_refused() -> None:
     )
     with pytest.raises(TypeError, match="DiscreteSACLoss has none"):
         DIAYNTrainer(env, loss)
+    with pytest.raises(ValueError, match="multiple of 32; got 40"):
+        make_trainer(frames_per_batch=40)
+    with pytest.raises(KeyError, match="speed"):
+        DIAYNTrainer.make_loss(env, in_keys=["speed"])
+    with pytest.raises(ValueError, match=r"cell_side .*> 0.0.*; got 0"):
+        StateCoverage(cell_side=0)
+    with pytest.raises(ValueError, match="window >= 1; got 0"):
+        StateCoverage(window=0)
 
 
 def test_the_optimiser_trains_every_parameter_once_with_the_rate_of_its_part() -> None:
     loss = DIAYNTrainer.make_loss(make_env(), 4, fixed_alpha=False)
     groups = make_skill_optimizer(loss, 0.1, 0.2, 0.3, 0.4).param_groups
-    assert [(g["name"], g["lr"]) for g in groups] == [
-        ("actor", 0.1),
-        ("critic", 0.2),
-        ("objective", 0.3),
-        ("alpha", 0.4),
-    ]
+    rates = {"actor": 0.1, "critic": 0.2, "objective": 0.3, "alpha": 0.4}
+    assert {g["name"]: g["lr"] for g in groups} == rates
     trained = [id(p) for g in groups for p in g["params"]]
     assert len(trained) == len(set(trained))
     assert set(trained) == {id(p) for p in loss.parameters() if p.requires_grad}
@@ -226,79 +179,48 @@ def test_targets_move_by_tau_towards_the_critics() -> None:
     trainer.collector.shutdown()
 
 
-def test_without_a_progress_bar_nothing_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    make_trainer().train()
-    out, err = capsys.readouterr()
-    assert "it/s" not in out + err
-
-
-def test_the_same_seed_gives_the_same_weights() -> None:
+def test_the_same_seed_gives_the_same_weights_and_prints_nothing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     runs = []
     for seed in (0, 0, 1):
-        torch.rand(len(runs) + 1)  # whatever the global generator went through before
+        torch.rand(len(runs) + 1)  # the global generator's past does not matter
         trainer = make_trainer(seed)
         trainer.train()
         runs.append(weights(trainer))
     assert torch.equal(runs[0], runs[1])
     assert not torch.equal(runs[0], runs[2])
+    assert "it/s" not in "".join(capsys.readouterr())
 
 
-def test_only_what_the_loss_reads_is_stored_and_truncation_is_not_invented() -> None:
-    trainer = make_trainer()
-    trainer.train()
-    stored = trainer.replay_buffer.storage[:]
-    assert ("next", "displacement") in stored.keys(True)
-    assert ("next", "position") not in stored.keys(True)
-    assert not stored["next", "done"].any()
-
-
-def test_a_batch_must_divide_among_the_copies() -> None:
-    with pytest.raises(ValueError, match="multiple of 32; got 40"):
-        make_trainer(frames_per_batch=40)
-
-
-def test_a_missing_entry_is_named() -> None:
-    with pytest.raises(KeyError, match="speed"):
-        DIAYNTrainer.make_loss(make_env(), in_keys=["speed"])
-
-
-def test_the_loss_runs_in_torchrls_own_plain_trainer() -> None:
-    env = make_env(16)
-    loss = DIAYNTrainer.make_loss(env, num_skills=4)
-    collector = Collector(
-        env,
-        loss.actor_network,
-        frames_per_batch=64,
-        total_frames=192,
-        auto_register_policy_transforms=False,
-    )
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(1000), transform=SkillReward(loss.objective), batch_size=32
-    )
+def plain(buffer: ReplayBuffer, loss: DIAYNLoss, **kwargs: Any) -> Trainer:
     trainer = Trainer(
-        collector=collector,
-        total_frames=192,
-        frame_skip=1,
-        optim_steps_per_batch=2,
-        loss_module=loss,
         optimizer=make_skill_optimizer(loss),
         optimization_stepper=DefaultOptimizationStepper(),
-        progress_bar=False,
+        **kwargs,
     )
     replay = ReplayBufferTrainer(buffer, batch_size=32, flatten_tensordicts=True)
     trainer.register_op("batch_process", replay.extend)
     trainer.register_op("process_optim_batch", replay.sample)
     trainer.register_op("post_optim", TargetNetUpdaterHook(SoftUpdate(loss, tau=0.05)))
-    before = [p.detach().clone() for p in loss.parameters()]
-    trainer.train()
-    changed = [not torch.equal(a, b) for a, b in zip(before, loss.parameters(), strict=True)]
-    assert all(changed)
+    return trainer
+
+
+def soft_actor_critic(buffer: ReplayBuffer, loss: DIAYNLoss, **kwargs: Any) -> Trainer:
+    return SACTrainer(
+        optimizer=torch.optim.Adam(loss.parameters()),
+        replay_buffer=buffer,
+        batch_size=32,
+        target_net_updater=SoftUpdate(loss, tau=0.05),
+        enable_logging=False,
+        **kwargs,
+    )
 
 
 @pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")
-@pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
-@pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
-def test_the_loss_runs_in_torchrls_own_sac_trainer() -> None:
+@pytest.mark.filterwarnings("ignore:The '(post_loss|optimizer)' hook stage:FutureWarning")
+@pytest.mark.parametrize("make", [plain, soft_actor_critic])
+def test_the_loss_runs_in_torchrls_own_trainers(make: Callable[..., Trainer]) -> None:
     env = make_env(16)
     loss = DIAYNTrainer.make_loss(env, num_skills=4)
     collector = Collector(
@@ -308,25 +230,19 @@ def test_the_loss_runs_in_torchrls_own_sac_trainer() -> None:
         total_frames=192,
         auto_register_policy_transforms=False,
     )
-    buffer = ReplayBuffer(
-        storage=LazyTensorStorage(1000), transform=SkillReward(loss.objective), batch_size=32
-    )
+    reward = SkillReward(loss.objective)
     before = [p.detach().clone() for p in loss.parameters()]
-    SACTrainer(
+    make(
+        ReplayBuffer(storage=LazyTensorStorage(1000), transform=reward, batch_size=32),
+        loss,
         collector=collector,
         total_frames=192,
         frame_skip=1,
         optim_steps_per_batch=2,
         loss_module=loss,
-        optimizer=torch.optim.Adam(loss.parameters()),
-        replay_buffer=buffer,
-        batch_size=32,
-        target_net_updater=SoftUpdate(loss, tau=0.05),
         progress_bar=False,
-        enable_logging=False,
     ).train()
-    changed = [not torch.equal(a, b) for a, b in zip(before, loss.parameters(), strict=True)]
-    assert all(changed)
+    assert not any(torch.equal(a, b) for a, b in zip(before, loss.parameters(), strict=True))
 
 
 @torch.no_grad()

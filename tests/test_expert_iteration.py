@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from maze_network import MazeNetwork, shortest_distances
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from trainer_parts import Bars, weights
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
 from torchrl_hmcts.objectives import ExpertIterationLoss
@@ -24,11 +26,9 @@ from torchrl_hmcts.planners import (
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import (
     ExpertIterationTrainer,
-    MazeNetwork,
-    SearchCollector,
     make_guided_planner,
-    shortest_distances,
 )
+from torchrl_hmcts.trainers.expert_iteration import SearchCollector
 
 
 class TwoHeads(nn.Module):
@@ -101,11 +101,12 @@ def test_the_policy_loss_is_the_closed_form_cross_entropy() -> None:
     ],
 )
 def test_value_losses_have_their_closed_forms(name: str, expected: list[float]) -> None:
-    net = given(LOGITS, [0.8, 0.4])
-    loss = ExpertIterationLoss(net, value_loss=name, value_coeff=2.0, reduction="none")
-    out = loss(examples())
-    torch.testing.assert_close(out["loss_value"], 2.0 * torch.tensor(expected).double())
-    torch.testing.assert_close(out["value_error"], torch.tensor([0.2, 0.1]).double())
+    for coeff in (2.0, 0.5, 0.0):
+        net = given(LOGITS, [0.8, 0.4])
+        loss = ExpertIterationLoss(net, value_loss=name, value_coeff=coeff, reduction="none")
+        out = loss(examples())
+        torch.testing.assert_close(out["loss_value"], coeff * torch.tensor(expected).double())
+        torch.testing.assert_close(out["value_error"], torch.tensor([0.2, 0.1]).double())
 
 
 def test_the_log_loss_of_discounted_distances_counts_base_steps() -> None:
@@ -174,53 +175,6 @@ def test_gradients_agree_with_finite_differences(name: str) -> None:
             )
 
 
-@pytest.mark.parametrize("nested", [False, True])
-def test_every_key_can_be_renamed(nested: bool) -> None:
-    names = {
-        key: ("inner", f"my_{key}") if nested else f"my_{key}"
-        for key in ("logits", "state_value", "policy_target", "policy_weight", "value_target",
-                    "value_weight", "action_mask")
-    }  # fmt: skip
-    entries = {
-        "policy_weight": [1.0, 0.5],
-        "value_weight": [0.5, 1.0],
-        "action_mask": [[True, False], [True, True]],
-    }
-    td = examples(**entries)
-    expected = ExpertIterationLoss(given(LOGITS, [0.8, 0.4]))(td)
-    net = given(LOGITS, [0.8, 0.4], [names["logits"], names["state_value"]])
-    loss = ExpertIterationLoss(net)
-    loss.set_keys(**names)
-    renamed = TensorDict(observation=td["observation"], batch_size=[2])
-    for key, name in names.items():
-        if key in td.keys():
-            renamed[name] = td[key]
-    out = loss(renamed)
-    for key in expected.keys():
-        torch.testing.assert_close(out[key], expected[key])
-    assert names["value_target"] in loss.in_keys
-    with pytest.raises(KeyError, match="my_policy_target"):
-        loss(td)
-
-
-def test_the_loss_takes_tensors_by_keyword() -> None:
-    loss = ExpertIterationLoss(given(LOGITS, [0.8, 0.4]))
-    td = examples()
-    out = loss(**{key: td[key] for key in loss.in_keys})
-    expected = loss(td)
-    assert [x.item() for x in out] == [expected[key].item() for key in loss.out_keys]
-
-
-def test_it_trains_the_network_it_was_given() -> None:
-    net = given(LOGITS, [0.8, 0.4])
-    loss = ExpertIterationLoss(net)
-    optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
-    before = net.module.logits.detach().clone()
-    sum(v for k, v in loss(examples()).items() if k.startswith("loss")).backward()
-    optimizer.step()
-    assert not torch.equal(net.module.logits, before)
-
-
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
@@ -235,13 +189,6 @@ def test_the_loss_refuses_what_makes_no_sense(kwargs: dict, message: str) -> Non
         ExpertIterationLoss(two_heads(), **kwargs)
 
 
-@pytest.mark.parametrize("value_coeff", [0.0, 0.5])
-def test_the_value_counts_as_much_as_its_coefficient_says(value_coeff: float) -> None:
-    # Squared errors of 0.2 and 0.1: a mean of 0.025.
-    loss = ExpertIterationLoss(given(LOGITS, [0.8, 0.4]), value_coeff=value_coeff)
-    assert loss(examples())["loss_value"].item() == pytest.approx(value_coeff * 0.025)
-
-
 # --------------------------------------------------------------------------- one call for two heads
 
 
@@ -249,7 +196,7 @@ def test_a_policy_value_evaluator_grows_the_tree_of_two_separate_evaluators() ->
     env, net = ChainEnv(length=7), two_heads()
     guide = PolicyValueEvaluator(net)
     kwargs = {"tree_policy": PUCT(c=1.0), "expand": "one"}
-    joint = MCTSPlanner(env, leaf_evaluator=guide, **kwargs)
+    joint = MCTSPlanner(env, leaf_evaluator=guide.value, option_prior=guide.prior, **kwargs)
     apart = MCTSPlanner(
         env, leaf_evaluator=ValueEvaluator(net), option_prior=ModulePrior(net), **kwargs
     )
@@ -265,9 +212,22 @@ def test_a_policy_value_evaluator_calls_its_network_once_per_wave() -> None:
     env, net = ChainEnv(length=7), two_heads()
     guide = PolicyValueEvaluator(net)
     waves = []
-    planner = MCTSPlanner(env, leaf_evaluator=guide, progress=waves.append)
+    planner = MCTSPlanner(
+        env, leaf_evaluator=guide.value, option_prior=guide.prior, progress=waves.append
+    )
     planner.search(env.reset())
     assert net.module.calls == len(waves) + 1  # the root is evaluated, too
+
+
+def test_logits_are_not_kept_for_a_tensordict_that_changed() -> None:
+    net = two_heads()
+    guide = PolicyValueEvaluator(net)
+    td = TensorDict(state=torch.tensor([1]), batch_size=[1])
+    guide.value(td)
+    first = guide.prior(td)
+    td["state"] = torch.tensor([2])
+    assert not torch.equal(guide.prior(td), first)
+    torch.testing.assert_close(guide.prior(td), ModulePrior(net)(td))
 
 
 def test_the_prior_is_sharpened_and_mixed_with_the_uniform_one() -> None:
@@ -276,7 +236,7 @@ def test_the_prior_is_sharpened_and_mixed_with_the_uniform_one() -> None:
     )
     td = TensorDict(x=torch.tensor([[math.log(4.0), 0.0]]), batch_size=[1])
     # exp(ln 4 / 2) = 2: probabilities 2/3 and 1/3; mixed half and half with 1/2.
-    prior = PolicyValueEvaluator(module, temperature=2.0, uniform_share=0.5)(td).priors
+    prior = PolicyValueEvaluator(module, temperature=2.0, uniform_share=0.5).prior(td)
     torch.testing.assert_close(prior, torch.tensor([[7 / 12, 5 / 12]]))
 
 
@@ -320,11 +280,6 @@ def test_gradients_of_distances_flow_along_the_shortest_paths() -> None:
     costs.requires_grad_()
     start.requires_grad_()
     assert torch.autograd.gradcheck(shortest_distances, (costs, start), eps=1e-7)
-
-
-def test_distances_refuse_costs_of_another_maze() -> None:
-    with pytest.raises(ValueError, match=r"\[1, 8, 2, 3\]"):
-        shortest_distances(torch.ones(1, 8, 2, 3), torch.ones(1, 3, 3))
 
 
 @pytest.fixture
@@ -378,7 +333,9 @@ def test_the_network_takes_any_batch_shape(env: WaterworldMazeEnv, shape: list[i
     assert ((td["state_value"] > 0) & (td["state_value"] < 1)).all()
 
 
-def test_a_network_is_refused_without_mazes_or_with_a_wrong_discount() -> None:
+def test_costs_and_networks_that_fit_no_maze_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"\[1, 8, 2, 3\]"):
+        shortest_distances(torch.ones(1, 8, 2, 3), torch.ones(1, 3, 3))
     with pytest.raises(ValueError, match=r"\[3, 3\]"):
         MazeNetwork(torch.zeros(3, 3, dtype=torch.bool))
     for kwargs in ({"gamma": 1.0}, {"steps_per_tile": 0.0}):
@@ -399,7 +356,8 @@ def make_trainer(**kwargs: object) -> ExpertIterationTrainer:
 
 
 def test_a_search_needs_no_detour_after_it_learned_from_one() -> None:
-    trainer = make_trainer()
+    bars = Bars()
+    trainer = make_trainer(progress=bars)
     trainer.train()
     first, second = trainer.collector.simulations
     assert second == 7  # the length of the plan
@@ -409,18 +367,12 @@ def test_a_search_needs_no_detour_after_it_learned_from_one() -> None:
     values = trainer.network(ChainEnv(length=8).reset().reshape(1))["state_value"]
     assert values.item() == pytest.approx(0.99**6, abs=0.06)
     assert trainer.history["policy_accuracy"][-1] == 1.0
+    (bar,) = bars  # of updates
+    assert (bar.total, bar.moves, bar.closed) == (120, [1] * 120, True)
+    assert bar.figures["solved"] == "1/1"
 
 
-def test_training_repeats_with_its_seed() -> None:
-    weights = []
-    for _ in range(2):
-        trainer = make_trainer(updates_per_iteration=30)
-        trainer.train()
-        weights.append(trainer.network.module.table.weight.detach().clone())
-    assert torch.equal(*weights)
-
-
-def test_a_run_that_was_stopped_and_loaded_is_the_run_that_never_stopped(tmp_path: Path) -> None:
+def test_a_run_repeats_with_its_seed_and_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
     whole = make_trainer()
     whole.train()
     first = make_trainer(save_dir=tmp_path, save_trainer_interval=0)
@@ -431,54 +383,27 @@ def test_a_run_that_was_stopped_and_loaded_is_the_run_that_never_stopped(tmp_pat
     second.train()
     assert second.collector.simulations == whole.collector.simulations
     assert second.history == whole.history
-    for a, b in zip(second.network.parameters(), whole.network.parameters(), strict=True):
-        assert torch.equal(a, b)
-
-
-def test_a_run_that_came_to_its_end_has_a_checkpoint_of_it(tmp_path: Path) -> None:
-    trainer = make_trainer(save_dir=tmp_path)
-    trainer.train()
-    assert make_trainer().load(tmp_path).collected_frames == trainer.collected_frames > 0
+    assert torch.equal(weights(second), weights(whole))
+    assert make_trainer().load(tmp_path).collected_frames == second.collected_frames > 0
 
 
 def test_a_collector_goes_on_where_another_stopped() -> None:
     env = ChainEnv(length=5)
     planner = MCTSPlanner(env)
-    kwargs = {"iterations": 3, "searches": 2, "keys": ["state"]}
-    whole = SearchCollector(env, planner, planner, **kwargs)
+
+    def make() -> SearchCollector:
+        settings = {"iterations": 3, "searches": 2, "keys": ["state"], "seed": 0}
+        return SearchCollector(env, planner, planner, example_kwargs={}, **settings)
+
+    whole, begun, resumed = make(), make(), make()
     batches = list(whole)
-    begun = SearchCollector(env, planner, planner, **kwargs)
     begun.collect()
-    resumed = SearchCollector(env, planner, planner, **kwargs)
     resumed.load_state_dict(copy.deepcopy(begun.state_dict()))
     rest = list(resumed)
     assert len(rest) == 2
     assert resumed.state_dict() == whole.state_dict()
     for one, other in zip(rest, batches[1:], strict=True):
         assert (one == other).all()
-
-
-def test_progress_is_shown_and_closed() -> None:
-    calls: list[object] = []
-
-    class Bar:
-        def __init__(self, total: int) -> None:
-            calls.append(total)
-
-        def update(self, n: int) -> None:
-            calls.append(n)
-
-        def set_postfix(self, *, refresh: bool, **figures: str) -> None:
-            calls.append(figures["solved"])
-
-        def close(self) -> None:
-            calls.append("closed")
-
-    make_trainer(updates_per_iteration=30, progress=Bar).train()
-    assert calls[0] == 60
-    assert calls.count(1) == 60
-    assert calls[31] == calls[-2] == "1/1"
-    assert calls[-1] == "closed"
 
 
 @pytest.mark.parametrize("name", ["iterations", "searches_per_iteration", "updates_per_iteration"])

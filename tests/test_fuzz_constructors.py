@@ -32,12 +32,12 @@ from torchrl.trainers import Trainer
 
 from torchrl_hmcts import envs, modules, objectives, planners, trainers, transforms
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.waterworld.config import (
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
+from torchrl_hmcts.trainers.experiments.settings import (
+    LabMazeConfig,
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # torch may warn of what it then accepts
 Good = Callable[[], tuple[Callable[..., Any], dict[str, Any]]]
@@ -246,11 +246,8 @@ GOOD: dict[str, Good] = {
         TerminationConfig={},
         StateCoverage={},
         ScriptedExpert={},
-        SharedAdam={"params": lambda: [nn.Parameter(torch.zeros(2))]},
         SharedRMSprop={"params": lambda: [nn.Parameter(torch.zeros(2))]},
         GrowSkills={"prior": lambda: modules.GrowingSkillPrior(4), "coverage": float},
-        MazeView={"mazes": lambda: maze()},
-        MazeNetwork={"mazes": lambda: maze(), "channels": 2, "hidden": 2},
         DIAYNTrainer={
             "env": lambda: make_training_env(copies=1),
             "loss_module": lambda: skill_loss(),
@@ -285,26 +282,26 @@ GOOD: dict[str, Good] = {
 }
 COSTLY = {  # milliseconds each; the others take microseconds
     *("DIAYNTrainer", "HMCTSTrainer", "A3CTrainer", "ExpertIterationTrainer", "MCTSPlanner"),
-    *("WaterworldMazeEnv", "LabMazeEnv", "GridworldMazeEnv", "MazeNetwork", "MazeView"),
+    *("WaterworldMazeEnv", "LabMazeEnv", "GridworldMazeEnv"),
     *("DIAYNLoss", "DiscreteSkillSACLoss", "SkillSACLoss", "A3CLoss", "OptionModel"),
     *("IntraOptionQLoss", "OptionTerminationLoss", "ExpertIterationLoss", "SkillDynamicsLoss"),
 }
 EXCLUDED = {  # why public names are not fuzzed here
     "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
-    "Evaluation GoalEpisodes GoalTrack TerminationResult Options Controllability",
+    "Evaluation GoalEpisodes GoalTrack Options Controllability",
     "a protocol": "NoveltyTest PlansGoals OptionWorker",
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
     "AttributeSnapshot ReplaySnapshot SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
-    "DurableRotation HindsightTransitions AnyTermination",
+    "DurableRotation AnyTermination",
     "hands its arguments to SkillReward": "SkillRewardHook",
     "searches from any object": "ReferenceSearch",
     "belongs to an Atari game": "ByteGoal FollowGoals JoinedWorkers OccasionalAction AtariAgent "
     "AtariKit TrainedSource",
     "the arguments of TorchRL's ValueEstimatorBase": "NStepReturn",
     "an exception": "CollectorError FolderInUse LearnerError SnapshotError",
-    "takes other parts, whose types it checks": "GeneratorStates RunningEpisodes SearchCollector "
+    "takes other parts, whose types it checks": "GeneratorStates RunningEpisodes "
     "SearchCoverage TilePlanner",
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import pickle
 from collections.abc import Iterator
@@ -14,13 +15,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
+from trainer_parts import differences
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage, num_places
+from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
     OptionTransform,
@@ -76,40 +78,50 @@ def make(coverages: list[float], room: int = 6, **kwargs: Any) -> GrowSkills:
 
 
 def flat() -> Iterator[float]:
-    while True:
-        yield 0.9
+    return itertools.repeat(0.9)
 
 
-def rising() -> Iterator[float]:
-    value = 0.0
-    while True:
-        value += 0.1
-        yield value
-
-
-def test_skills_are_added_while_they_add_coverage_and_the_one_that_does_not_goes() -> None:
-    grow = make([10.0, 15.0, 20.0, 20.5], patience=1)
-    # Judged every 200 base steps, two batches, since the accuracy does not rise.
-    assert run(grow, flat(), 12) == [2, 3, 3, 4, 4, 5, 5, 4, 4, 4, 4, 4]
+@pytest.mark.parametrize(
+    ("coverages", "patience", "numbers", "better", "gains"),
+    [  # judged every 200 base steps, two batches, since the accuracy does not rise
+        (
+            [10.0, 15.0, 20.0, 20.5],  # the skill that adds nothing goes
+            1,
+            [2, 3, 3, 4, 4, 5, 5, 4, 4, 4, 4, 4],
+            [True, True, True, False],
+            [0.5, 1 / 3, 0.025],
+        ),
+        (
+            [10.0, 9.0, 20.0, 19.0, 20.0],  # skills that add nothing get a second chance
+            2,
+            [2, 3, 3, 4, 4, 5, 5, 6, 6, 4, 4, 4],
+            [True, False, True, False, False],
+            [-0.1, 1.0, -0.05, 0.0],
+        ),
+        (
+            [10.0, 9.0, 9.0, 20.0, 19.0],  # it does not end before one skill has added something
+            1,
+            [2, 3, 3, 4, 4, 5, 5, 6, 6, 5, 5],
+            [True, False, False, True, False],
+            [-0.1, -0.1, 1.0, -0.05],
+        ),
+    ],
+)
+def test_skills_are_added_while_they_add_coverage(
+    coverages: list[float],
+    patience: int,
+    numbers: list[int],
+    better: list[bool],
+    gains: list[float],
+) -> None:
+    grow = make(coverages, patience=patience)
+    assert run(grow, flat(), len(numbers)) == numbers
     assert grow.finished
-    assert grow.history["num_active"] == [2, 3, 4, 5]
-    assert grow.history["better"] == [True, True, True, False]
-    assert grow.history["base_steps"] == [200, 400, 600, 800]
+    assert grow.history["num_active"] == list(range(2, 2 + len(better)))
+    assert grow.history["better"] == better
+    assert grow.history["base_steps"] == [200 * (i + 1) for i in range(len(better))]
     assert math.isnan(grow.history["gain"][0])
-    assert grow.history["gain"][1:] == pytest.approx([0.5, 1 / 3, 0.025])
-
-
-def test_patience_gives_skills_that_add_nothing_a_second_chance() -> None:
-    grow = make([10.0, 9.0, 20.0, 19.0, 20.0], patience=2)
-    assert run(grow, flat(), 12) == [2, 3, 3, 4, 4, 5, 5, 6, 6, 4, 4, 4]
-    assert grow.history["better"] == [True, False, True, False, False]
-    assert grow.history["gain"][3:] == pytest.approx([-0.05, 0.0])
-
-
-def test_growing_does_not_end_before_one_skill_has_added_something() -> None:
-    grow = make([10.0, 9.0, 9.0, 20.0, 19.0], patience=1)
-    assert run(grow, flat(), 11) == [2, 3, 3, 4, 4, 5, 5, 6, 6, 5, 5]
-    assert grow.history["better"] == [True, False, False, True, False]
+    assert grow.history["gain"][1:] == pytest.approx(gains)
 
 
 def test_the_best_skills_get_their_weights_back_and_data_of_other_numbers_are_forgotten() -> None:
@@ -127,18 +139,15 @@ def test_the_best_skills_get_their_weights_back_and_data_of_other_numbers_are_fo
 
 def test_skills_that_are_still_being_learned_are_judged_only_at_the_latest() -> None:
     grow = make([10.0, 15.0, 15.0])
-    assert run(grow, rising(), 8) == [2, 2, 2, 3, 3, 3, 3, 4]
+    assert run(grow, (0.1 * i for i in itertools.count()), 8) == [2, 2, 2, 3, 3, 3, 3, 4]
 
 
 def test_growing_ends_when_there_is_no_room_or_enough_is_covered_or_it_is_late() -> None:
-    assert run(make([1.0, 2.0, 3.0], room=3), flat(), 8)[-1] == 3
-    assert run(make([1.0, 2.0, 3.0], enough=2.0), flat(), 8)[-1] == 3
-    late = make([1.0, 2.0, 3.0], until=400)
-    assert run(late, flat(), 8)[-1] == 3
-    assert late.finished
-
-
-def test_a_useless_skill_is_switched_off_even_when_it_is_late() -> None:
+    for ending in ({"room": 3}, {"enough": 2.0}, {"until": 400}):
+        grow = make([1.0, 2.0, 3.0], **ending)
+        assert run(grow, flat(), 8)[-1] == 3
+        assert grow.finished
+    # A useless skill is switched off even when it is late.
     assert run(make([1.0, 1.0], until=300), flat(), 8) == [2, 3, 3, 2, 2, 2, 2, 2]
 
 
@@ -194,11 +203,11 @@ def test_its_state_resumes_with_the_prior_and_the_best_weights() -> None:
 def test_bad_arguments_are_refused_with_their_value() -> None:
     prior = GrowingSkillPrior(4)
     for kwargs, message in (
-        ({"min_base_steps": 500, "max_base_steps": 400}, "got 500 and 400"),
-        ({"min_base_steps": 0}, "got 0 and"),
-        ({"window": 1}, "window=1"),
-        ({"patience": 0}, "patience=0"),
-        ({"min_gain": -0.1}, "got -0.1"),
+        ({"min_base_steps": 500, "max_base_steps": 400}, "max_base_steps >= 500; got 400"),
+        ({"min_base_steps": 0}, "min_base_steps >= 1; got 0"),
+        ({"window": 1}, "window >= 2; got 1"),
+        ({"patience": 0}, "patience >= 1; got 0"),
+        ({"min_gain": -0.1}, "min_gain >= 0.0.*; got -0.1"),
     ):
         with pytest.raises(ValueError, match=message):
             GrowSkills(prior, lambda: 0.0, **kwargs)  # type: ignore[arg-type]
@@ -228,7 +237,6 @@ def test_coverage_counts_the_places_within_reach_of_the_skills_that_are_on() -> 
     coverage = SearchCoverage(planner, starts, prior)
     assert coverage() == pytest.approx((1 + 3 + 5) / 3)  # from the start to the left end
     assert coverage.base_steps == 1 + 3 + 5  # one step from each place
-    assert num_places(planner.last_search).tolist() == [1, 3, 5]
     prior.p.fill_(0.5)
     assert coverage() == 9.0
     assert "action_mask" not in starts.keys()
@@ -245,23 +253,18 @@ def test_searches_that_cannot_measure_coverage_are_refused() -> None:
 # ---------------------------------------------------------------- in a trainer
 
 
-def test_it_grows_a_worker_inside_diayn_trainer() -> None:
+def growing_worker(batches: int, save_dir: Path | None = None) -> tuple[DIAYNTrainer, GrowSkills]:
+    """Skills two to five, of which a third adds coverage and a fourth does not."""
     prior = GrowingSkillPrior(5, 2)
     env = TransformedEnv(
         WaterworldMazeEnv(batch_size=[32], observation=False),
         Compose(SkillTransform(5, 1, prior=prior), DisplacementTransform()),
     )
     loss = DIAYNTrainer.make_loss(env, 5, seed=0, prior=prior)
-    trainer = DIAYNTrainer(env, loss, total_frames=64 * 12, seed=0)
-
-    def all_heads() -> torch.Tensor:  # [Z, ...] of the actor
-        return loss.actor_network.network.heads.weight.detach().clone().view(5, -1)
-
-    heads = all_heads()
-    coverages = iter([1.0, 2.0, 2.0])
+    trainer = DIAYNTrainer(env, loss, total_frames=64 * batches, seed=0, save_dir=save_dir)
     grow = GrowSkills(
         prior,
-        lambda: next(coverages),
+        lambda: {2: 1.0, 3: 2.0, 4: 2.0}[int(prior.num_active)],
         patience=1,
         prune=False,
         min_base_steps=128,
@@ -269,18 +272,28 @@ def test_it_grows_a_worker_inside_diayn_trainer() -> None:
         window=2,
     )
     grow.register(trainer)
-    weights = []
+    return trainer, grow
+
+
+def test_it_grows_a_worker_inside_diayn_trainer() -> None:
+    trainer, grow = growing_worker(12)
+
+    def all_heads() -> torch.Tensor:  # [Z, ...] of the actor
+        heads = trainer.loss_module.actor_network.network.heads
+        return heads.weight.detach().clone().view(5, -1)
+
+    heads, weights = all_heads(), []
     trainer.register_op("post_steps", lambda: weights.append(all_heads()))
     trainer.train()
     assert grow.history["better"] == [True, True, False]
-    assert int(prior.num_active) == 3
+    assert int(grow.prior.num_active) == 3
     # Three skills were best after 256 base steps, the fourth batch; the sixth tried a fourth.
     assert torch.equal(weights[5], weights[3])
     moved = (weights[4] != heads).any(-1)
     assert moved.tolist() == [True, True, True, True, False]
     stored = trainer.replay_buffer.storage[:]["skill"]
     assert stored.shape == (64 * 6,)  # of the batches since
-    # The step after a skill is switched off still carries it out.
+    # The step after a skill is switched off still executes it.
     assert int(stored[64:].max()) == 2
     for values in trainer.history.values():
         assert all(map(math.isfinite, values))
@@ -288,39 +301,14 @@ def test_it_grows_a_worker_inside_diayn_trainer() -> None:
 
 
 def test_a_resumed_run_is_the_same_as_one_that_never_stopped(tmp_path: Path) -> None:
-    coverages = {2: 1.0, 3: 2.0, 4: 2.0}
-
-    def build(batches: int, save_dir: Path | None) -> tuple[DIAYNTrainer, GrowSkills]:
-        prior = GrowingSkillPrior(5, 2)
-        env = TransformedEnv(
-            WaterworldMazeEnv(batch_size=[32], observation=False),
-            Compose(SkillTransform(5, 1, prior=prior), DisplacementTransform()),
-        )
-        loss = DIAYNTrainer.make_loss(env, 5, seed=0, prior=prior)
-        trainer = DIAYNTrainer(env, loss, total_frames=64 * batches, seed=0, save_dir=save_dir)
-        grow = GrowSkills(
-            prior,
-            lambda: coverages[int(prior.num_active)],
-            patience=1,
-            prune=False,
-            min_base_steps=128,
-            max_base_steps=128,
-            window=2,
-        )
-        grow.register(trainer)
-        return trainer, grow
-
-    whole, expected = build(8, None)
+    whole, expected = growing_worker(8)
     whole.train()
-    half, _ = build(5, tmp_path)
-    half.train()  # ends while the fourth skill is on trial
-    resumed, grow = build(8, tmp_path)
+    growing_worker(5, tmp_path)[0].train()  # ends while the fourth skill is on trial
+    resumed, grow = growing_worker(8, tmp_path)
     resumed.load(tmp_path)
     assert int(grow.prior.num_active) == 4
     resumed.train()
     assert grow.history["better"] == expected.history["better"] == [True, True, False]
     assert int(grow.prior.num_active) == 3
-    states = (t.loss_module.state_dict().items() for t in (whole, resumed))
-    for (key, value), (_, again) in zip(*states, strict=True):
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, again), key
+    states = [t.loss_module.state_dict() for t in (resumed, whole)]
+    assert differences(*states) == []

@@ -23,6 +23,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase
+from trainer_parts import Bars, differences, weights
 
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
@@ -80,26 +81,12 @@ class Walk(EnvBase):
         )
 
 
-class Stepper:
-    """Makes envs and remembers them."""
-
-    def __init__(self) -> None:
-        self.envs: list[Walk] = []
-
-    def __call__(self) -> Walk:
-        self.envs.append(Walk())
-        return self.envs[-1]
-
-
-def make_loss(num_skills: int = 4, seed: int = 0) -> Any:
-    class Displaced(Walk):  # the trainer's recorder writes displacement; its size is all we need
-        @property
-        def full_observation_spec_unbatched(self) -> Composite:
-            spec = super().full_observation_spec_unbatched.clone()
-            spec["displacement"] = Unbounded((2,))
-            return spec
-
-    return DIAYNTrainer.make_loss(Displaced(), num_skills, hidden=(8, 8), seed=seed)
+class Displaced(Walk):  # the trainer's recorder writes displacement; its size is all we need
+    @property
+    def full_observation_spec_unbatched(self) -> Composite:
+        spec = super().full_observation_spec_unbatched.clone()
+        spec["displacement"] = Unbounded((2,))
+        return spec
 
 
 def make_trainer(make_env: Callable[[], EnvBase] = Walk, **kwargs: Any) -> HMCTSTrainer:
@@ -111,63 +98,64 @@ def make_trainer(make_env: Callable[[], EnvBase] = Walk, **kwargs: Any) -> HMCTS
         "batch_size": 16,
         "make_planner": partial(MCTSPlanner, budget=SearchBudget(expansions=4)),
     }
-    return HMCTSTrainer(make_env, make_loss(), **{**settings, **kwargs})
+    loss = DIAYNTrainer.make_loss(Displaced(), 4, hidden=(8, 8), seed=0)
+    return HMCTSTrainer(make_env, loss, **{**settings, **kwargs})
 
 
-def weights(trainer: HMCTSTrainer) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in trainer.loss_module.parameters()])
-
-
-def test_a_run_that_is_resumed_after_its_training_has_ended_trains_no_further(
-    tmp_path: Path,
-) -> None:
-    settings: dict[str, Any] = {"rounds": 10_000, "total_frames": 60, "save_dir": tmp_path}
-    whole = make_trainer(**settings)
-    whole.train()
-    again = make_trainer(**settings).load(tmp_path)
-    again.train()
-    assert again.collected_frames == whole.collected_frames >= 60
-    assert torch.equal(weights(again), weights(whole))
-
-
-def recorded_dataset(size: int = 40) -> TensorDict:
-    trainer = make_trainer(rounds=size, num_init_samples=size)
+def trained(make_env: Callable[[], EnvBase] = Walk, **kwargs: Any) -> HMCTSTrainer:
+    trainer = make_trainer(make_env, **kwargs)
     trainer.train()
-    return trainer.replay_buffer[:][:size]
+    return trainer
+
+
+def always(action: int) -> Callable[[TensorDictBase], TensorDictBase]:
+    return lambda td: td.set("action", torch.full(td.batch_size, action))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> TensorDict:
+    """40 transitions of options from here."""
+    return trained(rounds=40, num_init_samples=40).replay_buffer[:][:40]
 
 
 def test_it_trains_when_the_interval_divides_the_round_and_at_no_other_time() -> None:
-    trainer = make_trainer(rounds=5 + 7, retrain_interval=3)
-    trainer.train()
+    bars = Bars()
+    trainer = trained(rounds=5 + 7, retrain_interval=3, progress=bars)
     assert trainer.retrained_at == [0, 3, 6]
     assert trainer.records.columns["round"].tolist() == [0, 1, 2, 3, 4, 5, 6]
     steps = trainer.records.columns["training_steps"]
     assert [len(set(steps[i : i + 3])) for i in (0, 3)] == [1, 1]
     assert np.all(np.diff(steps[::3]) > 0)
     assert len(trainer.history["loss_actor"]) == 3
+    (bar,) = bars  # of rounds
+    assert (bar.total, bar.n, bar.closed) == (7, 7, True)
+    assert set(bar.figures) == {"solved", "base_steps", "simulated_steps", "executed_steps"}
 
 
 def test_every_base_step_that_an_env_took_is_counted_and_stored() -> None:
-    stepper = Stepper()
-    trainer = make_trainer(stepper)
-    real, simulator = stepper.envs
-    built = real.base_steps, simulator.base_steps
+    envs: list[Walk] = []
+
+    def make_env() -> Walk:
+        envs.append(Walk())
+        return envs[-1]
+
+    trainer = make_trainer(make_env)
+    built = [env.base_steps for env in envs]
     trainer.train()
-    executed = trainer.records.columns["executed_steps"].sum() + trainer.collector.init_steps
-    assert real.base_steps - built[0] == executed
-    assert simulator.base_steps - built[1] == trainer.records.columns["simulated_steps"].sum() > 0
-    total = sum(env.base_steps for env in stepper.envs) - sum(built)
-    assert trainer.collected_frames == trainer.collector.training_steps == total
-    assert len(trainer.replay_buffer) == total
+    real, simulated = (env.base_steps - n for env, n in zip(envs, built, strict=True))
+    columns = trainer.records.columns
+    assert real == columns["executed_steps"].sum() + trainer.collector.init_steps
+    assert simulated == columns["simulated_steps"].sum() > 0
+    assert trainer.collected_frames == trainer.collector.training_steps == real + simulated
     data = trainer.replay_buffer[:]
+    assert len(data) == real + simulated
     assert set(data.keys(True, True)) == set(trainer.loss_module.in_keys)
     moved = data["next", "displacement"] - data["displacement"]
     torch.testing.assert_close(moved, data["next", "velocity"])
 
 
 def test_the_first_samples_are_as_many_options_with_skills_of_all_kinds() -> None:
-    trainer = make_trainer(rounds=64, num_init_samples=64, option_steps=1)
-    trainer.train()
+    trainer = trained(rounds=64, num_init_samples=64, option_steps=1)
     data = trainer.replay_buffer[:]
     assert len(data) == trainer.collected_frames == trainer.collector.init_steps == 64
     assert data["skill"].bincount(minlength=4).min() > 64 / 4 / 3
@@ -176,34 +164,25 @@ def test_the_first_samples_are_as_many_options_with_skills_of_all_kinds() -> Non
     assert trainer.retrained_at == [0]
 
 
-def test_without_a_dataset_the_worker_of_the_first_samples_is_untrained() -> None:
-    optimised: list[int] = []
-    for dataset, expected in ((None, 0), (recorded_dataset(), 7)):
+def test_the_worker_is_trained_on_a_dataset_before_the_first_samples(recorded: TensorDict) -> None:
+    for dataset, expected in ((None, 0), (recorded, 7)):
+        optimised: list[int] = []
         trainer = make_trainer(dataset=dataset, pretrain_updates=7)
         trainer.register_op(
-            "batch_process", lambda batch, t=trainer: optimised.append(t._optim_count)
+            "batch_process", lambda batch, t=trainer, n=optimised: n.append(t._optim_count)
         )
         trainer.train()
         assert optimised[0] == expected
-        optimised.clear()
-
-
-def test_an_empty_dataset_is_no_dataset() -> None:
-    empty = ReplayBuffer(storage=LazyTensorStorage(10))
-    runs = [make_trainer(dataset=dataset) for dataset in (None, empty)]
-    for trainer in runs:
-        trainer.train()
-    assert torch.equal(weights(runs[0]), weights(runs[1]))
 
 
 @pytest.mark.parametrize(("fraction", "share"), [(0.25, 0.25), (1.0, 1.0), (0.0, 0.0), (None, 0.5)])
 def test_batches_mix_samples_and_dataset_in_the_given_share(
-    fraction: float | None, share: float
+    fraction: float | None, share: float, recorded: TensorDict
 ) -> None:
-    dataset = recorded_dataset(30)
+    dataset = recorded.clone()
     dataset["velocity"] = torch.full_like(dataset["velocity"], 77.0)
     trainer = make_trainer(dataset=dataset, dataset_fraction=fraction, batch_size=4000)
-    trainer.replay_buffer.extend(recorded_dataset(30))
+    trainer.replay_buffer.extend(recorded)
     (sample, _), *_ = trainer._process_optim_batch_ops
     drawn = sample(None)
     found = float((drawn["velocity"][:, 0] == 77.0).float().mean())
@@ -212,50 +191,38 @@ def test_batches_mix_samples_and_dataset_in_the_given_share(
     assert len(drawn) == 4000
 
 
-@pytest.mark.parametrize("form", ["memmap", "dumps", "buffer", "grid"])
-def test_a_dataset_comes_back_from_disk_as_it_was(form: str, tmp_path: Path) -> None:
-    data = recorded_dataset(20)
+@pytest.mark.parametrize("form", ["memmap", "dumps", "buffer", "grid", "empty"])
+def test_a_dataset_is_the_same_in_every_form(
+    form: str, tmp_path: Path, recorded: TensorDict
+) -> None:
+    data: Any = recorded
     source: Any = tmp_path
-    if form == "memmap":
-        data.memmap(tmp_path)
-    elif form == "grid":
-        data.reshape(4, 5).memmap(tmp_path)
+    if form in ("memmap", "grid"):
+        (data.reshape(4, 10) if form == "grid" else data).memmap(tmp_path)
     else:
         source = ReplayBuffer(storage=LazyTensorStorage(50))
-        source.extend(data)
+        if form == "empty":
+            data = None
+        else:
+            source.extend(data)
         if form == "dumps":
             source.dumps(tmp_path)
             source = str(tmp_path)
-    loaded = load_dataset(source, list(data.keys(True, True)))
-    assert (loaded == data).all()
-    trainers = [make_trainer(dataset=given, pretrain_updates=2) for given in (source, data)]
-    for trainer in trainers:
-        trainer.train()
-    assert torch.equal(weights(trainers[0]), weights(trainers[1]))
-
-
-def test_a_dataset_without_what_the_loss_reads_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"lacks \['skill'\].*OptionRecorder"):
-        make_trainer(dataset=recorded_dataset(20).exclude("skill"))
-    with pytest.raises(FileNotFoundError, match="no dataset in"):
-        make_trainer(dataset=tmp_path)
-    with pytest.raises(TypeError, match="got int"):
-        make_trainer(dataset=3)
+    if data is not None:
+        assert (load_dataset(source, list(data.keys(True, True))) == data).all()
+    runs = [weights(trained(dataset=given, pretrain_updates=2)) for given in (source, data)]
+    assert torch.equal(*runs)
 
 
 def test_a_worker_that_goes_right_solves_every_test_in_a_known_number_of_steps() -> None:
-    def right(td: TensorDictBase) -> TensorDictBase:
-        return td.set("action", torch.full(td.batch_size, 3))
-
-    trainer = make_trainer(
+    trainer = trained(
         rounds=6,
         make_test_env=Walk,
-        test_worker=right,
+        test_worker=always(3),
         test_rounds=9,
         option_steps=8,
         make_test_planner=partial(MCTSPlanner, budget=SearchBudget(expansions=1)),
     )
-    trainer.train()
     curve = trainer.test_records.curve()
     distance = 8.0 - trainer._test_starts["position"][:, 0].mean().item()
     assert curve["training_steps"][0] == 0.0
@@ -268,12 +235,7 @@ def test_a_worker_that_goes_right_solves_every_test_in_a_known_number_of_steps()
 
 
 def test_an_unsolved_round_counts_with_what_it_cost() -> None:
-    def left(td: TensorDictBase) -> TensorDictBase:
-        return td.set("action", torch.full(td.batch_size, 2))
-
-    trainer = make_trainer(worker=left, rounds=7)
-    trainer.train()
-    curve = trainer.records.curve()
+    curve = trained(worker=always(2), rounds=7).records.curve()  # to the left
     assert curve["solved"].tolist() == [0.0]
     assert curve["simulated_steps"].tolist() == [4 * 4 * 3]  # expansions, options, base steps
     assert curve["executed_steps"].tolist() == [0.0]
@@ -296,12 +258,18 @@ def test_the_curve_means_over_the_rounds_of_one_worker() -> None:
     }
 
 
-def test_base_steps_end_the_training_when_they_are_limited() -> None:
-    trainer = make_trainer(rounds=100, total_frames=200)
-    trainer.train()
+def test_base_steps_end_the_training_when_they_are_limited_and_again_when_it_is_resumed(
+    tmp_path: Path,
+) -> None:
+    settings: dict[str, Any] = {"rounds": 100, "total_frames": 200, "save_dir": tmp_path}
+    trainer = trained(**settings)
     assert trainer.collected_frames >= 200
     assert 0 < trainer.collector.round < 95
     assert trainer.collected_frames - trainer.records.columns["simulated_steps"][-2:].sum() < 200
+    again = make_trainer(**settings).load(tmp_path)
+    again.train()
+    assert again.collected_frames == trainer.collected_frames
+    assert torch.equal(weights(again), weights(trainer))
 
 
 def test_the_same_seed_gives_the_same_run_whatever_was_drawn_before() -> None:
@@ -309,12 +277,18 @@ def test_the_same_seed_gives_the_same_run_whatever_was_drawn_before() -> None:
     for seed in (0, 0, 1):
         torch.rand(len(runs) + 1)
         before = torch.get_rng_state()
-        trainer = make_trainer(seed=seed)
-        trainer.train()
+        runs.append(weights(trained(seed=seed)))
         assert torch.equal(torch.get_rng_state(), before)
-        runs.append(weights(trainer))
     assert torch.equal(runs[0], runs[1])
     assert not torch.equal(runs[0], runs[2])
+
+
+def test_seeds_of_different_rounds_and_phases_differ() -> None:
+    drawn = set()
+    for phase, index in (("round", 0), ("round", 1), ("train", 0), ("train", 1)):
+        with seeded(0, phase, index) as seed:
+            drawn.add((seed, float(torch.rand(()))))
+    assert len(drawn) == len({a for a, _ in drawn}) == len({b for _, b in drawn}) == 4
 
 
 def resumable(folder: Path, rounds: int, saved: str) -> HMCTSTrainer:
@@ -335,9 +309,7 @@ def everything(trainer: HMCTSTrainer) -> dict[str, Any]:
         "optimizer": trainer.optimizer.state_dict(),
         "buffer": trainer.replay_buffer[:].to_dict(),
         "cursor": trainer.replay_buffer.writer._cursor,
-        "length": len(trainer.replay_buffer),
-        "frames": trainer.collected_frames,
-        "updates": trainer._optim_count,
+        "counts": [trainer.collected_frames, trainer._optim_count, len(trainer.replay_buffer)],
         "history": trainer.history,
         "retrained": trainer.retrained_at,
         "rounds": trainer.records.state_dict(),
@@ -345,47 +317,23 @@ def everything(trainer: HMCTSTrainer) -> dict[str, Any]:
     }
 
 
-RUN = """
-import sys; sys.path.insert(0, {here!r})
-from pathlib import Path
-import torch
-from test_hmcts_trainer import everything, resumable
-folder = Path({folder!r})
-trainer = resumable(folder, {rounds}, "half").load(folder / "half")
-trainer.train()
-torch.save(everything(trainer), folder / "resumed.pt")
-"""
-
-
-def same(a: Any, b: Any) -> bool:
-    if isinstance(a, torch.Tensor):
-        return bool(torch.equal(a, b))
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(map(same, a, b))
-    return bool(a == b)
-
-
-def test_a_run_resumed_in_a_new_process_is_the_unbroken_run_bit_for_bit(tmp_path: Path) -> None:
-    recorded_dataset(30).memmap(tmp_path / "data")
+def test_a_run_resumed_in_a_new_process_is_the_unbroken_run_bit_for_bit(
+    tmp_path: Path, recorded: TensorDict
+) -> None:
+    recorded.memmap(tmp_path / "data")
     half = resumable(tmp_path, 5 + 4, "half")
     half.train()
-    script = RUN.format(here=str(Path(__file__).parent), folder=str(tmp_path), rounds=5 + 8)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    subprocess.run([sys.executable, __file__, str(tmp_path)], check=True, timeout=300)
     resumed = torch.load(tmp_path / "resumed.pt")
     trainer = resumable(tmp_path, 5 + 8, "unbroken")
     trainer.train()
-    unbroken = everything(trainer)
-    assert unbroken["frames"] > 300 == unbroken["length"]  # the buffer has turned over
-    assert not same(unbroken["loss"], half.loss_module.state_dict())
-    for name in unbroken:
-        assert same(unbroken[name], resumed[name]), name
+    assert trainer.collected_frames > 300 == len(trainer.replay_buffer)  # it has turned over
+    assert not torch.equal(weights(trainer), weights(half))
+    assert differences(everything(trainer), resumed) == []
 
 
 def test_what_would_change_the_run_is_refused_when_resuming(tmp_path: Path) -> None:
-    make_trainer(save_dir=tmp_path).train()
+    trained(save_dir=tmp_path)
     with pytest.raises(Exception, match="retrain_interval=2; this trainer has 3"):
         make_trainer(retrain_interval=3).load(tmp_path)
     with pytest.raises(Exception, match="seed=0; this trainer has 1"):
@@ -402,35 +350,9 @@ def test_ucb_gets_the_given_constant() -> None:
         budget = SearchBudget(expansions=2)
         return MCTSPlanner(env, tree_policy=tree_policy, seed=seed, budget=budget)
 
-    make_trainer(make_planner=make_planner, c_p=0.3).train()
+    trained(make_planner=make_planner, c_p=0.3)
     assert [c for c, _ in seen] == [0.3, 0.3, 0.3]
     assert len({seed for _, seed in seen}) == 3
-
-
-def test_a_progress_bar_counts_rounds() -> None:
-    class Bar:
-        def __init__(self, total: int) -> None:
-            self.total, self.n, self.closed, self.figures = total, 0, False, {}
-
-        def update(self, n: int) -> None:
-            self.n += n
-
-        def set_postfix(self, *, refresh: bool, **figures: str) -> None:
-            self.figures = figures
-
-        def close(self) -> None:
-            self.closed = True
-
-    bars: list[Bar] = []
-
-    def progress(total: int) -> Bar:
-        bars.append(Bar(total))
-        return bars[-1]
-
-    make_trainer(progress=progress).train()
-    (bar,) = bars
-    assert (bar.total, bar.n, bar.closed) == (6, 6, True)
-    assert set(bar.figures) == {"solved", "base_steps", "simulated_steps", "executed_steps"}
 
 
 @pytest.mark.parametrize(
@@ -439,11 +361,14 @@ def test_a_progress_bar_counts_rounds() -> None:
         ({"rounds": 4}, "rounds >= 5; got 4. The rounds include num_init_samples"),
         ({"retrain_interval": 0}, "retrain_interval >= 1; got 0"),
         ({"num_init_samples": 0}, "num_init_samples >= 1; got 0"),
-        ({"dataset_fraction": 1.5}, "dataset_fraction between 0 and 1; got 1.5"),
+        ({"dataset_fraction": 1.5}, "dataset_fraction >= 0.0 and <= 1.0; got 1.5"),
+        ({"dataset": TensorDict(x=torch.ones(2), batch_size=2)}, "lacks .*OptionRecorder"),
+        ({"dataset": Path("nowhere")}, "no dataset in"),
+        ({"dataset": 3}, "got int"),
     ],
 )
-def test_numbers_out_of_range_are_refused(kwargs: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_what_makes_no_sense_is_refused(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError, FileNotFoundError), match=message):
         make_trainer(**kwargs)
 
 
@@ -455,9 +380,8 @@ def test_an_env_with_a_state_of_its_own_is_refused() -> None:
         make_trainer(Locked)
 
 
-def test_seeds_of_different_rounds_and_phases_differ() -> None:
-    drawn = set()
-    for phase, index in (("round", 0), ("round", 1), ("train", 0), ("train", 1)):
-        with seeded(0, phase, index) as seed:
-            drawn.add((seed, float(torch.rand(()))))
-    assert len(drawn) == len({a for a, _ in drawn}) == len({b for _, b in drawn}) == 4
+if __name__ == "__main__":
+    place = Path(sys.argv[1])
+    continued = resumable(place, 5 + 8, "half").load(place / "half")
+    continued.train()
+    torch.save(everything(continued), place / "resumed.pt")

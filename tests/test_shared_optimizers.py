@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from torchrl_hmcts.trainers import SharedAdam, SharedRMSprop, share_optimizer
+from torchrl_hmcts.trainers import SharedRMSprop
+from torchrl_hmcts.trainers.a3c.shared_optimizers import share_optimizer
 
 GRADIENTS = [[2.0, -1.0], [0.5, 0.0], [-4.0, 1e-3]]
 
@@ -37,18 +37,11 @@ def test_rmsprop_is_the_papers_formula_with_epsilon_under_the_root() -> None:
         assert value.tolist() == pytest.approx(theta, rel=1e-5)
 
 
-@pytest.mark.parametrize("fused", [True, False])
-def test_adam_is_torchs_adam_from_the_first_step(fused: bool) -> None:
-    settings = {"lr": 0.1, "weight_decay": 0.3, "amsgrad": True, "fused": fused}
-    mine, theirs = (nn.Parameter(torch.tensor([1.0, 2.0])) for _ in range(2))
-    actual = step_through(SharedAdam([mine], **settings), mine)
-    expected = step_through(torch.optim.Adam([theirs], **settings), theirs)
-    assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
-
-
 @pytest.mark.parametrize(
     "make",
     [
+        lambda p: torch.optim.Adam(p, lr=0.1, weight_decay=0.3, amsgrad=True, fused=True),
+        lambda p: torch.optim.Adam(p, lr=0.1, amsgrad=True),
         lambda p: torch.optim.Adagrad(p, lr=0.1, initial_accumulator_value=0.5),
         lambda p: torch.optim.Adamax(p, lr=0.1),
         lambda p: torch.optim.AdamW(p, lr=0.1, weight_decay=0.1),
@@ -71,18 +64,9 @@ def test_a_shared_optimiser_steps_as_one_that_is_not(
     assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
 
 
-def test_groups_keep_their_settings() -> None:
-    parameters = [nn.Parameter(torch.ones(1)) for _ in range(2)]
-    groups: list[dict[str, Any]] = [{"params": [p]} for p in parameters]
-    groups[1].update(lr=0.5, weight_decay=0.25)
-    optimizer = SharedAdam(groups, lr=0.1)
-    assert [group["lr"] for group in optimizer.param_groups] == [0.1, 0.5]
-    assert [group["weight_decay"] for group in optimizer.param_groups] == [0, 0.25]
-
-
 def test_a_loaded_state_is_shared_again_and_kept() -> None:
     first, second = (nn.Parameter(torch.tensor([1.0, 2.0])) for _ in range(2))
-    trained, fresh = SharedAdam([first], lr=0.1), SharedAdam([second], lr=0.1)
+    trained, fresh = (share_optimizer(torch.optim.Adam([p], lr=0.1)) for p in (first, second))
     step_through(trained, first)
     fresh.load_state_dict(trained.state_dict())
     share_optimizer(fresh)
@@ -114,7 +98,7 @@ def test_a_closure_is_called_with_gradients() -> None:
 
 
 def test_an_optimiser_whose_state_cannot_be_built_beforehand_is_refused() -> None:
-    with pytest.raises(TypeError, match="NAdam builds its state at its first step.*SharedAdam"):
+    with pytest.raises(TypeError, match="NAdam builds its state at its first step.*SharedRMSprop"):
         share_optimizer(torch.optim.NAdam([nn.Parameter(torch.ones(1))]))
 
 
@@ -127,10 +111,10 @@ def test_parameters_that_are_not_in_the_cpus_memory_are_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"lr": -1.0}, "lr >= 0; got -1.0"),
-        ({"alpha": 1.0}, r"alpha in \[0, 1\).*1.0"),
+        ({"lr": -1.0}, "lr >= 0.0.*; got -1.0"),
+        ({"alpha": 1.0}, "alpha < 1.*1.0"),
         ({"eps": 0.0}, "eps > 0.*0.0"),
-        ({"weight_decay": -1.0}, "weight_decay >= 0; got -1.0"),
+        ({"weight_decay": -1.0}, "weight_decay >= 0.0.*; got -1.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, float], message: str) -> None:

@@ -24,7 +24,7 @@ from torchrl_hmcts.modules import (
 from torchrl_hmcts.objectives import IntraOptionQLoss, OptionTerminationLoss
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget, Transpositions
 from torchrl_hmcts.testing import ChainEnv, TableEnv
-from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
+from torchrl_hmcts.trainers.skills.termination import HindsightTransitions, MazeView
 from torchrl_hmcts.transforms import OptionTransform, StallTransform
 
 LEFT, RIGHT = 0, 1

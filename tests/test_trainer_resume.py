@@ -6,7 +6,6 @@ import random
 import subprocess
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from torch import nn
 from torchrl.checkpoint import CheckpointError, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import Compose, GymEnv, TransformedEnv
+from trainer_parts import differences
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
@@ -64,22 +64,6 @@ def train(trainer: DIAYNTrainer) -> dict[str, Any]:
     return torch.load(trainer.copy_of_end, weights_only=True)
 
 
-def differences(a: Any, b: Any, path: str = "") -> list[str]:
-    """Returns the paths at which two nested structures differ in any bit."""
-    if isinstance(a, torch.Tensor):
-        same = a.dtype == b.dtype and torch.equal(a, b)
-        return [] if same else [path]
-    if isinstance(a, Mapping):
-        if list(a) != list(b):
-            return [f"{path}: {sorted(map(str, a))} and {sorted(map(str, b))}"]
-        return [d for key in a for d in differences(a[key], b[key], f"{path}.{key}")]
-    if isinstance(a, Sequence) and not isinstance(a, str):
-        if len(a) != len(b):
-            return [f"{path}: {len(a)} and {len(b)}"]
-        return [d for i in range(len(a)) for d in differences(a[i], b[i], f"{path}.{i}")]
-    return [] if a == b else [f"{path}: {a} and {b}"]
-
-
 def resume_in_this_process(folder: Path) -> None:
     trainer = make_trainer(2 * HALF, seed=99, save_dir=folder / "again", save_trainer_interval=60)
     trainer.load(folder / "checkpoints")
@@ -106,11 +90,25 @@ def test_a_run_resumed_in_a_new_process_ends_bit_for_bit_as_one_that_never_stopp
     assert len(expected["history"]["actor_loss"]) == 14
 
 
-def test_a_checkpoint_holds_no_pickle(tmp_path: Path) -> None:
-    make_trainer(32, save_dir=tmp_path).train()
+def test_a_checkpoint_holds_no_pickle_and_nothing_of_the_memory_that_the_buffer_has_not_filled(
+    tmp_path: Path,
+) -> None:
+    trainer = make_trainer(32, save_dir=tmp_path)  # of 128 rows
+
+    def leave_something(batch: Any) -> None:  # as another object does
+        for tensor in trainer.replay_buffer.storage._storage[32:].values(True, True):
+            tensor.copy_(torch.ones_like(tensor))
+
+    trainer.register_op("pre_steps_log", leave_something)
+    trainer.train()
     (checkpoint,) = tmp_path.iterdir()
     files = [Path(name) for name in zipfile.ZipFile(checkpoint).namelist()]
     assert {path.suffix for path in files} == {".json", ".memmap"}
+    stored, again = (
+        t.replay_buffer.storage._storage for t in (trainer, make_trainer(32).load(tmp_path))
+    )
+    assert (again[:32] == stored[:32]).all()
+    assert not any(tensor.any() for tensor in again[32:].values(True, True))
 
 
 def test_the_newest_checkpoint_of_a_folder_is_loaded_and_old_ones_are_removed(
@@ -128,33 +126,20 @@ def test_a_finished_run_can_be_given_more_base_steps(tmp_path: Path) -> None:
     trainer = make_trainer(64).load(tmp_path)
     trainer.train()
     assert trainer.history["optim_steps"] == [3, 6, 9, 12]
-
-
-def test_a_checkpoint_of_another_number_of_copies_is_refused(tmp_path: Path) -> None:
-    make_trainer(32, save_dir=tmp_path).train()
     with pytest.raises(CheckpointError, match=r"batch size \[8\]; this one has \[4\]"):
         make_trainer(32, copies=4).load(tmp_path)
-
-
-def test_a_folder_without_checkpoint_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no checkpoint in .*nothing"):
         make_trainer(32).load(tmp_path / "nothing")
 
 
-def test_a_run_refuses_the_checkpoints_of_another_before_it_trains(tmp_path: Path) -> None:
+def test_the_checkpoints_of_another_run_are_refused_or_overwritten(tmp_path: Path) -> None:
     make_trainer(96, save_dir=tmp_path).train()
     other = make_trainer(32, save_dir=tmp_path)
     with pytest.raises(FileExistsError, match=r"of another run: .*096\.torchrl.*overwrite=True"):
         other.train()
     assert other.collected_frames == 0
     assert make_trainer(96).load(tmp_path).collected_frames == 96
-
-
-def test_a_run_that_overwrites_has_its_own_checkpoints_though_its_steps_are_fewer(
-    tmp_path: Path,
-) -> None:
-    make_trainer(96, save_dir=tmp_path).train()
-    make_trainer(32, save_dir=tmp_path, overwrite=True).train()
+    make_trainer(32, save_dir=tmp_path, overwrite=True).train()  # though its steps are fewer
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000000032.torchrl"]
 
 
@@ -274,21 +259,3 @@ def test_a_generator_that_is_missing_is_named() -> None:
 
 if __name__ == "__main__":
     resume_in_this_process(Path(sys.argv[1]))
-
-
-def test_a_checkpoint_holds_nothing_of_the_memory_that_the_buffer_has_not_filled(
-    tmp_path: Path,
-) -> None:
-    trainer = make_trainer(32, save_dir=tmp_path)  # of 128 rows
-
-    def leave_something(batch: Any) -> None:  # as another object does
-        for tensor in trainer.replay_buffer.storage._storage[32:].values(True, True):
-            tensor.copy_(torch.ones_like(tensor))
-
-    trainer.register_op("pre_steps_log", leave_something)
-    trainer.train()
-    stored, again = (
-        t.replay_buffer.storage._storage for t in (trainer, make_trainer(32).load(tmp_path))
-    )
-    assert (again[:32] == stored[:32]).all()
-    assert not any(tensor.any() for tensor in again[32:].values(True, True))

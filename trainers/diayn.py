@@ -3,45 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from operator import index
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from types import NoneType
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase, Transform
-from torchrl.objectives import LossModule, SoftUpdate
-from torchrl.trainers import (
-    ReplayBufferTrainer,
-    TargetNetUpdaterHook,
-    Trainer,
-    UpdateWeights,
-)
+from torchrl.objectives import LossModule
+from torchrl.trainers import UpdateWeights
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, DiscreteSkillSACLoss, SkillObjective
-from torchrl_hmcts.processes import system_errors
-from torchrl_hmcts.trainers.restarting_collector import CollectorError
-from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+from torchrl_hmcts.trainers.collectors import CollectorError
+from torchrl_hmcts.trainers.off_policy import OffPolicyTrainer, Progress, made_by
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
 from torchrl_hmcts.trainers.skills.curves import Curves, log_curves
 from torchrl_hmcts.transforms import SkillReward
 
 
-class Progress(Protocol):
-    """What a progress bar must offer; ``tqdm.tqdm`` does."""
-
-    def update(self, n: int) -> object: ...
-    def set_postfix(self, *, refresh: bool, **figures: str) -> object: ...
-    def close(self) -> object: ...
-
-
-@name_arguments
-class DIAYNTrainer(ResumableTrainer):
+class DIAYNTrainer(OffPolicyTrainer):
     """Trains skills off-policy with any skill loss, on TorchRL's Trainer and Collector.
 
     Per batch: collect ``frames_per_batch`` base steps with the current policy, store them, and make
@@ -73,12 +58,12 @@ class DIAYNTrainer(ResumableTrainer):
     the entries can also be read by the loss's own names.
 
     Args:
-        env (EnvBase): env under :class:`SkillTransform` and whatever the objective reads (e.g.
+        env (EnvBase): env under :class:`SkillTransform` and what the objective reads (e.g.
             :class:`DisplacementTransform`). Mini-episodes of 50 steps and 32 copies in one batch
             (a stateless env built with ``batch_size=[32]``) go with the defaults below.
         loss_module (LossModule): a :class:`DIAYNLoss`, e.g. from :meth:`make_loss`, or any
             :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` (continuous actions).
-        total_frames (int): base steps in all. Default ``40_000``, the source's.
+        total_frames (int): base steps in all. Default ``40_000``, the dissertation's.
         frames_per_batch (int): base steps per batch, a multiple of the env's copies. Default
             ``64``.
         updates_per_batch (int): updates per batch. Default ``3``.
@@ -98,19 +83,19 @@ class DIAYNTrainer(ResumableTrainer):
             e.g. ``tqdm.tqdm``. Default ``None``: quiet.
         seed (int, optional): seeds the env and torch before the first reset. Default ``None``. The
             networks' initial weights are older than the trainer: :meth:`make_loss` has its own.
-        save_dir (path, optional): folder of checkpoints. Default ``None``: none. To go on from one,
-            build env, loss and trainer as before and call ``trainer.load(save_dir)``; the run goes
-            on as if it had never stopped, see :class:`ResumableTrainer`.
+        save_dir (path, optional): folder of checkpoints. Default ``None``: none. To continue from
+            one, build env, loss and trainer as before and call ``trainer.load(save_dir)``; the run
+            continues as if it had never stopped, see :class:`ResumableTrainer`.
         log_interval (int): base steps between two values that reach the ``logger``. Default ``0``:
             every batch.
         make_collector (callable): called as ``torchrl.collectors.Collector`` (default) is, with
             env, policy and keywords; e.g. one that collects in other processes, after each batch of
-            which the weights are sent there. Such a run does not go on exactly.
+            which the weights are sent there. Such a run does not resume exactly.
         **trainer_kwargs: passed to :class:`ResumableTrainer` and ``torchrl.trainers.Trainer``
             (``logger``, ``keep_last``, ``save_trainer_interval``, ...).
 
     Raises:
-        ValueError: if a batch does not divide among the env's copies.
+        ValueError: if a number is out of range, or a batch does not divide among the env's copies.
         TypeError: if the loss has no skill objective and no ``reward`` is given.
 
     Reference:
@@ -157,6 +142,13 @@ class DIAYNTrainer(ResumableTrainer):
         make_collector: Callable[..., BaseCollector] = Collector,
         **trainer_kwargs: Any,
     ) -> None:
+        owner = "DIAYNTrainer"
+        instance(owner, "env", env, EnvBase)
+        instance(owner, "reward", reward, Transform, NoneType)
+        instance(owner, "coverage", coverage, StateCoverage, NoneType)
+        whole_number(owner, "frames_per_batch", frames_per_batch, least=1)
+        whole_number(owner, "updates_per_batch", updates_per_batch, least=1)
+        whole_number(owner, "log_interval", log_interval, least=-1)
         copies = env.batch_size.numel()
         if frames_per_batch % copies:
             raise ValueError(
@@ -165,73 +157,41 @@ class DIAYNTrainer(ResumableTrainer):
             )
         objective = _objective(loss_module)
         if seed is not None:  # before the collector makes its first reset
-            env.set_seed(index(seed))
-            torch.manual_seed(index(seed))
+            seed = whole_number(owner, "seed", seed)
+            env.set_seed(seed)
+            torch.manual_seed(seed)
         if reward is None:
             reward = SkillReward(objective, reward_key=loss_module.tensor_keys.reward)
         if coverage is None:
             coverage = StateCoverage(_reached(objective))
         # Only what is read is stored.
         keys = list(dict.fromkeys([*loss_module.in_keys, *objective.in_keys, coverage.key]))
-
-        def stored(batch: TensorDictBase) -> TensorDictBase:
-            return batch.select(*keys, strict=False).reshape(-1)
-
-        collector = make_collector(
-            env,
-            SkillPolicy(loss_module.actor_network),
-            frames_per_batch=frames_per_batch,
-            total_frames=total_frames,
-            postproc=stored,
-            trust_policy=True,
-            track_traj_ids=False,
-            use_buffers=False,
-            return_same_td=True,  # each batch is a new one as it is
-            auto_register_policy_transforms=False,
-        )
-        with system_errors("DIAYNTrainer cannot have the shared memory of its replay buffer"):
-            buffer = ReplayBuffer(
-                storage=LazyTensorStorage(buffer_size), transform=reward, batch_size=batch_size
-            )
-        updater = _SoftUpdate(loss_module, tau=target_tau)
+        policy = SkillPolicy(loss_module.actor_network)
         super().__init__(
-            collector=collector,
+            partial(_collect, make_collector, env, policy, keys, frames_per_batch, total_frames),
+            loss_module,
+            make_skill_optimizer(loss_module, actor_lr, critic_lr, objective_lr, alpha_lr),
             total_frames=total_frames,
-            frame_skip=1,
             optim_steps_per_batch=updates_per_batch,
-            loss_module=loss_module,
-            optimizer=make_skill_optimizer(
-                loss_module, actor_lr, critic_lr, objective_lr, alpha_lr
-            ),
-            replay_buffer=buffer,
-            target_net_updater=updater,
             batch_size=batch_size,
+            buffer_size=buffer_size,
+            buffer_options={"transform": reward},
             clip_norm=clip_norm,
-            progress_bar=False,
+            target_tau=target_tau,
+            settings={"frames_per_batch": frames_per_batch, "updates_per_batch": updates_per_batch},
+            progress=progress,
+            progress_total=total_frames,
             save_dir=save_dir,
             log_interval=log_interval,
             auto_log_optim_steps=False,
             **trainer_kwargs,
         )
         self.seed = seed
-        self.run_settings.update(
-            frames_per_batch=frames_per_batch,
-            updates_per_batch=updates_per_batch,
-            batch_size=batch_size,
-            buffer_size=buffer_size,
-            target_tau=target_tau,
-            clip_norm=clip_norm,
-        )
-        replay = ReplayBufferTrainer(buffer, batch_size=batch_size)
-        self.register_op("batch_process", replay.extend)
-        self.register_op("process_optim_batch", replay.sample)
-        self.register_op("post_optim", TargetNetUpdaterHook(updater))
-        self.register_op("post_optim_complete_log", log_curves)
-        if not isinstance(collector, Collector):  # it has weights of its own
-            self.register_op("post_steps", UpdateWeights(collector, 1))
+        self._latest: dict[str, float] = {}
+        self.register_op("post_optim_complete_log", self._log_curves)
+        if not isinstance(self.collector, Collector):  # it has weights of its own
+            self.register_op("post_steps", UpdateWeights(self.collector, 1))
         coverage.register(self)
-        if progress is not None:
-            _ProgressHook(self, progress).register(self)
 
     def train(self) -> None:
         """Train.
@@ -249,6 +209,14 @@ class DIAYNTrainer(ResumableTrainer):
     def history(self) -> dict[str, list[float]]:
         """All logged values by name: per batch the mean over its updates of each curve."""
         return Curves(super().history)
+
+    def _log_curves(self, optim_steps: int, losses: TensorDictBase | None) -> dict[str, float]:
+        self._latest = log_curves(optim_steps, losses)
+        return self._latest
+
+    def progress_figures(self) -> dict[str, str]:
+        names = ("actor_loss", "critic_loss", "discriminator_loss", "discriminator_accuracy")
+        return {name: f"{self._latest[name]:.3f}" for name in names if name in self._latest}
 
     @staticmethod
     def make_loss(
@@ -284,7 +252,7 @@ class DIAYNTrainer(ResumableTrainer):
             discriminator_hidden (sequence of int): widths of the discriminator's hidden layers.
                 Default ``()``: see :class:`SkillDiscriminator`.
             seed (int, optional): seed of the initial weights; torch's generator is left as it was.
-                Default ``None``: torch's generator goes on.
+                Default ``None``: torch's generator is used.
             **loss_kwargs: passed to the loss.
 
         Returns:
@@ -296,7 +264,7 @@ class DIAYNTrainer(ResumableTrainer):
         action_spec = env.action_spec_unbatched
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
             if seed is not None:
-                torch.manual_seed(index(seed))
+                torch.manual_seed(int(seed))
             actor = SkillActor(
                 _width(env, in_keys), action_spec, num_skills, in_keys=in_keys, hidden=hidden
             )
@@ -340,59 +308,51 @@ def make_skill_optimizer(
 
     Examples:
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+        >>> from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
         >>> loss = DIAYNTrainer.make_loss(make_training_env(copies=1))
         >>> [(g["name"], g["lr"]) for g in make_skill_optimizer(loss).param_groups]
         [('actor', 0.002), ('critic', 0.003), ('objective', 0.01)]
     """
     parts = {
-        "actor": (loss_module.actor_network_params.parameters(), actor_lr),
-        "critic": (loss_module.qvalue_network_params.parameters(), critic_lr),
-        "objective": (_objective(loss_module).parameters(), objective_lr),
-        "alpha": ([loss_module.log_alpha], alpha_lr),
+        "actor": (loss_module.actor_network_params.parameters(), "actor_lr", actor_lr),
+        "critic": (loss_module.qvalue_network_params.parameters(), "critic_lr", critic_lr),
+        "objective": (_objective(loss_module).parameters(), "objective_lr", objective_lr),
+        "alpha": ([loss_module.log_alpha], "alpha_lr", alpha_lr),
     }
     groups = []
-    for name, (parameters, lr) in parts.items():
+    for name, (parameters, argument, lr) in parts.items():
+        rate = real_number("make_skill_optimizer", argument, lr, least=0.0)
         trained = [p for p in parameters if p.requires_grad]
         if trained:
-            groups.append({"params": trained, "lr": lr, "name": name})
+            groups.append({"params": trained, "lr": rate, "name": name})
     return torch.optim.Adam(groups, fused=True)
 
 
-class _SoftUpdate(SoftUpdate):
-    """Moves all targets in one call instead of one by one."""
-
-    @torch.no_grad()
-    def step(self) -> None:
-        targets = list(self._targets.values(True, True))
-        torch._foreach_lerp_(targets, list(self._sources.values(True, True)), 1.0 - self.eps)
-
-
-class _ProgressHook:
-    """Moves a progress bar and shows the latest figures beside it."""
-
-    figures = ("actor_loss", "critic_loss", "discriminator_loss", "discriminator_accuracy")
-
-    def __init__(self, trainer: Trainer, progress: Callable[..., Progress]) -> None:
-        self.trainer, self.progress = trainer, progress
-
-    def register(self, trainer: Trainer) -> None:
-        trainer.register_op("setup", self.begin)
-        trainer.register_op("post_steps_log", self)
-        trainer.register_op("shutdown", self.end)
-
-    def begin(self) -> None:
-        self.bar = self.progress(total=self.trainer.total_frames)
-        self.bar.update(self.trainer.collected_frames)  # those of a resumed run
-
-    def __call__(self, batch: TensorDictBase) -> None:
-        log = self.trainer._log_dict
-        figures = {key: f"{float(log[key][-1]):.3f}" for key in self.figures if log.get(key)}
-        self.bar.set_postfix(refresh=False, **figures)
-        self.bar.update(batch.numel())
-
-    def end(self) -> None:
-        self.bar.close()
+def _collect(
+    make_collector: Callable[..., BaseCollector],
+    env: EnvBase,
+    policy: SkillPolicy,
+    keys: Sequence[NestedKey],
+    frames_per_batch: int,
+    total_frames: int,
+) -> BaseCollector:
+    """Returns a collector whose batches have one dimension and only these entries."""
+    return made_by(
+        make_collector,
+        "DIAYNTrainer",
+        "make_collector",
+        object,
+        env,
+        policy,
+        frames_per_batch=frames_per_batch,
+        total_frames=total_frames,
+        postproc=lambda batch: batch.select(*keys, strict=False).reshape(-1),
+        trust_policy=True,
+        track_traj_ids=False,
+        use_buffers=False,
+        return_same_td=True,  # each batch is a new one as it is
+        auto_register_policy_transforms=False,
+    )
 
 
 def _objective(loss_module: LossModule) -> SkillObjective:

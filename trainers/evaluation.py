@@ -23,28 +23,19 @@ from torchrl_hmcts.planners.simulator import Simulator
 
 @dataclass
 class Execution:
-    """What executing plans led to, one entry per start ``[M]``.
-
-    Attributes:
-        solved (ndarray): bool, whether the episode met a terminal state.
-        base_steps (ndarray): int64, base steps that were taken.
-        rewards (ndarray): float32, sum of the rewards of the options.
-        states (list of TensorDictBase): with ``keys`` the chosen entries ``[T + 1]`` before the
-            first and after every base step; of an env without a ``"trajectory"`` after every
-            option. Empty without ``keys``.
-        options (list of Tensor): int64 ``[T]``, the option under way between two states.
-
-    Example:
-        >>> import numpy as np
-        >>> Execution(np.array([True]), np.array([3]), np.array([1.0])).base_steps.tolist()
-        [3]
-    """
+    """What executing plans led to, one entry per start ``[M]``."""
 
     solved: np.ndarray
+    """Bool, whether the episode met a terminal state."""
     base_steps: np.ndarray
+    """Int64, base steps that were taken."""
     rewards: np.ndarray
+    """Float32, sum of the rewards of the options."""
     states: list[TensorDictBase] = field(default_factory=list)
+    """With ``keys`` the chosen entries ``[T + 1]`` before the first and after every base step; of
+    an env without a ``"trajectory"`` after every option."""
     options: list[Tensor] = field(default_factory=list)
+    """With ``keys``, int64 ``[T]``, the option under way between two states."""
 
 
 @torch.no_grad()

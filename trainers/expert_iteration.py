@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from operator import index
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from types import NoneType
 from typing import Any, Literal
 
 import numpy as np
@@ -11,11 +12,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.trainers import LRSchedulerHook, ReplayBufferTrainer
+from torchrl.objectives import LossModule
+from torchrl.trainers import LRSchedulerHook
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import (
     PUCT,
@@ -25,11 +26,11 @@ from torchrl_hmcts.planners import (
     SearchBudget,
     search_examples,
 )
-from torchrl_hmcts.processes import system_errors
-from torchrl_hmcts.trainers.diayn import Progress
-from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+from torchrl_hmcts.trainers.collectors import LocalCollector
+from torchrl_hmcts.trainers.off_policy import OffPolicyTrainer, Progress
 
 _TARGETS = ("policy_target", "policy_weight", "value_target", "value_weight", "action_mask")
+_GROUP = 100  # searches side by side
 
 
 def make_guided_planner(
@@ -53,7 +54,7 @@ def make_guided_planner(
             simulations more where the network is right, far fewer where it is wrong.
         novelty: which new nodes are worth searching. Default: all. Choose a test much stricter on
             what it calls equal than without a network (in Waterworld a radius of 0.2 tiles instead
-            of 0.7): the values tell near states apart, but a network that is still wrong goes in
+            of 0.7): the values tell near states apart, but a network that is still wrong walks in
             circles without one.
         expand: ``"one"`` (default) simulates only the option that PUCT chooses.
         budget: Default: 4,000 expansions, of one option each.
@@ -66,9 +67,11 @@ def make_guided_planner(
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
         >>> from torchrl_hmcts.trainers.expert_iteration import make_guided_planner
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
         >>> env = WaterworldMazeEnv(observation=False)  # plans base steps, for example
-        >>> make_guided_planner(env, MazeNetwork(env.mazes)).num_options
+        >>> network = TensorDictModule(
+        ...     lambda velocity: (torch.zeros(*velocity.shape[:-1], 4), velocity[..., :1]),
+        ...     ["velocity"], ["logits", "state_value"])
+        >>> make_guided_planner(env, network).num_options
         4
     """
     guide = PolicyValueEvaluator(network, uniform_share=uniform_share)
@@ -86,12 +89,11 @@ def make_guided_planner(
     )
 
 
-@name_arguments
-class SearchCollector:
+class SearchCollector(LocalCollector):
     """Yields one batch of examples per iteration, from searches at fresh starts of an env.
 
-    Takes the place of a TorchRL collector in a ``Trainer``: a frame is an example. What the
-    searches cost is counted in ``base_steps``.
+    A frame is an example. What the searches of each iteration cost is in ``base_steps`` and
+    ``simulations`` of options; ``solved`` counts those that found a plan.
 
     Args:
         env: the macro environment whose resets give the starts; batch size ``[]``.
@@ -100,23 +102,9 @@ class SearchCollector:
         iterations: batches to yield.
         searches: starts per iteration.
         keys: entries of the states that the network reads.
-        group: searches side by side. Default 100.
-        seed: of the starts: those of iteration i come from ``seed + i``. Default 0.
+        seed: of the starts: those of iteration i come from ``seed + i``.
         example_kwargs: passed to :func:`~torchrl_hmcts.planners.search_examples`.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> from torchrl_hmcts.trainers.expert_iteration import SearchCollector
-        >>> env = ChainEnv(length=4)
-        >>> planner = MCTSPlanner(env)
-        >>> collector = SearchCollector(
-        ...     env, planner, planner, iterations=1, searches=2, keys=["state"])
-        >>> next(iter(collector))["state"].reshape(-1).tolist(), collector.solved
-        ([0, 1, 2, 0, 1, 2], [2])
     """
-
-    init_random_frames = 0
 
     def __init__(
         self,
@@ -127,21 +115,18 @@ class SearchCollector:
         iterations: int,
         searches: int,
         keys: Sequence[NestedKey],
-        group: int = 100,
-        seed: int = 0,
-        example_kwargs: dict[str, Any] | None = None,
+        seed: int,
+        example_kwargs: Mapping[str, Any],
     ) -> None:
         self.env = env
         self.planners = (first_planner, planner)
-        self.iterations = iterations
-        self.searches = searches
+        self.iterations, self.searches = iterations, searches
         self.keys = list(keys)
-        self.group = group
         self.seed = seed
-        self.example_kwargs = example_kwargs or {}
-        self.base_steps: list[int] = []  # simulated, per iteration
-        self.simulations: list[int] = []  # options simulated, per iteration
-        self.solved: list[int] = []  # searches that found a plan, per iteration
+        self.example_kwargs = dict(example_kwargs)
+        self.base_steps: list[int] = []
+        self.simulations: list[int] = []
+        self.solved: list[int] = []
         for planner in self.planners:
             planner.simulator.keep([k for k in self.keys if k not in planner.simulator.kept_keys])
 
@@ -156,8 +141,8 @@ class SearchCollector:
         self.env.set_seed(self.seed + iteration)
         starts = self.env.reset(TensorDict(batch_size=[self.searches]))
         examples, counts = [], np.zeros(3, np.int64)
-        for begin in range(0, self.searches, self.group):
-            search = planner.search(starts[begin : begin + self.group], seed=iteration)
+        for some in starts.split(_GROUP):
+            search = planner.search(some, seed=iteration)
             found = search_examples(search, keys=self.keys, **self.example_kwargs)
             examples.append(found.select(*self.keys, *_TARGETS))
             counts += (
@@ -166,40 +151,27 @@ class SearchCollector:
                 (search.best_node >= 0).sum(),
             )
         planner.last_search = None  # its trees are large
-        for kept, count in zip(
-            (self.base_steps, self.simulations, self.solved), counts, strict=True
-        ):
-            kept.append(int(count))
+        self.base_steps.append(int(counts[0]))
+        self.simulations.append(int(counts[1]))
+        self.solved.append(int(counts[2]))
         return torch.cat(examples)
-
-    def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Seed the starts of the iterations to come."""
-        self.seed = seed
-        return seed
-
-    def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing runs beside this process."""
-
-    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing to do: the planner reads the network that is trained."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return what was counted, and with it the iteration."""
         return {name: list(getattr(self, name)) for name in ("base_steps", "simulations", "solved")}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on after the iterations of another collector."""
+        """Continue after the iterations of another collector."""
         for name, values in state_dict.items():
             setattr(self, name, list(values))
 
 
-@name_arguments
-class ExpertIterationTrainer(ResumableTrainer):
+class ExpertIterationTrainer(OffPolicyTrainer):
     """Trains the network that guides a planner, on what the planner finds with its help.
 
-    Per iteration: search at fresh starts (:class:`SearchCollector`), store the examples, and make
-    ``updates_per_iteration`` updates with Adam, whose learning rate falls to zero by a cosine over
-    all updates. Iteration 0 searches without the network.
+    Per iteration: search at fresh starts, store the examples, and make ``updates_per_iteration``
+    updates with Adam, whose learning rate falls to zero by a cosine over all updates. Iteration 0
+    searches without the network.
 
     Args:
         env (EnvBase): the macro environment of the training mazes.
@@ -225,8 +197,12 @@ class ExpertIterationTrainer(ResumableTrainer):
         seed (int): of the starts and of the batches. Default 0.
         **trainer_kwargs: passed to :class:`ResumableTrainer` (``logger``, ``save_dir``, ...).
 
+    Attributes:
+        collector: lists with an entry per iteration: ``solved`` (searches that found a plan),
+            ``base_steps`` and ``simulations`` (simulated by its searches).
+
     Raises:
-        ValueError: if a number is below 1.
+        ValueError: if a number is out of range.
 
     Reference:
         Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search", 2017,
@@ -267,24 +243,31 @@ class ExpertIterationTrainer(ResumableTrainer):
         buffer_size: int = 50_000,
         lr: float = 5e-3,
         clip_norm: float = 5.0,
-        example_kwargs: dict[str, Any] | None = None,
+        example_kwargs: Mapping[str, Any] | None = None,
         progress: Callable[..., Progress] | None = None,
         seed: int = 0,
         **trainer_kwargs: Any,
     ) -> None:
-        for name, value in (
-            ("iterations", iterations),
-            ("searches_per_iteration", searches_per_iteration),
-            ("updates_per_iteration", updates_per_iteration),
-        ):
-            if value < 1:
-                raise ValueError(f"ExpertIterationTrainer needs {name} >= 1; got {value}.")
+        owner = "ExpertIterationTrainer"
+        instance(owner, "env", env, EnvBase)
+        instance(owner, "network", network, TensorDictModuleBase)
+        instance(owner, "first_planner", first_planner, MCTSPlanner)
+        instance(owner, "planner", planner, MCTSPlanner, NoneType)
+        instance(owner, "loss_module", loss_module, LossModule, NoneType)
+        instance(owner, "example_kwargs", example_kwargs, Mapping, NoneType)
+        whole_number(owner, "iterations", iterations, least=1)
+        whole_number(owner, "searches_per_iteration", searches_per_iteration, least=1)
+        updates = whole_number(owner, "updates_per_iteration", updates_per_iteration, least=1)
+        seed = whole_number(owner, "seed", seed)
+        real_number(owner, "lr", lr, above=0.0)
         if planner is None:
             # What is not found soon is left out: a search of thousands costs more than it teaches.
             planner = make_guided_planner(env, network, budget=SearchBudget(expansions=400))
         if loss_module is None:
             loss_module = ExpertIterationLoss(network, value_loss="log", value_coeff=4.0)
-        collector = SearchCollector(
+        optimizer = torch.optim.Adam(loss_module.parameters(), lr=lr)
+        collector = partial(
+            SearchCollector,
             env,
             first_planner,
             planner,
@@ -294,54 +277,39 @@ class ExpertIterationTrainer(ResumableTrainer):
             seed=seed,
             example_kwargs={"roots": False} if example_kwargs is None else example_kwargs,
         )
-        generator = torch.Generator().manual_seed(index(seed))
-        with system_errors("ExpertIterationTrainer cannot have the shared memory of its buffer"):
-            storage = LazyTensorStorage(buffer_size)
-            buffer = ReplayBuffer(storage=storage, batch_size=batch_size, generator=generator)
-        optimizer = torch.optim.Adam(loss_module.parameters(), lr=lr)
         super().__init__(
-            collector=collector,  # type: ignore[arg-type]
+            collector,
+            loss_module,
+            optimizer,
             total_frames=torch.iinfo(torch.int64).max,  # the collector knows when to end
-            frame_skip=1,
-            optim_steps_per_batch=updates_per_iteration,
-            loss_module=loss_module,
-            optimizer=optimizer,
-            replay_buffer=buffer,
-            batch_size=batch_size,
-            clip_norm=clip_norm,
-            progress_bar=False,
-            **trainer_kwargs,
-        )
-        self.network = network
-        self.planner = planner
-        self.run_settings.update(
-            searches_per_iteration=searches_per_iteration,
-            updates_per_iteration=updates_per_iteration,
+            optim_steps_per_batch=updates,
             batch_size=batch_size,
             buffer_size=buffer_size,
+            buffer_options={"generator": torch.Generator().manual_seed(seed)},
             clip_norm=clip_norm,
+            settings={
+                "searches_per_iteration": searches_per_iteration,
+                "updates_per_iteration": updates,
+            },
+            progress=progress,
+            progress_total=iterations * updates,
+            **trainer_kwargs,
         )
-        replay = ReplayBufferTrainer(buffer, batch_size=batch_size)
-        self.register_op("batch_process", replay.extend)
-        self.register_op("process_optim_batch", replay.sample)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            optimizer, iterations * updates_per_iteration
-        )
+        self.network, self.planner = network, planner
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations * updates)
         LRSchedulerHook(schedule, interval="optim").register(self)
-        if progress is not None:
-            bar = progress(total=iterations * updates_per_iteration)
-            self.register_op("post_optim", lambda: bar.update(1))
-            self.register_op("post_steps_log", lambda batch: self._report(bar))
-            self.register_op("shutdown", bar.close)
+        self.register_op("post_optim", self.move_progress)
 
-    def _report(self, bar: Progress) -> None:
-        counts = self.collector
-        searches = counts.searches
+    def progress_position(self) -> int:
+        """Return the number of updates."""
+        return int(self._optim_count)
+
+    def progress_figures(self) -> dict[str, str]:
+        counts, searches = self.collector, self.collector.searches
         figures = {
             "solved": f"{counts.solved[-1]}/{searches}",
             "base_steps_per_search": f"{counts.base_steps[-1] / searches:.0f}",
         }
-        accuracy = self._log_dict.get("policy_accuracy")
-        if accuracy:
-            figures["policy_accuracy"] = f"{float(accuracy[-1]):.3f}"
-        bar.set_postfix(refresh=False, **figures)
+        for accuracy in self.history.get("policy_accuracy", [])[-1:]:
+            figures["policy_accuracy"] = f"{accuracy:.3f}"
+        return figures

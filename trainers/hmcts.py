@@ -3,42 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from tensordict.utils import NestedKey
+from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, EnvBase, TransformedEnv
-from torchrl.objectives import LossModule, SoftUpdate
-from torchrl.trainers import TargetNetUpdaterHook
+from torchrl.objectives import LossModule
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MCTSPlanner, SearchBudget
-from torchrl_hmcts.processes import system_errors
-from torchrl_hmcts.trainers.diayn import Progress, make_skill_optimizer
+from torchrl_hmcts.trainers.diayn import make_skill_optimizer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute
-from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
-from torchrl_hmcts.trainers.skills.dataset import UnionSampler, load_dataset
+from torchrl_hmcts.trainers.off_policy import OffPolicyTrainer, Progress, made_by
+from torchrl_hmcts.trainers.skills.dataset import load_dataset, sample_union
 from torchrl_hmcts.trainers.skills.rounds import PlanningRounds, RoundRecords, seeded
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
 
+_OWNER = "HMCTSTrainer"
 
-@name_arguments
-class HMCTSTrainer(ResumableTrainer):
-    r"""Learns skills and plans over them in turn: the source's Algorithm 3.
+
+class HMCTSTrainer(OffPolicyTrainer):
+    r"""Learns skills and plans over them in turn: the dissertation's Algorithm 3.
 
     With D a dataset that may be empty and S the samples of this run:
 
     1. train the worker h on D, if D is not empty;
-    2. draw ``num_init_samples`` options uniformly, carry them out, and keep them as S;
+    2. draw ``num_init_samples`` options uniformly, execute them, and keep them as S;
     3. for t = 0, 1, ..., T - ``num_init_samples``: if ``retrain_interval`` divides t, train h on
        :math:`S \cup D`; then play round t (there is none after the last training): search a plan
-       by UCT whose expansions are options carried out by h, and carry the plan out.
+       by UCT whose expansions are options executed by h, and execute the plan.
 
     A sample is a trajectory of one option; a round adds all those that it simulated and executed,
     by an :class:`OptionRecorder` in the simulator and in the env. During training the worker
@@ -51,22 +53,21 @@ class HMCTSTrainer(ResumableTrainer):
     that the ``Trainer`` counts and passes to its logger as steps are the base steps of S.
 
     Args:
-        make_env (callable): returns a fresh base env in which plans are carried out, stateless
+        make_env (callable): returns a fresh base env in which plans are executed, stateless
             (``batch_locked=False``), e.g. ``partial(WaterworldMazeEnv, observation=False)``.
-        loss_module (LossModule): of the skills, e.g. ``DIAYNTrainer.make_loss(...)``; the source's
-            N_policies is its number of skills.
-        rounds (int): T, with the initial samples, as in the source. Default ``200``.
-        num_init_samples (int): N_init, options carried out before the first round. Default ``64``.
+        loss_module (LossModule): of the skills, e.g. ``DIAYNTrainer.make_loss(...)``; the
+            dissertation's N_policies is its number of skills.
+        rounds (int): T, with the initial samples, as in the dissertation. Default ``200``.
+        num_init_samples (int): N_init, options executed before the first round. Default ``64``.
         retrain_interval (int): N_retrain, rounds between two trainings. Default ``4``.
         option_steps (int): N_worker_samples, base steps of an option at most. Default ``25``, which
-            needs fewer simulated steps in Waterworld than the source's 100.
+            needs fewer simulated steps in Waterworld than the dissertation's 100.
         c_p (float): constant of UCT. Default ``1.0``.
         dataset (ReplayBuffer, TensorDict or path, optional): D, transitions ``[n]`` with the
             loss's ``in_keys``, e.g. recorded by an :class:`OptionRecorder`; see
             :func:`load_dataset`. Default ``None``: empty.
         dataset_fraction (float, optional): share of each batch that is drawn from D. Default
             ``None``: uniformly from the union, so the share of D falls as S grows.
-        make_simulator (callable, optional): as ``make_env``, for the search. Default: ``make_env``.
         make_options (callable): ``make_options(worker, num_skills, option_steps,
             trajectory_keys=...)`` builds the ``OptionTransform``. Default: the class itself; pass a
             ``functools.partial`` of it for a discount or a termination.
@@ -75,7 +76,7 @@ class HMCTSTrainer(ResumableTrainer):
         make_planner (callable): ``make_planner(simulator, tree_policy=UCT(c_p), seed=...)`` builds
             the planner, e.g. ``partial(MCTSPlanner, novelty=..., budget=...)``. Bound its budget:
             an untrained worker finds few plans. Default: :class:`MCTSPlanner` with 50 expansions.
-        worker, test_worker (TensorDictModule, optional): carry options out in training and in test
+        worker, test_worker (TensorDictModule, optional): execute options in training and in test
             rounds. Default: :class:`SkillPolicy` over the loss's actor, sampling and greedy.
         make_test_env (callable, optional): as ``make_env``, with held-out episodes. Default
             ``None``: no test rounds.
@@ -99,12 +100,11 @@ class HMCTSTrainer(ResumableTrainer):
             of the last ``retrain_interval`` rounds may go beyond. Default ``None``: no limit.
         save_dir (path, optional): folder of the checkpoints, one after every training. Default
             ``None``: none.
-        keep_last (int): checkpoints kept. Default ``2``.
         progress (callable, optional): ``progress(total=rounds)`` returns a progress bar, e.g.
             ``tqdm.tqdm``. Default ``None``: quiet.
         seed (int): all random numbers of a round or training are a function of it and of t.
             Default ``0``.
-        **trainer_kwargs: passed to ``torchrl.trainers.Trainer`` (``logger``, ...).
+        **trainer_kwargs: passed to :class:`ResumableTrainer` (``logger``, ``keep_last``, ...).
 
     Raises:
         ValueError: if a number is out of range, the env is not stateless, or D lacks an entry.
@@ -118,7 +118,7 @@ class HMCTSTrainer(ResumableTrainer):
         >>> from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer
         >>> from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+        >>> from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
         >>> loss = DIAYNTrainer.make_loss(make_training_env(), num_skills=4, seed=0)
         >>> trainer = HMCTSTrainer(
         ...     partial(WaterworldMazeEnv, observation=False), loss,
@@ -142,7 +142,6 @@ class HMCTSTrainer(ResumableTrainer):
         c_p: float = 1.0,
         dataset: ReplayBuffer | TensorDictBase | str | Path | None = None,
         dataset_fraction: float | None = None,
-        make_simulator: Callable[[], EnvBase] | None = None,
         make_options: Callable[..., OptionTransform] = OptionTransform,
         make_recorder: Callable[..., OptionRecorder] = OptionRecorder,
         make_planner: Callable[..., MCTSPlanner] | None = None,
@@ -162,100 +161,62 @@ class HMCTSTrainer(ResumableTrainer):
         clip_norm: float = 10.0,
         total_frames: int | None = None,
         save_dir: str | Path | None = None,
-        keep_last: int = 2,
         progress: Callable[..., Progress] | None = None,
         seed: int = 0,
         **trainer_kwargs: Any,
     ) -> None:
-        for name, value, low in (
-            ("num_init_samples", num_init_samples, 1),
-            ("rounds", rounds, num_init_samples),
-            ("retrain_interval", retrain_interval, 1),
-            ("test_rounds", test_rounds, 1),
-            ("test_interval", test_interval, 1),
-        ):
-            if value < low:
-                raise ValueError(
-                    f"HMCTSTrainer needs {name} >= {low}; got {value}."
-                    + (" The rounds include num_init_samples." if name == "rounds" else "")
-                )
-        if dataset_fraction is not None and not 0.0 <= dataset_fraction <= 1.0:
-            raise ValueError(
-                f"HMCTSTrainer needs dataset_fraction between 0 and 1; got {dataset_fraction}."
-            )
+        _check(locals())
         keys = list(loss_module.in_keys)
         self.dataset = load_dataset(dataset, keys)
         actor = loss_module.actor_network
         worker = SkillPolicy(actor) if worker is None else worker
-        if test_worker is None:
-            test_worker = SkillPolicy(actor, deterministic=True)
-        num_skills = worker.num_skills if hasattr(worker, "num_skills") else actor.num_skills
-        recorders = make_recorder(keys), make_recorder(keys)
-
-        def make_macro(make: Callable[[], EnvBase], recorder: OptionRecorder) -> TransformedEnv:
-            base = make()
-            if base.batch_locked:
-                raise ValueError(
-                    f"HMCTSTrainer plays rounds side by side in an env whose state is in the "
-                    f"tensordict; {type(base).__name__} is batch_locked. Use a stateless "
-                    "one, e.g. WaterworldMazeEnv()."
-                )
-            options = make_options(
-                worker, num_skills, option_steps, trajectory_keys=recorder.trajectory_keys
-            )
-            return TransformedEnv(base, Compose(options, recorder))
-
+        test_worker = SkillPolicy(actor, deterministic=True) if test_worker is None else test_worker
+        num_skills = getattr(worker, "num_skills", None) or actor.num_skills
+        macro = _MacroEnvs(make_options, make_recorder, keys, num_skills, option_steps)
         if make_planner is None:
             make_planner = partial(MCTSPlanner, budget=SearchBudget(expansions=50))
-        env = make_macro(make_env, recorders[0])
-        simulator = make_macro(make_simulator or make_env, recorders[1])
+        if reward is None:
+            reward = SkillReward(loss_module.objective)
+        if save_dir is not None:
+            trainer_kwargs.setdefault("save_trainer_interval", 0)
         collector = PlanningRounds(
-            env,
-            simulator,
+            macro.recorded(worker, make_env, "make_env"),
+            macro.recorded(worker, make_env, "make_env"),
             partial(make_planner, tree_policy=UCT(c_p)),
-            recorders,
             num_init_samples=num_init_samples,
             interval=retrain_interval,
             rounds=rounds - num_init_samples,
             seed=seed,
         )
-        with system_errors("HMCTSTrainer cannot have the shared memory of its replay buffer"):
-            buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size), batch_size=batch_size)
-        if optimizer is None:
-            optimizer = make_skill_optimizer(loss_module)
-        if reward is None:
-            reward = SkillReward(loss_module.objective)
-        if save_dir is not None:
-            trainer_kwargs.setdefault("save_trainer_interval", 0)
-        updater = SoftUpdate(loss_module, tau=target_tau)
         super().__init__(
-            collector=collector,
+            lambda: collector,
+            loss_module,
+            make_skill_optimizer(loss_module) if optimizer is None else optimizer,
             total_frames=2**62 if total_frames is None else total_frames,
-            frame_skip=1,
             optim_steps_per_batch=1,  # set before every training
-            loss_module=loss_module,
-            optimizer=optimizer,
-            replay_buffer=buffer,
-            target_net_updater=updater,
             batch_size=batch_size,
+            buffer_size=buffer_size,
             clip_norm=clip_norm,
-            progress_bar=False,
+            target_tau=target_tau,
+            sample=partial(
+                sample_union,
+                dataset=self.dataset,
+                batch_size=batch_size,
+                fraction=dataset_fraction,
+                reward=reward,
+            ),
+            settings={
+                "option_steps": option_steps,
+                "c_p": c_p,
+                "updates_per_step": updates_per_step,
+                "dataset_fraction": dataset_fraction,
+            },
+            progress=progress,
+            progress_total=collector.rounds,
             save_dir=save_dir,
-            keep_last=keep_last,
             **{"log_interval": -1, **trainer_kwargs},
         )
         self.seed = seed
-        self.run_settings.update(
-            option_steps=option_steps,
-            c_p=c_p,
-            updates_per_step=updates_per_step,
-            batch_size=batch_size,
-            buffer_size=buffer_size,
-            dataset_fraction=dataset_fraction,
-            target_tau=target_tau,
-            clip_norm=clip_norm,
-        )
-        self.rounds, self.num_init_samples = rounds, num_init_samples
         self.retrain_interval, self.test_interval = retrain_interval, test_interval
         self.updates_per_step, self.pretrain_updates = updates_per_step, pretrain_updates
         self.retrained_at: list[int] = []  # the t of every training
@@ -267,29 +228,25 @@ class HMCTSTrainer(ResumableTrainer):
         )
         self._test_env: EnvBase | None = None
         if make_test_env is not None:
-            options = make_options(test_worker, num_skills, option_steps)
-            self._test_env = TransformedEnv(make_test_env(), options)
+            self._test_env = macro.plain(test_worker, make_test_env, "make_test_env")
             self._test_env.set_seed(seed)
             self._test_starts = self._test_env.reset(TensorDict(batch_size=[test_rounds]))
-        union = UnionSampler(buffer, self.dataset, batch_size, dataset_fraction, reward)
         self.register_op("setup", self._begin)
-        self.register_op("batch_process", self._extend)
-        self.register_op("process_optim_batch", union.sample)
-        self.register_op("post_optim", TargetNetUpdaterHook(updater))
         self.register_op("post_steps_log", self._report)
         self.register_module("hmcts", _Progressed(self))
-        self._bar: Progress | None = None
-        self._bar_at = 0
-        if progress is not None:
-            self._bar = progress(total=collector.rounds)
-            self.register_op("shutdown", self._bar.close)
+
+    def progress_position(self) -> int:
+        """Return the number of rounds played."""
+        return max(0, self.collector.round)
+
+    def progress_figures(self) -> dict[str, str]:
+        return {name: f"{value:,.2f}" for name, value in self.collector.latest.items()}
 
     # ---------------------------------------------------------------- stages of the training
 
     def _begin(self) -> None:
         """Before the first round: train on D, and test."""
-        self._stop_training = False
-        if self.collector.round >= 0:  # it goes on
+        if self.collector.round >= 0:  # it was resumed
             return
         if len(self.dataset):
             updates = self.pretrain_updates
@@ -297,10 +254,6 @@ class HMCTSTrainer(ResumableTrainer):
                 updates = round(self.updates_per_step * len(self.dataset))
             self._train_worker("pretrain", 0, updates, self.dataset[: self.batch_size])
         self._test()
-
-    def _extend(self, batch: TensorDictBase) -> TensorDictBase:
-        self.replay_buffer.extend(batch)
-        return batch
 
     def optim_steps(self, batch: TensorDictBase) -> None:
         """Train the worker if ``retrain_interval`` divides the number of rounds played so far."""
@@ -328,7 +281,7 @@ class HMCTSTrainer(ResumableTrainer):
         self._log(**{f"test/{name}": value for name, value in figures.items()})
 
     def _report(self, batch: TensorDictBase) -> None:
-        """After every batch: log the rounds, test, show the progress."""
+        """After every batch: log the rounds, and test."""
         t, figures = self.collector.round, self.collector.latest
         if figures:
             self._log(**{f"rounds/{name}": value for name, value in figures.items()})
@@ -336,13 +289,66 @@ class HMCTSTrainer(ResumableTrainer):
         due = (len(self.retrained_at) - 1) % self.test_interval == 0
         if self.retrained_at[-1] == t and (due or last):
             self._test()
-        if self._bar is not None:
-            shown = {name: f"{value:,.2f}" for name, value in figures.items()}
-            self._bar.set_postfix(refresh=False, **shown)
-            self._bar.update(t - self._bar_at)
-            self._bar_at = t
         if t >= self.collector.rounds:
             self.request_stop("All rounds have been played.")
+
+
+@dataclass
+class _MacroEnvs:
+    """Makes envs of a worker's options, with a recorder of what they did or without."""
+
+    make_options: Callable[..., OptionTransform]
+    make_recorder: Callable[..., OptionRecorder]
+    keys: list[NestedKey]
+    num_skills: int
+    option_steps: int
+
+    def plain(
+        self,
+        worker: Any,
+        make_env: Callable[[], EnvBase],
+        argument: str,
+        recorder: OptionRecorder | None = None,
+    ) -> TransformedEnv:
+        base = made_by(make_env, _OWNER, argument, EnvBase)
+        if base.batch_locked:
+            raise ValueError(
+                f"{_OWNER} plays rounds side by side in an env whose state is in the tensordict; "
+                f"{type(base).__name__} is batch_locked. Use a stateless one, e.g. "
+                "WaterworldMazeEnv()."
+            )
+        keys = None if recorder is None else recorder.trajectory_keys
+        args = (OptionTransform, worker, self.num_skills, self.option_steps)
+        options = made_by(self.make_options, _OWNER, "make_options", *args, trajectory_keys=keys)
+        return TransformedEnv(base, options if recorder is None else Compose(options, recorder))
+
+    def recorded(
+        self, worker: Any, make_env: Callable[[], EnvBase], argument: str
+    ) -> TransformedEnv:
+        recorder = made_by(self.make_recorder, _OWNER, "make_recorder", OptionRecorder, self.keys)
+        return self.plain(worker, make_env, argument, recorder)
+
+
+def _check(given: Mapping[str, Any]) -> None:
+    """Refuses arguments of the constructor that make no sense."""
+    instance(_OWNER, "loss_module", given["loss_module"], LossModule)
+    instance(_OWNER, "optimizer", given["optimizer"], torch.optim.Optimizer, NoneType)
+    for name in ("make_planner", "make_test_planner", "reward", "worker", "test_worker"):
+        instance(_OWNER, name, given[name], Callable, NoneType)
+    for name in ("num_init_samples", "retrain_interval", "test_rounds", "test_interval"):
+        whole_number(_OWNER, name, given[name], least=1)
+    first = given["num_init_samples"]
+    if whole_number(_OWNER, "rounds", given["rounds"]) < first:
+        raise ValueError(
+            f"{_OWNER} needs rounds >= {first}; got {given['rounds']}. The rounds include "
+            "num_init_samples."
+        )
+    whole_number(_OWNER, "seed", given["seed"])
+    if given["pretrain_updates"] is not None:
+        whole_number(_OWNER, "pretrain_updates", given["pretrain_updates"])
+    if given["dataset_fraction"] is not None:
+        real_number(_OWNER, "dataset_fraction", given["dataset_fraction"], least=0.0, most=1.0)
+    real_number(_OWNER, "updates_per_step", given["updates_per_step"], least=0.0)
 
 
 class _Progressed:

@@ -25,7 +25,14 @@ from torchrl.data import OneHot
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
-from torchrl_hmcts.nesting import env_name, flat_transforms, set_states, step_states
+from torchrl_hmcts.direct_calls import put
+from torchrl_hmcts.nesting import (
+    complete_done,
+    env_name,
+    flat_transforms,
+    set_states,
+    step_states,
+)
 from torchrl_hmcts.planners.keys import entry_key
 from torchrl_hmcts.planners.simulator_checks import (
     check_durations_and_masks,
@@ -176,11 +183,11 @@ class Simulator:
         option = torch.from_numpy(options)
         if self.env.device is not None and self.env.device.type != "cpu":
             option = option.to(self.env.device)
-        _put(states, self.option_key, self.encode(option))
+        put(states, self.option_key, self.encode(option))
 
     def _completed(self, states: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
         if any(_entry(after, key) is None for key in self._done_keys):
-            self.env._complete_done(self._done_spec, after)
+            complete_done(self.env, after, self._done_spec)
         for key in self.state_keys:
             if _entry(after, key) is None:  # the env leaves it as it was
                 after.set(key, states.get(key))
@@ -210,7 +217,7 @@ class Simulator:
             after = None if self._run_from is None else self._run_from(state, option)
             if after is None:
                 root = set_states(self.env, state).update(state)
-                _put(root, self.option_key, self.encode(option))
+                put(root, self.option_key, self.encode(option))
                 after = step_states(self.env, root)
             parts.append(after)
         stacked: TensorDictBase = torch.stack(parts)
@@ -313,13 +320,6 @@ def _entry(td: TensorDictBase, key: NestedKey) -> Tensor | None:
 def _required(td: TensorDictBase, key: NestedKey) -> Tensor:
     entry = _entry(td, key)
     return td.get(key) if entry is None else entry  # whose error names the key
-
-
-def _put(td: TensorDictBase, key: NestedKey, value: Tensor) -> None:
-    if isinstance(key, str):
-        td._set_str(key, value, validated=True, inplace=False, non_blocking=False)
-    else:
-        td.set(key, value)
 
 
 def _array(value: Tensor) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What one process of asynchronous training does: act, differentiate, update the shared parameters.
+"""One process of asynchronous training: it acts, differentiates, updates the shared parameters.
 
 Letters: *B batch of the environments, T steps of a segment, L learners.
 """
@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import connection
 
@@ -38,24 +38,13 @@ _GRACE_SECONDS = 5.0
 
 @dataclass
 class LearnerSettings:
-    """What every learner needs to know; it travels to the processes by cloudpickle.
+    """What every learner needs to know; it travels to the processes by cloudpickle."""
 
-    Args:
-        make_env: builds the learner's own environment, ``[*B]``.
-        loss_module: a copy of it becomes the learner's own.
-        segment_steps: T, steps between two updates.
-        total_frames: frames of all learners together, at which they end.
-        lr_schedule: factor of the learning rates by the share of the frames that are done.
-        clip_norm: bound of the gradient's norm, or ``None``.
-        seed: with the learner's number and the frames done, seeds everything random.
-        configure_learner: called with the learner's loss and number before it starts.
-    """
-
-    make_env: Callable[[], EnvBase]
-    loss_module: LossModule
-    segment_steps: int
-    total_frames: int
-    lr_schedule: Callable[[float], float]
+    make_env: Callable[[], EnvBase]  # [*B]
+    loss_module: LossModule  # a copy becomes the learner's own
+    segment_steps: int  # T
+    total_frames: int  # of all learners together, at which they end
+    lr_schedule: Callable[[float], float]  # factor by the share of the frames that are done
     clip_norm: float | None
     seed: int
     configure_learner: Callable[[LossModule, int], None] | None
@@ -63,48 +52,27 @@ class LearnerSettings:
 
 @dataclass
 class SharedMemory:
-    """Tensors that the parent and all learners have in common.
-
-    Args:
-        parameters: of the loss.
-        optimizer: over these parameters, its state shared too; each group has an ``initial_lr``.
-        board: float64 ``[L, columns]``, sums over what each learner has done. Each row has one
-            writer, so that no lock is needed; the counter T is the sum of the first column.
-        stop: uint8 ``[1]``, 1 to ask the learners to end.
-        steps: int64 ``[L]``, a sign of life: steps of its env that each learner has taken.
-    """
+    """Tensors that the parent and all learners have in common."""
 
     parameters: list[nn.Parameter]
-    optimizer: Optimizer
-    board: Tensor
-    stop: Tensor
-    steps: Tensor
+    optimizer: Optimizer  # its state is shared too; each group has an ``initial_lr``
+    board: Tensor  # float64 [L, columns] sums; one writer a row, so that no lock is needed
+    stop: Tensor  # uint8 [1], 1 asks the learners to end
+    steps: Tensor  # int64 [L] steps of each learner's env, a sign of life
 
 
 def board_columns(loss_module: LossModule) -> list[str]:
-    """Return the names of the board's columns: the counters, then the loss's entries.
-
-    Args:
-        loss_module: whose ``out_keys`` are logged.
-    """
+    """Return the names of the board's columns: the counters, then the loss's entries."""
     return [*COUNTERS, *(str(key) for key in loss_module.out_keys)]
 
 
 def trained_parameters(loss_module: LossModule) -> list[nn.Parameter]:
-    """Return the parameters that are trained, each once, in the order of the module.
-
-    Args:
-        loss_module: whose parameters they are.
-    """
+    """Return the parameters that are trained, each once, in the order of the module."""
     return [p for p in loss_module.parameters() if p.requires_grad]
 
 
 def actor_of(loss_module: LossModule) -> TensorDictModuleBase:
-    """Return the policy of a loss, as a module that holds the loss's own parameters.
-
-    Args:
-        loss_module: has an ``actor_network``, functional or not.
-    """
+    """Return the policy of a loss, as a module that holds the loss's own parameters."""
     actor = loss_module.actor_network
     params = getattr(loss_module, "actor_network_params", None)
     if params is not None:
@@ -116,14 +84,7 @@ def actor_of(loss_module: LossModule) -> TensorDictModuleBase:
 class ActorLearner:
     """One actor-learner of Algorithm 2: an environment, a copy of the networks, and the update.
 
-    Args:
-        settings: what to do.
-        shared: where the results go.
-        learner: its number, the row of the board that it writes.
-        start_frames: frames that were done before the board was empty, by an earlier run.
-
-    Raises:
-        TypeError: if ``make_env`` does not return an ``EnvBase``.
+    ``start_frames`` were done before the board was empty, by an earlier run.
     """
 
     def __init__(
@@ -131,30 +92,29 @@ class ActorLearner:
     ) -> None:
         self.settings, self.shared, self.learner = settings, shared, learner
         self.start_frames = start_frames
-        seed = learner_seed(settings.seed, learner, start_frames)
+        # With the frames done, so that a resumed run does not repeat the first one's episodes.
+        entropy = np.random.SeedSequence([settings.seed, learner, start_frames])
+        seed = int(entropy.generate_state(1)[0]) % 2**31
         random.seed(seed)
         np.random.seed(seed)  # noqa: NPY002  environments may draw from the global generator
         torch.manual_seed(seed)
-        env = settings.make_env()
-        if not isinstance(env, EnvBase):
+        self.env = settings.make_env()
+        if not isinstance(self.env, EnvBase):
             raise TypeError(
-                f"make_env must return a torchrl EnvBase; it returned {type(env).__name__}. Wrap a "
-                "Gymnasium environment, e.g. lambda: GymEnv('CartPole-v1')."
+                f"make_env must return a torchrl EnvBase; it returned {type(self.env).__name__}. "
+                "Wrap a Gymnasium environment, e.g. lambda: GymEnv('CartPole-v1')."
             )
-        self.env = env
-        env.set_seed(seed)
+        self.env.set_seed(seed)
         self.loss_module = settings.loss_module
         if settings.configure_learner is not None:
             settings.configure_learner(self.loss_module, learner)
         self.actor = actor_of(self.loss_module)
         self.parameters = trained_parameters(self.loss_module)
-        self.columns = board_columns(self.loss_module)
-        self.row = np.zeros(len(self.columns))
+        self.row = dict.fromkeys(board_columns(self.loss_module), 0.0)
         self.board, self.steps = shared.board.numpy(), shared.steps.numpy()
-        self.frames_per_segment = env.numel() * settings.segment_steps
-        self.running_return = np.zeros(env.numel())
-        self.running_length = np.zeros(env.numel())
-        self.carrier = env.reset()
+        self.running_return = np.zeros(self.env.numel())
+        self.running_length = np.zeros(self.env.numel())
+        self.carrier = self.env.reset()
         self.keys: list[NestedKey] | None = None
 
     @property
@@ -167,29 +127,23 @@ class ActorLearner:
         """Whether there is nothing left to do."""
         return bool(self.shared.stop[0]) or self.frames >= self.settings.total_frames
 
-    def run(self) -> None:
-        """Updates until T has reached its end or the parent asks to stop."""
-        while not self.done:
-            self.update()
-
     def update(self) -> None:
-        """Synchronises, acts for a segment, and applies its gradients to the shared parameters."""
+        """Synchronise, act for a segment, and apply its gradients to the shared parameters."""
         with torch.no_grad():
             for mine, theirs in zip(self.parameters, self.shared.parameters, strict=True):
                 mine.copy_(theirs)
         segment = self.collect()
         losses = self.loss_module(segment)
-        names = [key for key in losses.keys() if key.startswith("loss")]
-        total = sum(losses.get(name) for name in names)
+        terms = {key: losses.get(key) for key in losses.keys() if key.startswith("loss")}
         for parameter in self.parameters:
             parameter.grad = None
-        total.backward()
-        norm = self._gradient_norm(losses, names)
+        sum(terms.values()).backward()
+        norm = self._clip(terms)
         self._apply()
         self._count(segment, losses, norm)
 
     def collect(self) -> TensorDictBase:
-        """Returns the next segment ``[*B, T]``, with the entries that the loss reads."""
+        """Return the next segment ``[*B, T]``, with the entries that the loss reads."""
         steps, state = [], self.carrier
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             for _ in range(self.settings.segment_steps):
@@ -210,12 +164,12 @@ class ActorLearner:
         keys = [*loss.in_keys, *after, *(key for key in extra if key is not None)]
         return list(dict.fromkeys(unravel_key(key) for key in keys))
 
-    def _gradient_norm(self, losses: TensorDictBase, names: Sequence[str]) -> float:
-        """Clips the gradients; returns their norm before. What is not finite goes no further."""
+    def _clip(self, terms: dict[str, Tensor]) -> float:
+        """Clips the gradients; returns their norm before. One that is not finite is refused."""
         bound = self.settings.clip_norm
         norm = nn.utils.clip_grad_norm_(self.parameters, float("inf") if bound is None else bound)
         if not torch.isfinite(norm):
-            values = {name: float(losses.get(name).detach()) for name in names}
+            values = {name: float(term.detach()) for name, term in terms.items()}
             raise FloatingPointError(
                 f"The gradient's norm is {float(norm)} with the losses {values}, after "
                 f"{self.frames} frames. The update was not applied: the shared parameters are as "
@@ -234,38 +188,26 @@ class ActorLearner:
         optimizer.step()
 
     def _count(self, segment: TensorDictBase, losses: TensorDictBase, norm: float) -> None:
-        keys = self.loss_module.tensor_keys
+        keys, row = self.loss_module.tensor_keys, self.row
         after, steps = segment.get("next"), self.settings.segment_steps
         reward = after.get(keys.reward).reshape(-1, steps).numpy()
         done = after.get(keys.done).reshape(-1, steps).numpy()
-        row, column = self.row, {name: i for i, name in enumerate(self.columns)}
         for t in range(steps):
             self.running_return += reward[:, t]
             self.running_length += 1
             ended = done[:, t]
             if ended.any():
-                row[column["episodes"]] += ended.sum()
-                row[column["return"]] += self.running_return[ended].sum()
-                row[column["length"]] += self.running_length[ended].sum()
+                row["episodes"] += ended.sum()
+                row["return"] += self.running_return[ended].sum()
+                row["length"] += self.running_length[ended].sum()
                 self.running_return[ended] = 0.0
                 self.running_length[ended] = 0.0
-        row[column["frames"]] += self.frames_per_segment
-        row[column["updates"]] += 1
-        row[column["grad_norm"]] += norm
+        row["frames"] += self.env.numel() * steps
+        row["updates"] += 1
+        row["grad_norm"] += norm
         for name in losses.keys():
-            row[column[name]] += float(losses.get(name).detach().mean())
-        self.board[self.learner] = row
-
-
-def learner_seed(seed: int, learner: int, frames: int) -> int:
-    """Return the seed of a learner that starts after so many frames.
-
-    Args:
-        seed: of the run.
-        learner: its number.
-        frames: done before, so that a resumed run does not repeat the first one's episodes.
-    """
-    return int(np.random.SeedSequence([seed, learner, frames]).generate_state(1)[0]) % 2**31
+            row[name] += float(losses.get(name).detach().mean())
+        self.board[self.learner] = list(row.values())
 
 
 def run_learner(
@@ -277,12 +219,7 @@ def run_learner(
 ) -> None:
     """Run a learner as a process; what goes wrong is sent to the parent as text.
 
-    Args:
-        payload: :class:`LearnerSettings` by cloudpickle.
-        shared: what it has in common with the others.
-        learner: its number.
-        start_frames: frames done by an earlier run.
-        errors: receives a traceback.
+    ``payload`` are the :class:`LearnerSettings` by cloudpickle; ``errors`` receives a traceback.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
@@ -292,7 +229,8 @@ def run_learner(
     actor_learner = None
     try:
         actor_learner = ActorLearner(cloudpickle.loads(payload), shared, learner, start_frames)
-        actor_learner.run()
+        while not actor_learner.done:
+            actor_learner.update()
     except BaseException:
         with contextlib.suppress(OSError):  # the parent may be gone
             errors.send(traceback.format_exc()[-30_000:])

@@ -1,4 +1,4 @@
-"""What asynchronous learners write on their board, as counters and curves."""
+"""Counters and curves from what asynchronous learners write on their board."""
 
 from __future__ import annotations
 
@@ -17,12 +17,7 @@ from torchrl_hmcts.trainers.a3c.actor_learner import COUNTERS
 class LearnerLog:
     """The sums on the learners' board, and the curves that follow from them.
 
-    Args:
-        board (Tensor): float64 ``[learners, columns]``, sums of what they did in this run.
-        columns (list of str): names of its columns.
-        logger (Logger, optional): of TorchRL; gets every value. Default: none.
-
-    Examples:
+    Example:
         >>> columns = [*COUNTERS, "loss_critic"]
         >>> log = LearnerLog(torch.zeros(2, len(columns), dtype=torch.float64), columns)
         >>> log.start()
@@ -45,7 +40,7 @@ class LearnerLog:
     @property
     def frames(self) -> int:
         """T: frames of all learners so far."""
-        return int(self._totals()[0])
+        return int(self._before[0] + self.board[:, 0].sum())
 
     @property
     def seconds(self) -> float:
@@ -64,26 +59,22 @@ class LearnerLog:
         return self._last["frames"]
 
     def start(self) -> None:
-        """Starts the clock, with an empty board for learners that may be others than before."""
+        """Start the clock, with an empty board for learners that may be others than before."""
         self._before += self.board.sum(0)
         self.board.zero_()
         self._started = time.perf_counter()
         self._last = self._marks()
 
     def stop(self) -> None:
-        """Stops the clock."""
+        """Stop the clock."""
         self._seconds, self._started = self.seconds, None
 
     def restart_clock(self) -> None:
-        """Leaves the time until now out of the next ``frames_per_second``."""
+        """Leave the time until now out of the next ``frames_per_second``."""
         self._last["seconds"] = self.seconds
 
     def log(self, lr: float) -> dict[str, float]:
-        """Records the means since the last time; returns them.
-
-        Args:
-            lr (float): the learning rate now.
-        """
+        """Record the means since the last time, and the learning rate; return them."""
         now, last = self._marks(), self._last
         self._last = now
 
@@ -110,36 +101,24 @@ class LearnerLog:
         return values
 
     def record(self, values: Mapping[str, float], frames: int) -> None:
-        """Appends values to the history and tells the logger those that are finite.
-
-        Args:
-            values (mapping): by name.
-            frames (int): T to which they belong.
-        """
+        """Append values of T to the history, and tell the logger those that are finite."""
         for name, value in values.items():
             self._log_dict.setdefault(name, []).append(float(value))
             if self.logger is not None and math.isfinite(value):
                 self.logger.log_scalar(name, float(value), step=frames)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the sums and the time; the curves are saved by themselves."""
-        totals = dict(zip(self.columns, self._totals().tolist(), strict=True))
-        return {"totals": totals, "seconds": self.seconds}
+        """Return the sums and the time; the curves are saved by themselves."""
+        totals = self._marks()
+        return {"seconds": totals.pop("seconds"), "totals": totals}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Takes the sums and the time of a checkpoint for what was done before.
-
-        Args:
-            state_dict (mapping): of :meth:`state_dict`.
-        """
+        """Take the sums and the time of a checkpoint for what was done before."""
         totals = [state_dict["totals"][name] for name in self.columns]
         self._before.copy_(torch.tensor(totals, dtype=torch.float64))
         self.board.zero_()
         self._seconds = state_dict["seconds"]
 
-    def _totals(self) -> Tensor:
-        return self._before + self.board.sum(0)
-
     def _marks(self) -> dict[str, float]:
-        totals = dict(zip(self.columns, self._totals().tolist(), strict=True))
-        return {**totals, "seconds": self.seconds}
+        totals = (self._before + self.board.sum(0)).tolist()
+        return {**dict(zip(self.columns, totals, strict=True)), "seconds": self.seconds}

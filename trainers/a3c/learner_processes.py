@@ -42,64 +42,43 @@ class LearnerError(RuntimeError):
 
 
 class LearnerProcesses:
-    """The processes of one training.
+    """The processes of one training; a step of a learner's env may take ``step_seconds``."""
 
-    Args:
-        number (int): learners.
-        start_method (str): of ``multiprocessing``.
-        step_seconds (float): longest time for one step of a learner's env. Default 60.
-
-    Examples:
-        >>> LearnerProcesses(2, "spawn").wait(0.0)  # none is running
-        True
-    """
-
-    def __init__(self, number: int, start_method: str, step_seconds: float = 60.0) -> None:
-        self.number, self.step_seconds = number, step_seconds
+    def __init__(
+        self, number: int, start_method: str, step_seconds: float, shared: SharedMemory
+    ) -> None:
+        self.number, self.step_seconds, self.shared = number, step_seconds, shared
         self.context: Any = start_context(start_method)
         if self.context.get_start_method() == "forkserver":
             # Imported once; learners then start within milliseconds.
             self.context.set_forkserver_preload(["__main__", run_learner.__module__])
+        self.start_frames = 0
         self.silences: list[Silence] = []
         self.running: list[tuple[Any, Any]] = []  # process, end of a pipe with its traceback
 
-    def start(self, payload: bytes, shared: SharedMemory, start_frames: int) -> None:
-        """Starts all learners.
-
-        Args:
-            payload: their settings by cloudpickle.
-            shared: what they have in common.
-            start_frames: frames done by earlier runs.
-        """
-        self.start_frames, self.shared = start_frames, shared
+    def start(self, payload: bytes, start_frames: int) -> None:
+        """Start all learners, with their settings by cloudpickle and the frames done before."""
+        self.start_frames = start_frames
         self.silences = [Silence() for _ in range(self.number)]
         with system_errors(f"A3CTrainer cannot start {self.number} learners"):
-            self._start(payload, shared, start_frames)
-
-    def _start(self, payload: bytes, shared: SharedMemory, start_frames: int) -> None:
-        need_descriptors(self.number, pipes=self.number)
-        for i in range(self.number):
-            errors, send = self.context.Pipe(duplex=False)
-            # Not daemons: those may not have processes of their own, as a ParallelEnv has.
-            process = self.context.Process(
-                target=run_learner,
-                args=(payload, shared, i, start_frames, send),
-                name=f"learner {i}",
-            )
-            with no_interrupts():
-                process.start()
-                self.running.append((process, errors))
-            send.close()
+            need_descriptors(self.number, pipes=self.number)
+            for i in range(self.number):
+                errors, send = self.context.Pipe(duplex=False)
+                # Not daemons: those may not have processes of their own, as a ParallelEnv has.
+                process = self.context.Process(
+                    target=run_learner,
+                    args=(payload, self.shared, i, start_frames, send),
+                    name=f"learner {i}",
+                )
+                with no_interrupts():
+                    process.start()
+                    self.running.append((process, errors))
+                send.close()
 
     def wait(self, seconds: float, enough: bool = False) -> bool:
-        """Waits until a learner ends or the time is over.
+        """Wait until a learner ends or the time is over; return whether all ended as they should.
 
-        Args:
-            seconds: at most.
-            enough: whether T has been reached; a learner that does not answer is then left alone.
-
-        Returns:
-            bool: whether all have ended as they should.
+        With ``enough`` frames done, a learner that does not answer is given up.
 
         Raises:
             LearnerError: if one has ended otherwise.
@@ -111,25 +90,20 @@ class LearnerProcesses:
             if process.exitcode not in (None, 0):
                 raise self._error(i, process.exitcode, errors)
         patience = min(_STOP_SECONDS, self.step_seconds) if enough else self.step_seconds
-        silent = self._silent(patience)
+        left = [i for i, (process, _) in enumerate(self.running) if process.exitcode is None]
+        silent = [i for i in left if self._silence(i) >= patience]
         if silent and not enough:
             raise self._no_answer(silent[0])
-        left = [i for i, (process, _) in enumerate(self.running) if process.exitcode is None]
         if silent and silent == left:
             print(f"{self._no_answer(silent[0])}", file=sys.stderr)
             for i in silent:  # what it had under way is nobody's
                 self.running[i][0].kill()
         return silent == left
 
-    def _silent(self, seconds: float) -> list[int]:
-        """Numbers of the learners that have not moved for so long."""
-        silent = []
-        for i, (process, _) in enumerate(self.running):
-            if process.exitcode is None:
-                marks = (int(self.shared.steps[i]), cpu_ticks(process.pid))
-                if self.silences[i].look(marks) >= seconds:
-                    silent.append(i)
-        return silent
+    def _silence(self, learner: int) -> float:
+        """Seconds for which a learner has neither stepped nor used the processor."""
+        ticks = cpu_ticks(self.running[learner][0].pid)
+        return self.silences[learner].look((int(self.shared.steps[learner]), ticks))
 
     def _no_answer(self, learner: int) -> LearnerError:
         seconds, pid = self.silences[learner].seconds, self.running[learner][0].pid
@@ -144,13 +118,9 @@ class LearnerProcesses:
     def _frames(self) -> int:
         return self.start_frames + int(self.shared.board[:, 0].sum())
 
-    def stop(self, shared: SharedMemory) -> None:
-        """Ends all learners: they finish their segment, or are killed after some seconds.
-
-        Args:
-            shared: where they are asked to.
-        """
-        shared.stop[0] = 1
+    def stop(self) -> None:
+        """End all learners: they finish their segment, or are killed after some seconds."""
+        self.shared.stop[0] = 1
         with no_interrupts():
             deadline = time.monotonic() + _STOP_SECONDS
             for i, (process, errors) in enumerate(self.running):
@@ -163,7 +133,7 @@ class LearnerProcesses:
                 process.close()
                 errors.close()
             self.running.clear()
-        shared.stop[0] = 0
+        self.shared.stop[0] = 0
 
     def _error(self, learner: int, exitcode: int, errors: Any) -> LearnerError:
         try:
@@ -185,7 +155,7 @@ class LearnerProcesses:
 
 @contextmanager
 def no_interrupts() -> Iterator[None]:
-    """Puts Ctrl-C off until the end; processes started meanwhile never get it."""
+    """Put Ctrl-C off until the end; processes started meanwhile never get it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield

@@ -9,40 +9,27 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-# Those whose state after a step with zero gradients is the state they start from.
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import real_number
 from torchrl_hmcts.processes import share
 
-_SHAREABLE = (
-    torch.optim.Adagrad,
-    torch.optim.Adam,
-    torch.optim.Adamax,
-    torch.optim.AdamW,
-    torch.optim.RMSprop,
-    torch.optim.SGD,
-)
+# Those whose state after a step with zero gradients is the state they start from.
+_SHAREABLE = ("Adagrad", "Adam", "Adamax", "AdamW", "RMSprop", "SGD", "SharedRMSprop")
+_LARGEST = torch.finfo(torch.float32).max
 
 
 def share_optimizer(optimizer: Optimizer) -> Optimizer:
-    """Builds an optimiser's state at once, and moves it and the parameters to shared memory.
+    """Build an optimiser's state at once, and move it and the parameters to shared memory.
 
     torch builds the state at the first step, so that each process would get one of its own. Here
     parameters and state stay what they were, but every process that receives the optimiser changes
     the same numbers when it steps. Learning rates and other settings stay each process's own.
 
-    Args:
-        optimizer (Optimizer): :class:`SharedRMSprop`, :class:`SharedAdam`, or torch's ``Adagrad``,
-            ``Adam``, ``Adamax``, ``AdamW``, ``RMSprop`` or ``SGD``. On the CPU.
-
-    Returns:
-        Optimizer: itself.
-
     Raises:
-        TypeError: if it is another kind, whose state cannot be built beforehand.
+        TypeError: if it is a kind whose state cannot be built beforehand.
         ValueError: if a parameter is not on the CPU.
         OSError: if there is too little shared memory.
 
-    Examples:
+    Example:
         >>> weight = torch.nn.Parameter(torch.ones(2))
         >>> optimizer = share_optimizer(torch.optim.SGD([weight], lr=0.1, momentum=0.9))
         >>> weight.is_shared(), optimizer.state[weight]["momentum_buffer"].is_shared()
@@ -65,12 +52,10 @@ def share_optimizer(optimizer: Optimizer) -> Optimizer:
 
 
 def _build_state(optimizer: Optimizer, parameters: list[Tensor]) -> None:
-    if not isinstance(optimizer, (SharedRMSprop, *_SHAREABLE)):
-        names = ", ".join(kind.__name__ for kind in _SHAREABLE)
+    if not any(kind.__name__ in _SHAREABLE for kind in type(optimizer).__mro__):
         raise TypeError(
             f"{type(optimizer).__name__} builds its state at its first step, so that every learner "
-            f"would have one of its own. Use SharedRMSprop, SharedAdam, or one of torch.optim's "
-            f"{names}."
+            f"would have one of its own. Use one of {', '.join(_SHAREABLE)}."
         )
     before = [p.detach().clone() for p in parameters]
     decay = [group.get("weight_decay", 0.0) for group in optimizer.param_groups]
@@ -90,7 +75,6 @@ def _build_state(optimizer: Optimizer, parameters: list[Tensor]) -> None:
         group["weight_decay"] = value
 
 
-@name_arguments
 class SharedRMSprop(Optimizer):
     r"""RMSprop with one shared mean of squared gradients, as in A3C.
 
@@ -134,16 +118,20 @@ class SharedRMSprop(Optimizer):
         eps: float = 1e-5,
         weight_decay: float = 0.0,
     ) -> None:
-        if not lr >= 0.0:
-            raise ValueError(f"SharedRMSprop needs a learning rate lr >= 0; got {lr}.")
-        if not 0.0 <= alpha < 1.0:
-            raise ValueError(f"SharedRMSprop needs alpha in [0, 1), its memory; got {alpha}.")
-        if not eps > 0.0:
-            raise ValueError(f"SharedRMSprop needs eps > 0, which it divides by; got {eps}.")
-        if not weight_decay >= 0.0:
-            raise ValueError(f"SharedRMSprop needs weight_decay >= 0; got {weight_decay}.")
+        for name, value in (("lr", lr), ("weight_decay", weight_decay)):
+            real_number("SharedRMSprop", name, value, least=0.0, most=_LARGEST)
+        if real_number("SharedRMSprop", "alpha", alpha, least=0.0) >= 1.0:
+            raise ValueError(f"SharedRMSprop needs alpha < 1, its memory; got {alpha}.")
+        real_number("SharedRMSprop", "eps", eps, above=0.0, most=_LARGEST)
+        try:
+            groups = list(params)
+        except (RuntimeError, TypeError) as error:
+            raise TypeError(
+                f"SharedRMSprop needs a list of parameters for params; got a "
+                f"{type(params).__name__}."
+            ) from error
         super().__init__(
-            params, {"lr": lr, "alpha": alpha, "eps": eps, "weight_decay": weight_decay}
+            groups, {"lr": lr, "alpha": alpha, "eps": eps, "weight_decay": weight_decay}
         )
         share_optimizer(self)
 
@@ -152,7 +140,7 @@ class SharedRMSprop(Optimizer):
         """Changes the parameters by their gradients.
 
         Args:
-            closure (callable, optional): computes the loss anew, with gradients, and returns it.
+            closure (callable, optional): computes the loss again, with gradients, and returns it.
         """
         loss = None
         if closure is not None:
@@ -174,33 +162,3 @@ class SharedRMSprop(Optimizer):
                 # The mean is read once: another process may be writing it.
                 parameter.addcdiv_(gradient, (mean + group["eps"]).sqrt_(), value=-group["lr"])
         return loss
-
-
-@name_arguments
-class SharedAdam(torch.optim.Adam):
-    """torch's Adam with its moments and step count in shared memory.
-
-    Args:
-        params (iterable): parameters, or groups of them; moved to shared memory.
-        lr (float): learning rate. Default 1e-3.
-        fused (bool): one call for all parameters of a group; on the CPU about 3 times as fast.
-            Default ``True``.
-        **kwargs: of ``torch.optim.Adam`` (``betas``, ``eps``, ``weight_decay``, ``amsgrad``).
-
-    Reference:
-        Kingma and Ba, "Adam: a method for stochastic optimization", 2015, arXiv 1412.6980.
-
-    Examples:
-        >>> weight = torch.nn.Parameter(torch.tensor([1.0]))
-        >>> optimizer = SharedAdam([weight], lr=0.5)
-        >>> weight.grad = torch.tensor([3.0])
-        >>> _ = optimizer.step()
-        >>> weight.item(), optimizer.state[weight]["step"].is_shared()
-        (0.5, True)
-    """
-
-    def __init__(
-        self, params: Iterable[Any], lr: float = 1e-3, *, fused: bool = True, **kwargs: Any
-    ) -> None:
-        super().__init__(params, lr=lr, fused=fused, **kwargs)
-        share_optimizer(self)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import cloudpickle
@@ -19,7 +21,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.processes import share
 from torchrl_hmcts.trainers.a3c.actor_learner import (
     ActorLearner,
@@ -31,11 +33,8 @@ from torchrl_hmcts.trainers.a3c.actor_learner import (
 )
 from torchrl_hmcts.trainers.a3c.learner_log import LearnerLog
 from torchrl_hmcts.trainers.a3c.learner_processes import LearnerProcesses
-from torchrl_hmcts.trainers.a3c.shared_optimizers import (
-    SharedAdam,
-    SharedRMSprop,
-    share_optimizer,
-)
+from torchrl_hmcts.trainers.a3c.shared_optimizers import SharedRMSprop, share_optimizer
+from torchrl_hmcts.trainers.off_policy import made_by
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     check_settings,
@@ -53,11 +52,14 @@ _SCHEDULES: dict[str, Callable[[float], float]] = {
     "linear": lambda progress: 1.0 - progress,
     "constant": lambda progress: 1.0,
 }
-_OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {"rmsprop": SharedRMSprop, "adam": SharedAdam}
+_OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
+    "rmsprop": SharedRMSprop,
+    "adam": partial(torch.optim.Adam, fused=True),
+}
 _POLL_SECONDS = 0.2
+_OWNER = "A3CTrainer"
 
 
-@name_arguments
 class A3CTrainer:
     r"""Actor-learners in processes of their own, with one set of parameters in shared memory.
 
@@ -97,9 +99,9 @@ class A3CTrainer:
     raises ``KeyboardInterrupt``; a second one does not interrupt that. If this process is killed,
     the learners notice and end.
 
-    A run goes on from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
+    A run continues from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
     T, the learning rate's schedule and the curves are as they were. Not exact, and not meant to be:
-    running episodes begin anew, with other random numbers, and checkpoints are read while learners
+    new episodes begin, with other random numbers, and checkpoints are read while learners
     write, so that single weights may be an update older than others. How learners interleave
     differs from run to run; with one learner a run is a function of its seed.
 
@@ -119,8 +121,9 @@ class A3CTrainer:
         num_learners (int): processes. Default 2. With 0 one learner runs in this process, as
             ``num_workers=0`` of a ``DataLoader``: to debug, and for tests.
         optimizer (str, callable or Optimizer): ``"rmsprop"`` (default; :class:`SharedRMSprop`),
-            ``"adam"`` (:class:`SharedAdam`), ``optimizer(parameters) -> Optimizer``, or an
-            optimiser over the loss's parameters; see :func:`share_optimizer` for the kinds.
+            ``"adam"``, ``optimizer(parameters) -> Optimizer``, or an optimiser over the loss's
+            parameters: :class:`SharedRMSprop`, or torch's ``Adagrad``, ``Adam``, ``Adamax``,
+            ``AdamW``, ``RMSprop`` or ``SGD``.
         lr (float): learning rate at the start, of a named optimiser. Default 7e-4.
         lr_schedule (str or callable): ``"linear"`` (default): it falls to 0 at ``total_frames``, as
             in the paper; ``"constant"``; or factor of the share of frames done, 0 to 1.
@@ -129,7 +132,7 @@ class A3CTrainer:
             learner i with its own copy, for exploration that differs between learners, e.g.
             ``lambda loss, i: loss.entropy_coeff.fill_((0.01, 0.003)[i])``.
         evaluate (callable, optional): ``evaluate(policy) -> dict`` of floats, with a copy of the
-            policy as it is now, without gradients. Called in this process while the learners go on.
+            policy as it is now, without gradients. Called in this process while the learners act.
         eval_interval (int, optional): frames between evaluations, besides the one at the end.
             Default: a tenth of ``total_frames``.
         stop_when (callable, optional): ``stop_when(metrics) -> bool``, called with what
@@ -207,97 +210,49 @@ class A3CTrainer:
         start_method: str = "spawn",
         step_seconds: float = 60.0,
     ) -> None:
-        eval_interval = max(1, total_frames // 10) if eval_interval is None else eval_interval
-        save_interval = max(1, total_frames // 10) if save_interval is None else save_interval
-        for name, value, least in (
-            ("total_frames", total_frames, 1),
-            ("segment_steps", segment_steps, 1),
-            ("num_learners", num_learners, 0),
-            ("eval_interval", eval_interval, 1),
-            ("log_interval", log_interval, 1),
-            ("save_interval", save_interval, 1),
-            ("seed", seed, 0),
-        ):
-            if value < least:
-                raise ValueError(f"A3CTrainer needs {name} >= {least}; got {value}.")
-        if not step_seconds > 0.0:
-            raise ValueError(f"A3CTrainer needs step_seconds > 0; got {step_seconds}.")
-        if clip_norm is not None and not clip_norm > 0.0:
-            raise ValueError(
-                f"A3CTrainer needs clip_norm > 0, or None to leave gradients as they are; got "
-                f"{clip_norm}."
-            )
-        if start_method not in multiprocessing.get_all_start_methods():
-            raise ValueError(
-                f"start_method={start_method!r} is none of this system's "
-                f"{multiprocessing.get_all_start_methods()}."
-            )
-        if not hasattr(loss_module, "actor_network"):
-            raise TypeError(
-                f"A3CTrainer acts with the loss's actor_network; {type(loss_module).__name__} has "
-                "none. Use A3CLoss, or another actor-critic loss."
-            )
-        if getattr(loss_module, "reduction", "mean") == "none":
-            raise ValueError(
-                "A3CTrainer needs a loss that is one number; this one has reduction='none'. Use "
-                "'mean' or 'sum'."
-            )
-        if stop_when is not None and evaluate is None:
-            raise ValueError("stop_when looks at what evaluate returns; pass evaluate too.")
+        _check(locals())
+        tenth = max(1, total_frames // 10)
+        if not callable(lr_schedule):
+            lr_schedule = _SCHEDULES[_known("lr_schedule", lr_schedule, _SCHEDULES)]
         self.loss_module = loss_module
         self.settings = LearnerSettings(
             make_env=make_env,
             loss_module=loss_module,
             segment_steps=segment_steps,
             total_frames=total_frames,
-            lr_schedule=_named("lr_schedule", lr_schedule, _SCHEDULES),
+            lr_schedule=lr_schedule,
             clip_norm=clip_norm,
             seed=seed,
             configure_learner=configure_learner,
         )
         parameters = trained_parameters(loss_module)
-        if isinstance(optimizer, Optimizer):
-            self.optimizer = optimizer
-        elif isinstance(optimizer, str):
-            self.optimizer = _named("optimizer", optimizer, _OPTIMIZERS)(parameters, lr=lr)
-        else:
-            self.optimizer = optimizer(parameters)
-        self._check_parameters(parameters)
-        share_optimizer(self.optimizer)
-        for group in self.optimizer.param_groups:
-            group.setdefault("initial_lr", group["lr"])
+        self.optimizer = _make_optimizer(optimizer, parameters, lr)
         columns = board_columns(loss_module)
         board = torch.zeros(max(1, num_learners), len(columns), dtype=torch.float64)
         stop = torch.zeros(1, dtype=torch.uint8)
         steps = torch.zeros(len(board), dtype=torch.int64)
-        share([board, stop, steps], "A3CTrainer")
+        share([board, stop, steps], _OWNER)
         self.shared = SharedMemory(parameters, self.optimizer, board, stop, steps)
-        self.learners = LearnerProcesses(num_learners, start_method, step_seconds)
+        self.learners = LearnerProcesses(num_learners, start_method, step_seconds, self.shared)
         self.evaluate, self.stop_when = evaluate, stop_when
         self.log, self.progress = LearnerLog(board, columns, logger), progress
-        self.run_settings = {"trainer": "A3CTrainer", "loss_module": type(loss_module).__name__}
+        self.run_settings = {"trainer": _OWNER, "loss_module": type(loss_module).__name__}
         self.rotation = None
         if save_dir is not None:
             self.rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
             self.rotation.settings = self.run_settings
         self._save_at = float("inf")  # time at which a checkpoint is due
-        self.intervals = {"log": log_interval, "eval": eval_interval, "save": save_interval}
+        self.intervals = {
+            "log": log_interval,
+            "eval": tenth if eval_interval is None else eval_interval,
+            "save": tenth if save_interval is None else save_interval,
+        }
         self._checkpoint = plain_checkpoint(
             loss_module=loss_module,
             optimizer=_OptimizerState(self.optimizer),
             counters=self.log,
             history=HistoryState(self.log),  # type: ignore[arg-type]
         )
-
-    def _check_parameters(self, parameters: list[nn.Parameter]) -> None:
-        known = {id(p) for p in parameters}
-        held = [p for group in self.optimizer.param_groups for p in group["params"]]
-        foreign = sum(id(p) not in known for p in held)
-        if foreign:
-            raise ValueError(
-                f"{foreign} of the optimiser's {len(held)} parameters are not the loss's. Build it "
-                "over loss_module.parameters()."
-            )
 
     @property
     def frames(self) -> int:
@@ -344,23 +299,25 @@ class A3CTrainer:
         self.log.start()
         self._next = {name: self._after(name) for name in self.intervals}
         self._accepted: LossModule | None = None  # what stop_when was content with
-        self._bar = self.progress(total=self.settings.total_frames) if self.progress else None
+        self._bar = None
+        if self.progress is not None:
+            self._bar = self.progress(total=self.settings.total_frames)
         try:
             if self.frames < self.settings.total_frames:
                 (self._watch if self.learners.number else self._run_here)()
-            self.learners.stop(self.shared)
+            self.learners.stop()
             if self._accepted is not None:
                 self.loss_module.load_state_dict(self._accepted.state_dict())
             self._report(at_end=True)
         except BaseException as error:
             with unbroken():
-                self.learners.stop(self.shared)
+                self.learners.stop()
                 self._end_badly(error)
             if not isinstance(error, KeyboardInterrupt):
                 raise_if_asked()  # the signal came to the learners as well, and ended them first
             raise
         finally:
-            self.learners.stop(self.shared)
+            self.learners.stop()
             self.log.stop()
             if self._bar is not None:
                 self._bar.close()
@@ -418,7 +375,7 @@ class A3CTrainer:
 
     def _watch(self) -> None:
         start = self.frames
-        self.learners.start(cloudpickle.dumps(self.settings), self.shared, start)
+        self.learners.start(cloudpickle.dumps(self.settings), start)
         while not self.learners.wait(_POLL_SECONDS, self.frames >= self.settings.total_frames):
             raise_if_asked()
             if self.frames == start:  # they are still importing
@@ -435,7 +392,7 @@ class A3CTrainer:
         except OSError as failure:  # what ended the run is the error to raise
             print(f"\n{type(error).__name__}; and {failure}.", file=sys.stderr)
             return
-        again = f"Go on with trainer.load({str(self.rotation.directory)!r}).train()."
+        again = f"Continue with trainer.load({str(self.rotation.directory)!r}).train()."
         how = "Stopped" if isinstance(error, KeyboardInterrupt) else type(error).__name__
         print(f"\n{how}; saved at {self.frames} frames. {again}", file=sys.stderr)
 
@@ -503,16 +460,68 @@ class _OptimizerState:
         if saved != own:
             raise ValueError(
                 f"the checkpoint's optimiser has the state {saved}, this one, "
-                f"{type(self.optimizer).__name__}, has {own}. Go on with the same optimiser."
+                f"{type(self.optimizer).__name__}, has {own}. Continue with the same optimiser."
             )
         self.optimizer.load_state_dict(dict(state_dict))
         share_optimizer(self.optimizer)  # loading has put new tensors in place of the shared ones
 
 
-def _named(name: str, value: Any, known: Mapping[str, Any]) -> Any:
-    """Returns what a name stands for; anything callable stands for itself."""
-    if callable(value):
-        return value
-    if value not in known:
-        raise ValueError(f"{name}={value!r} is none of {sorted(known)}, and not callable.")
-    return known[value]
+def _check(given: Mapping[str, Any]) -> None:
+    """Refuses arguments of the constructor that make no sense."""
+    for name in ("total_frames", "segment_steps", "log_interval"):
+        whole_number(_OWNER, name, given[name], least=1)
+    for name in ("eval_interval", "save_interval"):
+        if given[name] is not None:
+            whole_number(_OWNER, name, given[name], least=1)
+    whole_number(_OWNER, "num_learners", given["num_learners"])
+    whole_number(_OWNER, "seed", given["seed"])
+    real_number(_OWNER, "lr", given["lr"], least=0.0)
+    real_number(_OWNER, "step_seconds", given["step_seconds"], above=0.0)
+    if given["clip_norm"] is not None:
+        real_number(_OWNER, "clip_norm", given["clip_norm"], above=0.0)
+    instance(_OWNER, "make_env", given["make_env"], Callable)
+    for name in ("configure_learner", "evaluate", "stop_when", "progress"):
+        instance(_OWNER, name, given[name], Callable, NoneType)
+    instance(_OWNER, "logger", given["logger"], Logger, NoneType)
+    _known("start_method", given["start_method"], multiprocessing.get_all_start_methods())
+    loss_module = given["loss_module"]
+    if not hasattr(loss_module, "actor_network"):
+        raise TypeError(
+            f"A3CTrainer acts with the loss's actor_network; {type(loss_module).__name__} has "
+            "none. Use A3CLoss, or another actor-critic loss."
+        )
+    if getattr(loss_module, "reduction", "mean") == "none":
+        raise ValueError(
+            "A3CTrainer needs a loss that is one number; this one has reduction='none'. Use "
+            "'mean' or 'sum'."
+        )
+    if given["stop_when"] is not None and given["evaluate"] is None:
+        raise ValueError("stop_when looks at what evaluate returns; pass evaluate too.")
+
+
+def _make_optimizer(
+    optimizer: str | MakeOptimizer | Optimizer, parameters: list[nn.Parameter], lr: float
+) -> Optimizer:
+    """Returns a shared optimiser over parameters of the loss, whose groups know their first lr."""
+    if isinstance(optimizer, str):
+        optimizer = _OPTIMIZERS[_known("optimizer", optimizer, _OPTIMIZERS)](parameters, lr=lr)
+    elif not isinstance(optimizer, Optimizer):
+        optimizer = made_by(optimizer, _OWNER, "optimizer", Optimizer, parameters)
+    known = {id(p) for p in parameters}
+    held = [p for group in optimizer.param_groups for p in group["params"]]
+    foreign = sum(id(p) not in known for p in held)
+    if foreign:
+        raise ValueError(
+            f"{foreign} of the optimiser's {len(held)} parameters are not the loss's. Build it "
+            "over loss_module.parameters()."
+        )
+    share_optimizer(optimizer)
+    for group in optimizer.param_groups:
+        group.setdefault("initial_lr", group["lr"])
+    return optimizer
+
+
+def _known(name: str, value: Any, known: Collection[str]) -> str:
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"A3CTrainer needs {name} to be one of {sorted(known)}; got {value!r}.")
+    return value

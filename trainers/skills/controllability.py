@@ -27,8 +27,11 @@ class Controllability:
             the action.
         num_values: int64 ``[F]``, values that a feature takes.
         motion: float64 ``[F]``, share of the states in which the neutral action changes a feature.
-        min_dependence, min_values, min_effect, min_motion: what :attr:`controllable` and
-            :attr:`moving` ask for.
+        min_dependence: share of states in which a controllable feature must depend on the action.
+            Default 0.15.
+        min_values: values that a controllable or moving feature must take. Default 16.
+        min_effect: mean change that counts as raising or lowering. Default 0.5.
+        min_motion: share of states in which a moving feature must change. Default 0.15.
 
     Example:
         >>> import numpy as np
@@ -69,16 +72,15 @@ class Controllability:
 
     def raising(self, feature: int) -> np.ndarray:
         """Actions that raise a feature, the strongest first."""
-        effect = self.effects[:, feature]
-        order = np.argsort(-effect, kind="stable")
-        found: np.ndarray = order[effect[order] > self.min_effect]
-        return found
+        return self._strongest(self.effects[:, feature])
 
     def lowering(self, feature: int) -> np.ndarray:
         """Actions that lower a feature, the strongest first."""
-        effect = self.effects[:, feature]
-        order = np.argsort(effect, kind="stable")
-        found: np.ndarray = order[effect[order] < -self.min_effect]
+        return self._strongest(-self.effects[:, feature])
+
+    def _strongest(self, effect: np.ndarray) -> np.ndarray:
+        order = np.argsort(-effect, kind="stable")
+        found: np.ndarray = order[effect[order] > self.min_effect]
         return found
 
 
@@ -88,10 +90,7 @@ def probe_controllability(
     key: NestedKey,
     *,
     neutral: int = 0,
-    min_dependence: float = 0.15,
-    min_values: int = 16,
-    min_effect: float = 0.5,
-    min_motion: float = 0.15,
+    **thresholds: float,
 ) -> Controllability:
     r"""Take every action in every state and look which features it changed.
 
@@ -106,11 +105,8 @@ def probe_controllability(
         states (TensorDictBase): ``[S]``, what to try the actions from.
         key (NestedKey): features, integer or float ``[S, F]``; differences of uint8 wrap around.
         neutral (int): the action that changes least. Default 0.
-        min_dependence (float): share of states in which a controllable feature must depend on the
-            action. Default 0.15.
-        min_values (int): values that a feature must take. Default 16.
-        min_effect (float): mean change that counts as raising or lowering. Default 0.5.
-        min_motion (float): share of states in which a moving feature must change. Default 0.15.
+        **thresholds: ``min_dependence``, ``min_values``, ``min_effect``, ``min_motion`` of
+            :class:`Controllability`.
 
     Returns:
         Controllability: effects and what follows from them.
@@ -159,8 +155,5 @@ def probe_controllability(
         dependence=(after != after[:, :1]).any(1).mean(0),
         num_values=np.array([len(np.unique(flat[:, f])) for f in range(flat.shape[1])]),
         motion=(change[:, neutral] != 0).mean(0),
-        min_dependence=min_dependence,
-        min_values=min_values,
-        min_effect=min_effect,
-        min_motion=min_motion,
+        **thresholds,  # type: ignore[arg-type]
     )

@@ -5,6 +5,7 @@ Letters: n base steps of a batch, D size of the watched entry, C distinct cells.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Any
@@ -15,10 +16,9 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, real_number, whole_number
 
 
-@name_arguments
 class StateCoverage(TrainerHookBase):
     r"""Counts the distinct cells of an entry that were visited: lately, and since the start.
 
@@ -62,36 +62,26 @@ class StateCoverage(TrainerHookBase):
     def __init__(
         self, key: NestedKey = "displacement", *, cell_side: float = 0.5, window: int = 4_000
     ) -> None:
-        if not cell_side > 0.0:
-            raise ValueError(
-                f"StateCoverage needs cells of a positive side, in units of {key!r}; got "
-                f"cell_side={cell_side}."
-            )
-        if window < 1:
-            raise ValueError(
-                f"StateCoverage needs a window of at least one base step; got window={window}."
-            )
+        instance("StateCoverage", "key", key, str, tuple)
         self.key = unravel_key(("next", key))
-        self.cell_side = float(cell_side)
-        self.window = int(window)
-        self._total: set[bytes] = set()
-        self._recent: Counter[bytes] = Counter()
-        self._batches: deque[list[bytes]] = deque()
+        self.cell_side = real_number("StateCoverage", "cell_side", cell_side, above=0.0)
+        self.window = whole_number("StateCoverage", "window", window, least=1)
+        self._total: set[tuple[int, ...]] = set()
+        self._recent: Counter[tuple[int, ...]] = Counter()
+        self._batches: deque[list[tuple[int, ...]]] = deque()
         self._steps = 0
-        self._size = 0  # D, known from the first batch on
 
     def __call__(self, batch: TensorDictBase) -> dict[str, float]:
         value = batch.get(self.key)
         rows = value.detach().reshape(-1, value.shape[-1]).numpy(force=True)
         cells = np.floor(rows / self.cell_side).astype(np.int32)
-        self._size = cells.shape[1]
-        self._add(_as_bytes(cells))
+        self._add(list(map(tuple, cells.tolist())))
         return {
             "state_coverage": float(len(self._recent)),
             "state_coverage_total": float(len(self._total)),
         }
 
-    def _add(self, cells: list[bytes]) -> None:
+    def _add(self, cells: list[tuple[int, ...]]) -> None:
         self._total.update(cells)
         self._recent.update(cells)
         self._batches.append(cells)
@@ -107,37 +97,23 @@ class StateCoverage(TrainerHookBase):
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the visited cells, int32 ``[*, D]``, and the sizes of the window's batches."""
+        recent = [cell for batch in self._batches for cell in batch]
         return {
-            "total": self._as_cells(sorted(self._total)),
-            "recent": self._as_cells([cell for batch in self._batches for cell in batch]),
+            "total": torch.tensor(sorted(self._total), dtype=torch.int32),
+            "recent": torch.tensor(recent, dtype=torch.int32),
             "batch_steps": [len(batch) for batch in self._batches],
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Goes on from what :meth:`state_dict` returned."""
-        total, recent = (state_dict[name].numpy(force=True) for name in ("total", "recent"))
-        self._size = total.shape[1]
-        self._total = set(_as_bytes(total))
+        """Continues from what :meth:`state_dict` returned."""
+        total, recent = (map(tuple, state_dict[name].tolist()) for name in ("total", "recent"))
+        self._total = set(total)
         self._recent.clear()
         self._batches.clear()
-        self._steps = begin = 0
+        self._steps = 0
         for steps in state_dict["batch_steps"]:
-            self._add(_as_bytes(recent[begin : begin + steps]))
-            begin += steps
+            self._add(list(itertools.islice(recent, steps)))
 
     def register(self, trainer: Trainer, name: str = "state_coverage") -> None:
         trainer.register_op("pre_steps_log", self)
         trainer.register_module(name, self)
-
-    def _as_cells(self, cells: list[bytes]) -> torch.Tensor:
-        flat = np.frombuffer(b"".join(cells), np.int32).copy()
-        return torch.from_numpy(flat.reshape(len(cells), self._size))
-
-
-def _as_bytes(cells: np.ndarray) -> list[bytes]:
-    """Returns the rows of int32 cells as keys that can be counted."""
-    if not cells.size:
-        return []
-    width = 4 * cells.shape[1]
-    data = cells.tobytes()
-    return [data[i : i + width] for i in range(0, len(data), width)]

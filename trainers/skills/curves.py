@@ -10,10 +10,7 @@ from tensordict import TensorDictBase
 
 
 def curve_name(key: str) -> str:
-    """Returns the name under which an entry of a loss's output is logged.
-
-    Args:
-        key (str): the entry, e.g. ``"loss_actor"``.
+    """Return the name under which an entry of a loss's output is logged.
 
     Example:
         >>> [curve_name(key) for key in ("loss_actor", "qvalue_loss_0", "loss_qvalue", "entropy")]
@@ -29,22 +26,10 @@ def curve_name(key: str) -> str:
 
 
 def log_curves(optim_steps: int, average_losses: TensorDictBase | None) -> dict[str, float]:
-    """Names the losses and diagnostics of a batch, averaged over its updates, for the log.
+    """Name the losses and diagnostics of a batch, averaged over its updates, for the log.
 
     A hook of any TorchRL ``Trainer`` for the stage ``"post_optim_complete_log"``; turn off the
     Trainer's own ``auto_log_optim_steps`` with it.
-
-    Args:
-        optim_steps (int): updates so far.
-        average_losses (TensorDictBase, optional): scalars by the loss's names.
-
-    Returns:
-        dict of float: the same by the names of :func:`curve_name`, and ``optim_steps``.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> log_curves(3, TensorDict(loss_actor=torch.tensor(0.5)))
-        {'optim_steps': 3, 'actor_loss': 0.5}
     """
     values: dict[str, float] = {"optim_steps": optim_steps}
     if average_losses is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -31,36 +31,26 @@ def load_dataset(
         FileNotFoundError: if the folder holds no dataset.
         ValueError: if an entry is missing.
         TypeError: if it is none of these.
-
-    Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> data = TensorDict(skill=torch.arange(6).view(2, 3), batch_size=[2, 3])
-        >>> _ = data.memmap("recorded")
-        >>> load_dataset("recorded", ["skill"])["skill"].tolist()
-        [0, 1, 2, 3, 4, 5]
     """
-    if dataset is None:
-        return TensorDict(batch_size=[0])
+    data: TensorDictBase = TensorDict(batch_size=[0])
     if isinstance(dataset, (str, Path)):
-        data, name = _load_folder(Path(dataset)), f"in {str(dataset)!r}"
+        data = _load_folder(Path(dataset))
     elif isinstance(dataset, ReplayBuffer):
-        data = dataset[:] if len(dataset) else TensorDict(batch_size=[0])
-        name = "in the replay buffer"
+        data = dataset[:] if len(dataset) else data
     elif isinstance(dataset, TensorDictBase):
-        data, name = dataset, "given"
-    else:
+        data = dataset
+    elif dataset is not None:
         raise TypeError(
             f"A dataset is a ReplayBuffer, a TensorDict or the path of a folder; got "
             f"{type(dataset).__name__}."
         )
-    data = data.reshape(-1) if data.ndim != 1 else data
+    data = data if data.ndim == 1 else data.reshape(-1)
     if not len(data):
         return TensorDict(batch_size=[0])
     missing = [key for key in keys if data.get(key, None) is None]
     if missing:
         raise ValueError(
-            f"The dataset {name} lacks {missing}, which the loss reads; it has "
+            f"The dataset lacks {missing}, which the loss reads; it has "
             f"{sorted(map(str, data.keys(True, True)))}. Record it with "
             "OptionRecorder(loss.in_keys)."
         )
@@ -81,49 +71,26 @@ def _load_folder(folder: Path) -> TensorDictBase:
     return data
 
 
-class UnionSampler:
-    """Draws batches from a replay buffer S and a dataset D together.
+def sample_union(
+    buffer: ReplayBuffer,
+    *,
+    dataset: TensorDictBase,
+    batch_size: int,
+    fraction: float | None,
+    reward: Callable[[TensorDictBase], TensorDictBase],
+) -> TensorDictBase:
+    """Draw a batch from a replay buffer S and a dataset D together, and write its reward.
 
-    Args:
-        buffer: S, which may grow.
-        dataset: D, transitions ``[n]``, maybe none.
-        batch_size: transitions of a batch.
-        fraction: share of a batch that comes from D, while both have some. ``None``: uniformly from
-            the union.
-        reward: transform that writes the reward of a batch.
-
-    Example:
-        >>> from torchrl.data import LazyTensorStorage
-        >>> given = TensorDict(x=torch.arange(3), batch_size=[3])
-        >>> buffer = ReplayBuffer(storage=LazyTensorStorage(9))
-        >>> UnionSampler(buffer, given, 8, None, torch.nn.Identity()).sample().batch_size
-        torch.Size([8])
+    ``fraction`` of it comes from D, while both have some; ``None``: uniformly from the union.
     """
-
-    def __init__(
-        self,
-        buffer: ReplayBuffer,
-        dataset: TensorDictBase,
-        batch_size: int,
-        fraction: float | None,
-        reward: torch.nn.Module,
-    ) -> None:
-        self.buffer, self.dataset = buffer, dataset
-        self.batch_size, self.fraction, self.reward = batch_size, fraction, reward
-
-    def sample(self, batch: TensorDictBase | None = None) -> TensorDictBase:
-        """Return a batch; a ``Trainer`` passes the latest one, which is not used."""
-        own, given = len(self.buffer), len(self.dataset)
-        if own and given and self.fraction is not None:
-            from_given = round(self.fraction * self.batch_size)
-            given_index = torch.randint(given, (from_given,))
-            own_index = torch.randint(own, (self.batch_size - from_given,))
-        else:  # uniform over the union
-            index = torch.randint(own + given, (self.batch_size,))
-            own_index, given_index = index[index < own], index[index >= own] - own
-        parts = [
-            source[rows]
-            for source, rows in ((self.buffer, own_index), (self.dataset, given_index))
-            if len(rows)
-        ]
-        return self.reward(torch.cat(parts) if len(parts) > 1 else parts[0])
+    own, given = len(buffer), len(dataset)
+    if own and given and fraction is not None:
+        from_given = round(fraction * batch_size)
+        given_index = torch.randint(given, (from_given,))
+        own_index = torch.randint(own, (batch_size - from_given,))
+    else:
+        index = torch.randint(own + given, (batch_size,))
+        own_index, given_index = index[index < own], index[index >= own] - own
+    drawn = ((buffer, own_index), (dataset, given_index))
+    parts = [source[rows] for source, rows in drawn if len(rows)]
+    return reward(torch.cat(parts) if len(parts) > 1 else parts[0])

@@ -6,6 +6,7 @@ Letters: B searches, Z skills there is room for.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -13,13 +14,14 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.modules import GrowingSkillPrior, SkillPrior
 from torchrl_hmcts.planners import MCTSPlanner, Search
 from torchrl_hmcts.planners.tree import PRUNED
 
+_COLUMNS = ("base_steps", "num_active", "accuracy", "coverage", "gain", "better")
 
-@name_arguments
+
 class SearchCoverage:
     r"""Counts the places that searches of a fixed budget reach with the skills that are on.
 
@@ -62,15 +64,13 @@ class SearchCoverage:
     def __init__(
         self, planner: MCTSPlanner, starts: TensorDictBase, prior: SkillPrior | None = None
     ) -> None:
-        if planner.novelty is None:
+        if planner.novelty is None or planner.budget.until_plan:
             raise ValueError(
-                "SearchCoverage counts the nodes that a novelty test accepts; the planner has "
-                "none. Build it with e.g. novelty=RadiusNovelty('position', 0.7)."
-            )
-        if planner.budget.until_plan:
-            raise ValueError(
-                "SearchCoverage needs searches that use up their budget, or it counts how near the "
-                "target is. Build the planner with budget=SearchBudget(..., until_plan=False)."
+                "SearchCoverage counts the nodes that a novelty test accepts while the budget "
+                "lasts; the planner has novelty="
+                f"{planner.novelty} and until_plan={planner.budget.until_plan}. Build it with e.g. "
+                "novelty=RadiusNovelty('position', 0.7), budget=SearchBudget(..., "
+                "until_plan=False)."
             )
         self.planner = planner
         self.starts = starts
@@ -85,28 +85,16 @@ class SearchCoverage:
             starts.set(key, active.expand(*starts.batch_size, len(active)).clone())
         search = self.planner.search(starts, seed=0)
         self.base_steps += int(search.num_base_steps.sum())
-        return float(num_places(search).mean())
+        return float(_num_places(search).mean())
 
 
-def num_places(search: Search) -> np.ndarray:
-    """Return how many nodes of each tree its novelty test accepted, int64 ``[B]``.
-
-    Args:
-        search: a search, finished or not.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> env = ChainEnv(length=5)
-        >>> int(num_places(MCTSPlanner(env).search(env.reset()))[0]) > 1
-        True
-    """
+def _num_places(search: Search) -> np.ndarray:
+    """Nodes of each tree that its novelty test accepted, int64 ``[B]``."""
     used = np.arange(search.tree.capacity) < search.tree.num_nodes[:, None]
     accepted: np.ndarray = (search.tree.nodes["flags"] & PRUNED) == 0
     return (accepted & used).sum(-1)
 
 
-@name_arguments
 class GrowSkills(TrainerHookBase):
     r"""Switches on one skill after the other while they add coverage, then goes back to the best.
 
@@ -205,36 +193,24 @@ class GrowSkills(TrainerHookBase):
         min_rise: float = 0.01,
         accuracy_key: str = "discriminator_accuracy",
     ) -> None:
-        if not 1 <= min_base_steps <= max_base_steps:
-            raise ValueError(
-                "GrowSkills judges skills between min_base_steps and max_base_steps after the last "
-                f"change, 1 <= min <= max; got {min_base_steps} and {max_base_steps}."
-            )
-        if window < 2:
-            raise ValueError(
-                f"GrowSkills compares two halves of a window of batches; got window={window}."
-            )
-        if patience < 1:
-            raise ValueError(
-                "GrowSkills ends when patience skills in a row have added nothing, one at least; "
-                f"got patience={patience}."
-            )
-        if not min_gain >= 0.0:
-            raise ValueError(
-                "GrowSkills keeps skills that raise coverage by min_gain, which must not be "
-                f"negative, or it would never stop; got {min_gain}."
-            )
+        owner = "GrowSkills"
+        instance(owner, "prior", prior, GrowingSkillPrior)
+        instance(owner, "coverage", coverage, Callable)
+        instance(owner, "prune", prune, bool)
+        instance(owner, "accuracy_key", accuracy_key, str)
         self.prior = prior
         self.coverage = coverage
-        self.min_gain = float(min_gain)
-        self.patience = int(patience)
-        self.prune = bool(prune)
-        self.enough = enough
-        self.min_base_steps = int(min_base_steps)
-        self.max_base_steps = int(max_base_steps)
-        self.until = until
-        self.window = int(window)
-        self.min_rise = float(min_rise)
+        self.min_gain = real_number(owner, "min_gain", min_gain, least=0.0)
+        self.patience = whole_number(owner, "patience", patience, least=1)
+        self.prune = prune
+        self.enough = math.inf if enough is None else real_number(owner, "enough", enough)
+        self.min_base_steps = whole_number(owner, "min_base_steps", min_base_steps, least=1)
+        self.max_base_steps = whole_number(
+            owner, "max_base_steps", max_base_steps, least=self.min_base_steps
+        )
+        self.until = math.inf if until is None else whole_number(owner, "until", until)
+        self.window = whole_number(owner, "window", window, least=2)
+        self.min_rise = real_number(owner, "min_rise", min_rise)
         self.accuracy_key = accuracy_key
         self.finished = False
         self.history: dict[str, list[Any]] = {key: [] for key in _COLUMNS}
@@ -290,21 +266,23 @@ class GrowSkills(TrainerHookBase):
         for key, value in zip(_COLUMNS, row, strict=True):
             self.history[key].append(value)
         if better:
-            self._best = {"number": number, "coverage": coverage, "weights": _weights(trainer)}
+            weights = {n: copy.deepcopy(p.state_dict()) for n, p in _parts(trainer).items()}
+            self._best = {"number": number, "coverage": coverage, "weights": weights}
         self._fruitless = 0 if better else self._fruitless + 1
         helped = any(self.history["better"][1:])
         self.finished = (
             (helped and self._fruitless >= self.patience)
             or number == self.prior.num_skills
-            or (self.until is not None and base_steps >= self.until)
-            or (self.enough is not None and coverage >= self.enough)
+            or base_steps >= self.until
+            or coverage >= self.enough
         )
         if not self.finished:
             self.prior.set_num_active(number + 1)
         else:
             if not better:
                 self.prior.set_num_active(self._best["number"])
-                _load_weights(trainer, self._best["weights"])
+                for name, part in _parts(trainer).items():
+                    part.load_state_dict(copy.deepcopy(self._best["weights"][name]))
             if self.prune:
                 self._drop_useless_skills()
             self._best.pop("weights")
@@ -345,7 +323,7 @@ class GrowSkills(TrainerHookBase):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Goes on from what :meth:`state_dict` returned."""
+        """Continues from what :meth:`state_dict` returned."""
         self.prior.load_state_dict(state_dict["prior"])
         self.finished = bool(state_dict["finished"])
         self._changed_at = int(state_dict["changed_at"])
@@ -356,18 +334,7 @@ class GrowSkills(TrainerHookBase):
         self.history = {key: list(state_dict["history"][key]) for key in _COLUMNS}
 
 
-def _weights(trainer: Trainer) -> dict[str, Any]:
-    """Copies what training has learned so far."""
+def _parts(trainer: Trainer) -> dict[str, Any]:
+    """What training changes, and what goes back to where it was best."""
     parts = {"loss_module": trainer.loss_module, "optimizer": trainer.optimizer}
-    return {
-        name: copy.deepcopy(part.state_dict()) for name, part in parts.items() if part is not None
-    }
-
-
-def _load_weights(trainer: Trainer, weights: Mapping[str, Any]) -> None:
-    trainer.loss_module.load_state_dict(weights["loss_module"])
-    if trainer.optimizer is not None:
-        trainer.optimizer.load_state_dict(copy.deepcopy(weights["optimizer"]))
-
-
-_COLUMNS = ("base_steps", "num_active", "accuracy", "coverage", "gain", "better")
+    return {name: part for name, part in parts.items() if part is not None}

@@ -45,12 +45,7 @@ class SkillRewardHook(TrainerHookBase):
         }
 
     def register(self, trainer: Trainer, name: str = "skill_reward") -> None:
-        """Append the transform to the trainer's replay buffer.
-
-        Args:
-            trainer (Trainer): with a ``replay_buffer`` and a loss that has an ``objective``.
-            name (str): ignored; the hook has no state.
-        """
+        """Append the transform to the trainer's replay buffer; the hook itself has no state."""
         objective = getattr(trainer.loss_module, "objective", None)
         buffer = getattr(trainer, "replay_buffer", None)
         if objective is None or buffer is None:
@@ -61,11 +56,7 @@ class SkillRewardHook(TrainerHookBase):
             )
         buffer.append_transform(SkillReward(objective, **self._keywords))
 
-    def __call__(self) -> None:
-        """Do nothing: the replay buffer calls the transform."""
-
     def state_dict(self) -> dict[str, Any]:
-        """Return nothing: the transform has no state of its own."""
         return {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
+from torchrl.envs import TransformedEnv
 
 from torchrl_hmcts.planners import MCTSPlanner
-from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
-from torchrl_hmcts.transforms import OptionRecorder
+from torchrl_hmcts.trainers.collectors import LocalCollector
+from torchrl_hmcts.trainers.evaluation import Results, execute_plans, plan_and_execute
 
 RECORDED = ("round", "training_steps", "solved", "found", "simulated_steps", "executed_steps")
 
@@ -25,12 +25,9 @@ class RoundRecords:
     """What each round of planning and acting cost, in the order in which they were played.
 
     Args:
-        columns: int64 ``[rounds]`` by the names in ``RECORDED``. Default: no rounds yet.
-
-    Attributes:
-        columns: ``round`` its number t; ``training_steps`` base steps its worker had been trained
-            on; ``solved`` and plan ``found`` (0 or 1); ``simulated_steps`` of the search and
-            ``executed_steps`` of the episode, in base steps.
+        columns: int64 ``[rounds]``: ``round`` its number t; ``training_steps`` base steps its
+            worker had been trained on; ``solved`` and plan ``found`` (0 or 1); ``simulated_steps``
+            of the search and ``executed_steps`` of the episode, in base steps. Default: no rounds.
 
     Example:
         >>> import numpy as np
@@ -53,22 +50,21 @@ class RoundRecords:
 
     def add(self, results: Results, rounds: np.ndarray, training_steps: int) -> dict[str, float]:
         """Append rounds; return their means."""
-        new = {
-            "round": rounds,
-            "training_steps": np.full(len(rounds), training_steps),
-            "solved": results.solved,
-            "found": results.found,
-            "simulated_steps": results.simulated_steps,
-            "executed_steps": results.episode_steps,
-        }
-        for name, values in new.items():
-            self.columns[name] = np.concatenate((self.columns[name], values.astype(np.int64)))
-        return {
-            "solved": float(np.mean(results.solved)),
-            "base_steps": float(np.mean(results.simulated_steps + results.episode_steps)),
-            "simulated_steps": float(np.mean(results.simulated_steps)),
-            "executed_steps": float(np.mean(results.episode_steps)),
-        }
+        new = RoundRecords(
+            {
+                "round": rounds,
+                "training_steps": np.full(len(rounds), training_steps),
+                "solved": results.solved,
+                "found": results.found,
+                "simulated_steps": results.simulated_steps,
+                "executed_steps": results.episode_steps,
+            }
+        )
+        for name, values in new.columns.items():
+            self.columns[name] = np.concatenate((self.columns[name], values))
+        means = new.curve()
+        names = ("solved", "base_steps", "simulated_steps", "executed_steps")
+        return {name: float(means[name][0]) for name in names}
 
     def curve(self) -> dict[str, np.ndarray]:
         """Return means over the rounds played at the same training, float64 ``[points]``.
@@ -100,36 +96,32 @@ class RoundRecords:
         self.columns = {name: state_dict[name].numpy().copy() for name in RECORDED}
 
 
-class PlanningRounds:
+class PlanningRounds(LocalCollector):
     """Plays the rounds of Algorithm 3 and yields the base transitions they consisted of.
 
-    The first batch are those of ``num_init_samples`` options, each drawn uniformly and carried out
+    The first batch are those of ``num_init_samples`` options, each drawn uniformly and executed
     from a state after a reset. Every later batch is ``interval`` rounds: a plan is searched from a
-    state after a reset and carried out; both the simulated and the executed base transitions count.
-    It has what a ``Trainer`` wants of a collector.
+    state after a reset and executed; both the simulated and the executed base transitions count.
 
     Random numbers are a function of ``seed`` and of the round, so that a resumed run needs to know
     no more than its round.
 
     Args:
-        env: in which plans are carried out: stateless, under an ``OptionTransform``.
+        env: in which plans are executed: stateless, under an ``OptionTransform`` and an
+            ``OptionRecorder``.
         simulator: in which they are searched, of the same kind.
         make_planner: ``make_planner(simulator, seed=...)`` builds the planner for some rounds.
-        recorders: of the two envs.
-        num_init_samples: options carried out at first.
+        num_init_samples: options executed at first.
         interval: rounds of a batch, planned side by side.
         rounds: after which the iteration ends.
         seed: of all random numbers.
     """
 
-    init_random_frames = 0
-
     def __init__(
         self,
-        env: EnvBase,
-        simulator: EnvBase,
+        env: TransformedEnv,
+        simulator: TransformedEnv,
         make_planner: Callable[..., MCTSPlanner],
-        recorders: tuple[OptionRecorder, OptionRecorder],
         *,
         num_init_samples: int,
         interval: int,
@@ -138,11 +130,9 @@ class PlanningRounds:
     ) -> None:
         self.env, self.simulator = env, simulator
         self.make_planner = make_planner
-        self.recorders = recorders
-        self.num_init_samples = num_init_samples
-        self.interval = interval
-        self.rounds = rounds
-        self.seed = seed
+        self.recorders = [made.transform[-1] for made in (env, simulator)]
+        self.num_init_samples, self.interval = num_init_samples, interval
+        self.rounds, self.seed = rounds, seed
         self.round = -1  # the next one; -1: the first samples have not been drawn
         self.training_steps = 0  # base steps handed out so far
         self.init_steps = 0  # those of the first samples
@@ -171,11 +161,9 @@ class PlanningRounds:
 
     def _draw(self, seed: int) -> None:
         starts = self._starts(self.num_init_samples, seed)
-        key = self.env.action_keys[0]
-        num_options = int(self.env.full_action_spec[key].space.n)
+        num_options = int(self.env.full_action_spec[self.env.action_keys[0]].space.n)
         options = torch.randint(num_options, (self.num_init_samples,))
-        after = self.env.step(starts.set(key, options))["next"]
-        self.init_steps = int(after["duration"].sum())
+        self.init_steps = int(execute_plans(self.env, starts, options[:, None]).base_steps.sum())
 
     def _play(self, count: int, seed: int) -> None:
         planner = self.make_planner(self.simulator, seed=seed)
@@ -184,25 +172,14 @@ class PlanningRounds:
         rounds = self.round + np.arange(count)
         self.latest = self.records.add(results, rounds, self.training_steps)
 
-    # -------------------------------------------------- what a Trainer asks of a collector
-
-    def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing runs elsewhere."""
-
-    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing to copy: the worker has the live parameters of the loss."""
-
     def state_dict(self) -> dict[str, Any]:
-        counters = {
-            name: getattr(self, name)
-            for name in ("round", "training_steps", "init_steps", "seed", "interval")
-        }
+        names = ("round", "training_steps", "init_steps", "seed", "interval")
+        counters = {name: getattr(self, name) for name in names}
         return {**counters, "records": self.records.state_dict()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        for name in ("interval", "seed"):
+        for name, argument in (("interval", "retrain_interval"), ("seed", "seed")):
             if int(state_dict[name]) != getattr(self, name):
-                argument = "retrain_interval" if name == "interval" else name
                 raise ValueError(
                     f"The checkpoint was written with {argument}={int(state_dict[name])}; this "
                     f"trainer has {getattr(self, name)}. Resume with the same one."

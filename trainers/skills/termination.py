@@ -1,39 +1,178 @@
 """Learning when Waterworld's options should end: the option-critic, with targets in hindsight.
 
-Letters: C copies, T base steps of each.
+Letters: C copies, T base steps of each, *B batch of the tensordict, b batch of an update.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.modules import MLP
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
-from torchrl_hmcts.modules import (
-    AnyTermination,
-    LearnedTermination,
-    StallTermination,
-    TerminationNetwork,
-)
+from torchrl_hmcts.modules import TerminationNetwork
 from torchrl_hmcts.objectives import IntraOptionQLoss, OptionTerminationLoss
-from torchrl_hmcts.trainers.skills.hindsight import HindsightTransitions, MazeView
-from torchrl_hmcts.transforms import OptionTransform, SkillTransform, StallTransform
+from torchrl_hmcts.transforms import SkillTransform
 
-_STALL_TOLERANCE = 0.005  # tiles per base step, a twentieth of the top speed
 _EPISODE_STEPS = 200  # base steps in a maze before the next one
 
 
-@name_arguments
+class MazeView(TensorDictModuleBase):
+    """Writes what lies around the disc, ``"view"`` float32 ``[*B, F]``.
+
+    Reads ``"position"``, ``"velocity"`` and ``"maze_index"``. The features are the position within
+    the tile (2, from -1 to 1), the velocity (2) and the walls of the surrounding
+    ``(2 reach + 1) ** 2`` tiles (1 is solid, as is all outside).
+
+    Args:
+        mazes: bool ``[M, H, W]`` of the env that is viewed.
+        reach: tiles seen in each direction. Default 2.
+    """
+
+    _solid: Tensor
+    _offsets: Tensor
+
+    def __init__(self, mazes: Tensor, *, reach: int = 2) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = ["position", "velocity", "maze_index"]
+        self.out_keys: list[NestedKey] = ["view"]
+        solid = torch.nn.functional.pad(mazes, (reach,) * 4, value=True)  # [M, H', W']
+        span = torch.arange(2 * reach + 1)
+        self.num_features = 4 + len(span) ** 2
+        self._shape = solid.shape
+        self.register_buffer("_solid", solid.to(torch.float32).flatten(), persistent=False)
+        offsets = (span[:, None] * solid.shape[2] + span).flatten()
+        self.register_buffer("_offsets", offsets, persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the view of each row."""
+        position = tensordict.get("position")
+        tile = position.long()
+        _, height, width = self._shape
+        corner = (tensordict.get("maze_index") * height + tile[..., 1]) * width + tile[..., 0]
+        walls = self._solid[corner.unsqueeze(-1) + self._offsets]
+        within = 2.0 * (position - tile) - 1.0
+        return tensordict.set("view", torch.cat((within, tensordict.get("velocity"), walls), -1))
+
+
+class HindsightTransitions:
+    r"""Pieces of options from stored base steps, with targets that may have been reached.
+
+    A piece is ``every`` base steps of one option. Half of the targets are places that the same
+    episode reached later, the others places it visited at any time. The reward of a piece is
+    :math:`\gamma^i` if its base step ``i`` touches the target, which also terminates it.
+
+    Args:
+        data: base transitions ``[C, T]`` with ``"skill"`` and ``"skill_step"``.
+        view: writes what networks see of a state.
+        touch: distance from the target, tiles, at which it is reached.
+        every: base steps of a piece.
+        horizon: base steps within which a place that was reached serves as a target.
+        gamma: discount per base step.
+        seed: of the draws.
+
+    Raises:
+        ValueError: if the data hold no whole piece.
+    """
+
+    def __init__(
+        self,
+        data: TensorDictBase,
+        view: MazeView,
+        *,
+        touch: float,
+        every: int = 5,
+        horizon: int = 100,
+        gamma: float = 0.98,
+        seed: int = 0,
+    ) -> None:
+        copies, length = data.batch_size
+        done = data["next", "done"].squeeze(-1)
+        # Places before each step, and the one after the last.
+        self.position = torch.cat((data["position"], data["next", "position"][:, -1:]), 1)
+        self.after = data["next", "position"]  # [C, T, 2]
+        self.view = view(data.copy())["view"]  # [C, T, F]
+        self.view_after = view(data["next"].copy())["view"]
+        self.skill = data["skill"]  # [C, T]
+        self.skill_step = data["skill_step"].squeeze(-1)  # [C, T]
+        time = torch.arange(length)
+        # First and last base step of the episode that each base step belongs to.
+        begins = torch.cat((torch.ones(copies, 1, dtype=torch.bool), done[:, :-1]), 1)
+        self.first = torch.where(begins, time, 0).cummax(1).values
+        ends = torch.where(done, time, length - 1)
+        self.last = ends.flip(1).cummin(1).values.flip(1)
+        # Where a piece begins: its last base step is of the same option and episode.
+        begin, end = slice(0, max(0, length - every + 1)), slice(every - 1, None)
+        same = self.skill_step[:, end] == self.skill_step[:, begin] + every - 1
+        same &= self.first[:, end] == self.first[:, begin]
+        self.pieces = same.nonzero()  # [P, 2] of copy and base step
+        if not len(self.pieces):
+            raise ValueError(
+                f"The data hold no piece of an option of every={every} base steps; they are "
+                f"{length} base steps of {copies} copies. Collect more, or make it shorter."
+            )
+        self.every, self.horizon, self.gamma, self.touch = every, horizon, gamma, touch
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def sample(self, batch_size: int) -> TensorDict:
+        """Return at most ``batch_size`` transitions ``[b]``, none of which begins at its target.
+
+        ``"begin"`` holds what an earlier step of the same option saw, where it may have begun.
+        """
+
+        def draw(low: Tensor, high: Tensor) -> Tensor:  # both included
+            share = torch.rand(low.shape, generator=self.generator)
+            return low + ((high - low + 1) * share).long()
+
+        index = torch.randint(len(self.pieces), (batch_size,), generator=self.generator)
+        copy, step = self.pieces[index].unbind(-1)
+        first, last = self.first[copy, step], self.last[copy, step]
+        later = draw(step, (step + self.horizon).clamp_max(last))
+        chosen = torch.where(
+            torch.rand(batch_size, generator=self.generator) < 0.5, later, draw(first, last)
+        )
+        target = self.after[copy, chosen]  # [b, 2]
+        begun = draw((step - self.skill_step[copy, step]).clamp_min(first), step)
+        span = step.unsqueeze(-1) + torch.arange(self.every)
+        path = self.after[copy.unsqueeze(-1), span]  # [b, every, 2]
+        hit = (path - target.unsqueeze(1)).norm(dim=-1) < self.touch
+        reached = hit.any(-1)
+        when = hit.to(torch.int64).argmax(-1)
+        reward = torch.where(reached, self.gamma**when, 0.0)
+        there = (self.position[copy, step] - target).norm(dim=-1) < self.touch
+        end = step + self.every - 1
+
+        def seen(view: Tensor, place: Tensor, **entries: Any) -> TensorDict:
+            td = {"view": view, "offset": target - place, **entries}
+            return TensorDict(td, batch_size=[batch_size])
+
+        after = seen(
+            self.view_after[copy, end],
+            self.after[copy, end],
+            reward=reward.unsqueeze(-1),
+            terminated=reached.unsqueeze(-1),
+            duration=torch.full((batch_size, 1), self.every),
+        )
+        out = seen(
+            self.view[copy, step],
+            self.position[copy, step],
+            skill=self.skill[copy, step],
+            begin=seen(self.view[copy, begun], self.position[copy, begun]),
+            next=after,
+        )
+        return out[~there]
+
+
 @dataclass
 class TerminationConfig:
     """How a termination is learned.
@@ -47,7 +186,7 @@ class TerminationConfig:
     """
 
     base_steps: int = 20_000
-    """Base steps of options carried out in training mazes: all the experience there is."""
+    """Base steps of options executed in training mazes: all the experience there is."""
     copies: int = 32
     """Mazes played at once."""
     option_steps: int = 50
@@ -80,10 +219,12 @@ class TerminationConfig:
     """Of mazes, networks and batches."""
 
     def __post_init__(self) -> None:
-        whole = ("base_steps", "copies", "option_steps", "every", "horizon", "rounds")
-        for name in (*whole, "value_updates", "termination_updates", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        for column in fields(self):
+            name, value = column.name, getattr(self, column.name)
+            if isinstance(column.default, int):
+                whole_number("TerminationConfig", name, value, least=0 if name == "seed" else 1)
+            else:
+                real_number("TerminationConfig", name, value, least=0.0)
         if self.every > self.option_steps:
             raise ValueError(
                 f"Options of option_steps={self.option_steps} hold no piece of "
@@ -97,24 +238,11 @@ def collect_option_steps(
     config: TerminationConfig,
     mazes: Tensor | None = None,
 ) -> TensorDictBase:
-    """Let the worker carry out random options in random mazes.
-
-    Args:
-        worker: reads ``"velocity"`` and ``"skill"``, writes ``"action"``.
-        num_options: number of options.
-        config: of which ``base_steps``, ``copies``, ``option_steps`` and ``seed`` are used.
-        mazes: bool ``[M, H, W]``. Default: the training split.
+    """Let the worker execute random options in random mazes, of the training split by default.
 
     Returns:
         Base transitions ``[C, T]`` with the option under ``"skill"`` and the base steps it has
         taken before under ``"skill_step"``.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule
-        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> config = TerminationConfig(base_steps=40, copies=4)
-        >>> collect_option_steps(worker, 4, config).batch_size
-        torch.Size([4, 10])
     """
     env = TransformedEnv(
         WaterworldMazeEnv(
@@ -130,26 +258,6 @@ def collect_option_steps(
     return env.rollout(steps, worker, break_when_any_done=False)
 
 
-@dataclass
-class TerminationResult:
-    """What :func:`learn_termination` returns.
-
-    Example:
-        >>> network = TerminationNetwork(29, 4, in_keys=["view"])
-        >>> TerminationResult(network, network, 20_000).base_steps
-        20000
-    """
-
-    network: TerminationNetwork
-    """Reads ``"view"`` and ``"skill"``."""
-    values: TensorDictModuleBase
-    """Reads ``"view"`` and ``"offset"`` (target minus position), writes ``"action_value"``."""
-    base_steps: int
-    """Base steps that were simulated for it."""
-    history: dict[str, list[float]] = field(default_factory=dict)
-    """Every 100 updates: losses and diagnostics, by name."""
-
-
 def learn_termination(
     worker: Callable[[TensorDictBase], TensorDictBase],
     num_options: int = 4,
@@ -158,7 +266,7 @@ def learn_termination(
     mazes: Tensor | None = None,
     data: TensorDictBase | None = None,
     progress: Callable[[int], Any] | None = None,
-) -> TerminationResult:
+) -> tuple[TerminationNetwork, dict[str, list[float]]]:
     """Learn when options should end, from random options and targets in hindsight.
 
     Values Q(s, o, target) are learned for options that end with the probability of the termination
@@ -166,7 +274,7 @@ def learn_termination(
     targets that were reached. The termination, which does not see the target, is then learned from
     states met under an option that was the best for its target where it began
     (:class:`~torchrl_hmcts.objectives.OptionTerminationLoss`): it ends options where, over all
-    targets, going on loses more than the deliberation cost, as at the mouth of a side passage.
+    targets, continuing loses more than the deliberation cost, as at the mouth of a side passage.
 
     Args:
         worker: reads ``"velocity"`` and ``"skill"``, writes ``"action"``.
@@ -178,7 +286,8 @@ def learn_termination(
         progress: called with 1 after every update, e.g. ``tqdm(...).update``.
 
     Returns:
-        Networks, history and the base steps it took.
+        The network, which reads ``"view"`` of a :class:`MazeView` and ``"skill"``; and losses and
+        diagnostics by name, every 100 updates.
 
     Reference:
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140; Harb et
@@ -190,19 +299,19 @@ def learn_termination(
         >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         >>> config = TerminationConfig(
         ...     base_steps=640, value_updates=2, termination_updates=2, copies=16)
-        >>> learn_termination(worker, 4, config).base_steps
-        640
+        >>> network, history = learn_termination(worker, 4, config)
+        >>> network.in_keys
+        ['view', 'skill']
     """
     config = TerminationConfig() if config is None else config
     mazes = maze_pool("train") if mazes is None else mazes
     if data is None:
         data = collect_option_steps(worker, num_options, config, mazes)
     view = MazeView(mazes)
-    touch = WaterworldMazeEnv.PLAYER_RADIUS + WaterworldMazeEnv.TARGET_RADIUS
     transitions = HindsightTransitions(
         data,
         view,
-        touch=touch,
+        touch=WaterworldMazeEnv.PLAYER_RADIUS + WaterworldMazeEnv.TARGET_RADIUS,
         every=config.every,
         horizon=config.horizon,
         gamma=config.gamma,
@@ -216,99 +325,47 @@ def learn_termination(
             in_keys=["view"],
             initial_probability=config.initial_probability,
         )
-        values = _make_values(view.num_features, num_options)
+        values = TensorDictModule(
+            MLP(
+                in_features=view.num_features + 2,
+                out_features=num_options,
+                num_cells=[128, 128],
+                activation_class=torch.nn.ReLU,
+            ),
+            in_keys=["view", "offset"],  # the offset: target minus position
+            out_keys=["action_value"],
+        )
     value_loss = IntraOptionQLoss(values, network, gamma=config.gamma)
     updater = SoftUpdate(value_loss, tau=config.tau)
     loss = OptionTerminationLoss(network, values, deliberation_cost=config.deliberation_cost)
     # The losses hold the parameters: those of the networks are the same tensors.
     value_optimizer = torch.optim.Adam(value_loss.parameters(), lr=config.value_lr, fused=True)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.termination_lr, fused=True)
-    result = TerminationResult(network, values, data.numel())
+    history: dict[str, list[float]] = {}
 
-    def note(update: int, out: TensorDictBase) -> None:
+    def step(
+        part: LossModule, adam: torch.optim.Optimizer, name: str, batch: TensorDictBase, update: int
+    ) -> None:
+        out = part(batch)
+        adam.zero_grad()
+        out[name].backward()
+        adam.step()
         if progress is not None:
             progress(1)
         if update % 100 == 99:
-            for name, value in out.detach().items():
-                result.history.setdefault(name, []).append(float(value))
+            for key, value in out.detach().items():
+                history.setdefault(key, []).append(float(value))
 
     for _ in range(config.rounds):
         for update in range(config.value_updates):
-            out = value_loss(transitions.sample(config.batch_size))
-            value_optimizer.zero_grad()
-            out["loss_qvalue"].backward()
-            value_optimizer.step()
+            batch = transitions.sample(config.batch_size)
+            step(value_loss, value_optimizer, "loss_qvalue", batch, update)
             updater.step()
-            note(update, out)
         for update in range(config.termination_updates):
             batch = transitions.sample(config.batch_size)
             with torch.no_grad():
                 best = values(batch["begin"])["action_value"].argmax(-1)
             batch = batch[best == batch["skill"]]  # on-policy: options that would be chosen
-            if not len(batch):
-                continue
-            out = loss(batch)
-            optimizer.zero_grad()
-            out["loss_termination"].backward()
-            optimizer.step()
-            note(update, out)
-    return result
-
-
-def make_terminating_env(
-    worker: Any,
-    mazes: Tensor | None = None,
-    *,
-    network: TerminationNetwork | None = None,
-    every: int = 5,
-    stall_steps: int | None = 3,
-    num_options: int = 4,
-    max_steps: int = 100,
-    gamma: float = 0.99,
-    seed: int | None = None,
-) -> TransformedEnv:
-    """Build a Waterworld whose options end by themselves, for planning and for acting.
-
-    Args:
-        worker: reads ``"velocity"`` and ``"skill"``, writes ``"action"``.
-        mazes: bool ``[M, H, W]``. Default: the training split.
-        network: ends an option where it says so, see :func:`learn_termination`. Default: none.
-        every: base steps between two questions to the network.
-        stall_steps: base steps in a row without movement that end an option; None for any number.
-            From rest the disc does not move in its first base step, so at least 2.
-        num_options: number of options.
-        max_steps: base steps of an option at most. Default: the 100 of the source.
-        gamma: discount per base step.
-        seed: of the env.
-
-    Returns:
-        The macro environment, stateless and without batch size.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule
-        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> make_terminating_env(worker).rollout(2)["next", "duration"].shape
-        torch.Size([2, 1])
-    """
-    base = WaterworldMazeEnv(mazes, observation=False, seed=seed)
-    conditions: list[Callable[[TensorDictBase], Tensor]] = []
-    transforms: list[Any] = []
-    if stall_steps is not None:
-        transforms.append(StallTransform("position", _STALL_TOLERANCE))
-        conditions.append(StallTermination(stall_steps))
-    if network is not None:
-        seen = TensorDictSequential(MazeView(base.mazes), network)
-        conditions.append(LearnedTermination(seen, every=every))
-    termination = AnyTermination(*conditions) if conditions else None
-    transforms.append(OptionTransform(worker, num_options, max_steps, gamma, termination))
-    return TransformedEnv(base, Compose(*transforms))
-
-
-def _make_values(num_features: int, num_options: int) -> TensorDictModule:
-    network = MLP(
-        in_features=num_features + 2,
-        out_features=num_options,
-        num_cells=[128, 128],
-        activation_class=torch.nn.ReLU,
-    )
-    return TensorDictModule(network, in_keys=["view", "offset"], out_keys=["action_value"])
+            if len(batch):
+                step(loss, optimizer, "loss_termination", batch, update)
+    return network, history
