@@ -90,9 +90,8 @@ class Simulator:
         extra = [unravel_key(k) for k in extra_keys]
         self._check_available(extra, "The novelty test or an evaluator")
         self.kept_keys = list(self.state_keys)
-        for name, key in (("duration_key", duration_key), ("mask_key", mask_key)):
-            key = None if key is None else entry_key("MCTSPlanner", name, key)
-            setattr(self, name, key if key in available else None)
+        self.duration_key = self._optional("duration_key", duration_key)
+        self.mask_key = self._optional("mask_key", mask_key)
         self.root_keys = list(dict.fromkeys([*self.state_keys, *extra]))
         if self.mask_key is not None:
             self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))
@@ -136,6 +135,12 @@ class Simulator:
         self._check_available(keys, "The policy that executes plans")
         self.kept_keys = list(dict.fromkeys([*self.kept_keys, *keys]))
         self.root_keys = list(dict.fromkeys([*self.root_keys, *keys]))
+
+    def _optional(self, name: str, key: NestedKey | None) -> NestedKey | None:
+        """A key of the env, or None if the env has no such entry."""
+        if key is None or entry_key("MCTSPlanner", name, key) not in self._available:
+            return None
+        return entry_key("MCTSPlanner", name, key)
 
     def _check_available(self, keys: Sequence[NestedKey], reader: str) -> None:
         for key in keys:
