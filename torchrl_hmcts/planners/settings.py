@@ -203,6 +203,10 @@ class SearchSettings:
             record[name] = number
         return record
 
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return one of the numbers that the kernels read, ``[1]``, e.g. ``settings["c"]``."""
+        return self.record()[name]
+
 
 def _is_same(one: Any, other: Any) -> bool:
     """Whether two parts do the same; a copy of a search holds copies of them."""
