@@ -29,7 +29,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_hmcts.envs import maze_pool
-from torchrl_hmcts.planners import UCT, MaxBackup, MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer, make_guided_planner
@@ -53,7 +53,7 @@ def fixed_planners(env: EnvBase) -> dict[str, MCTSPlanner]:
             env,
             tree_policy=UCT(c=0.1),
             leaf_evaluator=Closeness(),
-            backup=MaxBackup(),
+            backup="max",
             novelty=RadiusNovelty("position", RADIUS),
             expand=expand,
             budget=SearchBudget(expansions=expansions),

@@ -184,11 +184,12 @@ def test_the_search_that_is_kept_explores_in_units_of_the_greatest_reward() -> N
     player = AtariAgent(pool, AtariSearch(ratio=4.0, tree_policy="uct", c=2.0), seed=0)
     player.play(1)
     kept = player.planner.last_search
-    assert kept.settings["c"][0] == 2.0
+    assert kept.settings.tree_policy.c == 2.0
     player.greatest_reward = 40.0
     player.play(1)
     assert player.planner.last_search is kept  # no tree was planted again
-    assert kept.settings["c"][0] == player.planner.tree_policy.c == 80.0
+    assert kept.settings.tree_policy.c == kept.record["c"][0] == 80.0
+    assert kept.settings is player.planner.settings
 
 
 # ------------------------------------------------------------------------------------ experiment

@@ -381,9 +381,9 @@ def test_a_guide_learns_which_option_was_visited_and_what_it_was_worth() -> None
     search.tree.nodes["value"][0, 0] = 3.0  # of a scale of 6
     guide.learn(search, scale=6.0)
     root = agent.state.select("ram")
-    prior = guide.prior(root)[0].detach().numpy()
+    prior = guide.evaluate(root).priors[0].detach().numpy()
     np.testing.assert_allclose(prior, 0.75 * visits / visits.sum() + 0.25 / 3, atol=0.03)
-    assert guide.value(root).item() == pytest.approx(3.0, abs=0.5)
+    assert guide.evaluate(root).values.item() == pytest.approx(3.0, abs=0.5)
     assert SearchGuide(3).value is None
     with pytest.raises(ValueError, match="min_visits >= 1; got 0"):
         SearchGuide(3, min_visits=0)

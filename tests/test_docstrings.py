@@ -109,9 +109,9 @@ LITERATURE = {
 # In them: data, forms that a user's object has, and tools.
 NOTHING_TO_CITE = set(
     "NodeStatistics NoveltyTest Plan PlansGoals Root Search SearchProgress SearchTree Transition "
-    "TreeView best_plans_below extract_plans OptionWorker TorchRLGymnasiumEnv check_mazes "
-    "free_tiles maze_from_text maze_to_text register_envs replay_recording shortest_path "
-    "shortest_path_lengths wall_centers Snapshot AttributeSnapshot ReplaySnapshot "
+    "TreeView Evaluation SearchSettings extract_plans OptionWorker TorchRLGymnasiumEnv "
+    "check_mazes free_tiles maze_from_text maze_to_text register_envs replay_recording "
+    "shortest_path shortest_path_lengths wall_centers Snapshot AttributeSnapshot ReplaySnapshot "
     "SnapshotError".split()
 )
 # What works on tensors, so that its docstring has to give their shapes.

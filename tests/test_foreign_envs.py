@@ -26,7 +26,6 @@ from torchrl.envs import (
 from torchrl_hmcts.planners import (
     UCT,
     HighestValue,
-    MaxBackup,
     MCTSPlanner,
     ProgressiveWidening,
     SearchBudget,
@@ -56,7 +55,7 @@ def test_a_pendulum_is_swung_up_by_a_search_over_held_torques() -> None:
     planner = MCTSPlanner(
         swinging_pendulum(),
         tree_policy=UCT(c=5.0),  # a step costs up to 16
-        backup=MaxBackup(),
+        backup="max",
         final_choice=HighestValue(),
         budget=SearchBudget(expansions=24, until_plan=False),
         leaves_per_wave=8,

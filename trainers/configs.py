@@ -87,7 +87,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
             "uct": "UCT",
         },
         "novelty": {"radius": "RadiusNovelty", "width": "WidthNovelty"},
-        "backup": {"max": "MaxBackup", "mean": "MeanBackup"},
         "final_choice": {
             "best_plan": "BestPlan",
             "highest_value": "HighestValue",
@@ -109,7 +108,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
         "control": {
             "goals": "GoalPlanner",
             "hierarchical": "HierarchicalPolicy",
-            "model_based": "ModelBasedControl",
         },
     },
     "torchrl_hmcts.modules": {

@@ -20,7 +20,6 @@ from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import (
     PUCT,
-    MaxBackup,
     MCTSPlanner,
     NoveltyTest,
     PolicyValueEvaluator,
@@ -79,9 +78,8 @@ def make_guided_planner(
     return MCTSPlanner(
         env,
         tree_policy=PUCT(c=c),
-        leaf_evaluator=guide.value,
-        option_prior=guide.prior,
-        backup=MaxBackup(),
+        leaf_evaluator=guide,
+        backup="max",
         novelty=novelty,
         expand=expand,
         budget=budget,

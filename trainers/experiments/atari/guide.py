@@ -17,7 +17,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.objectives import ExpertIterationLoss
-from torchrl_hmcts.planners import PolicyValueEvaluator, Search, search_examples
+from torchrl_hmcts.planners import Evaluation, PolicyValueEvaluator, Search, search_examples
 
 
 class _TwoHeads(nn.Module):
@@ -134,14 +134,9 @@ class SearchGuide:
         """Means of the losses and diagnostics of the latest training."""
 
     @property
-    def prior(self) -> Any:
-        """For a planner's ``option_prior``."""
-        return self._evaluator.prior
-
-    @property
-    def value(self) -> Any:
-        """For a planner's ``leaf_evaluator``; None if leaves are not valued."""
-        return _Scaled(self) if self.values else None
+    def evaluate(self) -> Any:
+        """For a planner's ``leaf_evaluator``: priors and, if leaves are valued, scaled values."""
+        return _Scaled(self)
 
     def learn(self, search: Search, scale: float) -> None:
         """Take examples from a search, and train if it is time.
@@ -213,11 +208,12 @@ class SearchGuide:
 
 
 class _Scaled:
-    """A guide's values in units of the reward."""
+    """A guide's priors, and its values in units of the reward."""
 
     def __init__(self, guide: SearchGuide) -> None:
         self._guide = guide
         self.in_keys = list(guide._evaluator.in_keys)
 
-    def __call__(self, td: TensorDictBase) -> Tensor:
-        return self._guide._evaluator.value(td) * self._guide.scale
+    def __call__(self, td: TensorDictBase) -> Evaluation:
+        priors, values = self._guide._evaluator(td)
+        return Evaluation(priors, values * self._guide.scale if self._guide.values else None)
