@@ -258,7 +258,6 @@ GOOD: dict[str, Good] = {
         AtariSearch={},
         GoalSearch={},
         DemoConfig={},
-        TerminationConfig={},
         StateCoverage={},
         ScriptedExpert={},
         SharedRMSprop={"params": lambda: [nn.Parameter(torch.zeros(2))]},

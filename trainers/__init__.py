@@ -71,7 +71,6 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.skills.coverage import StateCoverage
     from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
     from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
-    from torchrl_hmcts.trainers.skills.termination import TerminationConfig, learn_termination
 
 __all__ = [
     "A3CTrainer",
@@ -114,10 +113,8 @@ __all__ = [
     "SharedRMSprop",
     "SkillRewardHook",
     "StateCoverage",
-    "TerminationConfig",
     "TilePlanner",
     "WorkerSource",
-    "learn_termination",
     "load_options",
     "make_goal_env",
     "make_guided_planner",
@@ -171,10 +168,8 @@ _MODULES = {
     "SharedRMSprop": "a3c.shared_optimizers",
     "SkillRewardHook": "skills.reward_hook",
     "StateCoverage": "skills.coverage",
-    "TerminationConfig": "skills.termination",
     "TilePlanner": "experiments.waterworld.goal_planning",
     "WorkerSource": "experiments.atari.options",
-    "learn_termination": "skills.termination",
     "load_options": "experiments.atari.options",
     "make_goal_env": "experiments.waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
