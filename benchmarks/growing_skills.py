@@ -31,10 +31,10 @@ from torchrl_hmcts.modules import (
     GrowingSkillPrior,
     SkillActor,
     SkillCritic,
-    SkillNetwork,
     SkillPolicy,
     SkillPrior,
 )
+from torchrl_hmcts.modules.skill_mlp import SkillNetwork
 from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers import DIAYNTrainer, GrowSkills, SearchCoverage

@@ -38,9 +38,16 @@ def hydra() -> Iterator[None]:
 
 
 def keywords(component: type) -> dict[str, inspect.Parameter]:
-    parameters = inspect.signature(component.__init__).parameters
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return {n: p for n, p in parameters.items() if n != "self" and p.kind not in variable}
+    found: dict[str, inspect.Parameter] = {}
+    for cls in component.__mro__:  # **kwargs stand for the arguments of the class above
+        if cls is component or cls.__module__.startswith("torchrl_hmcts"):
+            given = inspect.signature(cls.__init__).parameters if "__init__" in vars(cls) else {}
+            found = {**given, **found}
+            if given and "VAR_KEYWORD" not in {p.kind.name for p in given.values()}:
+                break
+        else:
+            break
+    return {n: p for n, p in found.items() if n != "self" and "VAR" not in p.kind.name}
 
 
 def as_written(value: Any) -> Any:

@@ -9,7 +9,6 @@ import ast
 import dataclasses
 import doctest
 import importlib
-import importlib.util
 import inspect
 import pkgutil
 import re
@@ -27,24 +26,12 @@ ROOTS = ("torchrl_hmcts", "torchrl_hmcts.envs", "torchrl_hmcts.trainers")
 DOCTEST_FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
-def submodules(package: str, folder: str) -> dict[str, bool]:
-    """Maps the name of each module under a package to whether it is a package; imports none."""
-    found = {}
-    for module in pkgutil.iter_modules([folder]):
-        name = f"{package}.{module.name}"
-        found[name] = module.ispkg
-        if module.ispkg:
-            found.update(submodules(name, str(Path(folder, module.name))))
-    return found
-
-
 def module_names() -> dict[str, bool]:
     """Maps the name of each module of the project to whether it is a package."""
     found = dict.fromkeys(ROOTS, True)
     for root in ROOTS:
-        spec = importlib.util.find_spec(root)
-        for folder in (spec and spec.submodule_search_locations) or ():
-            found.update(submodules(root, folder))
+        path = importlib.import_module(root).__path__
+        found |= {m.name: m.ispkg for m in pkgutil.walk_packages(path, f"{root}.")}
     return {name: found[name] for name in sorted(found)}
 
 
@@ -143,15 +130,13 @@ def parameters(value: Any) -> list[str]:
     """The names of the arguments that a user may give."""
     if getattr(value, "_is_tensorclass", False):
         return list(value.__annotations__)
-    if inspect.isclass(value) and "__init__" not in vars(value):
-        if not dataclasses.is_dataclass(value):
-            return list(getattr(value, "_fields", ()))  # else the base class tells
-    taken = inspect.signature(constructor(value)).parameters.values()
+    inherits = inspect.isclass(value) and "__init__" not in vars(value)
+    if inherits and not dataclasses.is_dataclass(value):
+        return list(getattr(value, "_fields", ()))  # else the base class tells
+    taken = list(inspect.signature(constructor(value)).parameters.values())
     variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    skip = 1 if inspect.isclass(value) else 0
-    return [
-        p.name for p in list(taken)[skip:] if p.kind not in variable and not p.name.startswith("_")
-    ]
+    own = [p.name for p in taken[inspect.isclass(value) :] if p.kind not in variable]
+    return [name for name in own if not name.startswith("_")]
 
 
 def sentences_below_fields(value: Any) -> set[str]:
@@ -173,12 +158,13 @@ def undocumented_parameters(value: Any) -> list[str]:
 
 def raised(value: Any) -> set[str]:
     """The errors that a function, or the constructor of a class, raises by a line of its own."""
+    functions = [value]
     if inspect.isclass(value):
         own = [vars(value).get("__init__"), vars(value).get("__post_init__")]
-        functions = [inspect.unwrap(function) for function in own if inspect.isfunction(function)]
-        functions = [f for f in functions if f.__code__.co_filename == inspect.getfile(value)]
-    else:
-        functions = [inspect.unwrap(value)]
+        functions = [function for function in own if inspect.isfunction(function)]
+    functions = [inspect.unwrap(function) for function in functions]
+    file = inspect.getfile(value)  # what a decorator made is elsewhere
+    functions = [f for f in functions if f.__code__.co_filename == file]
     found = set()
     for function in functions:
         for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(function)))):

@@ -70,7 +70,7 @@ def names(folder: Path) -> list[str]:
 
 
 def rewrite(path: Path, change: Callable[[dict[str, bytes]], dict[str, bytes]]) -> None:
-    """Write the files of a zip anew, without a seal."""
+    """Write the files of a zip again, without a seal."""
     with zipfile.ZipFile(path) as archive:
         content = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, "w") as archive:

@@ -118,7 +118,7 @@ def demo(folder: Path) -> Kind:
 
 def _atari_run(folder: Path) -> Any:
     from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
-    from torchrl_hmcts.trainers.experiments.atari.run import AtariRun
+    from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun
 
     pytest.importorskip("ale_py")
     config = AtariConfig(
@@ -154,7 +154,7 @@ def checkpoint_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_run(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.run import load_run
+    from torchrl_hmcts.trainers.experiments.atari.episodes import load_run
 
     rotation = DurableRotation(folder / "checkpoints")
     state = _atari_run(folder)
@@ -163,7 +163,7 @@ def atari_run(folder: Path) -> Kind:
 
 
 def atari_run_of_older_versions(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.run import load_run
+    from torchrl_hmcts.trainers.experiments.atari.episodes import load_run
 
     path = folder / "checkpoints" / "run.pt"
     path.parent.mkdir(parents=True)
@@ -172,11 +172,11 @@ def atari_run_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_trials(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.trials import RememberedTrials, Trial
+    from torchrl_hmcts.trainers.experiments.atari.memory import Trial, TrialMemory
 
     folder.mkdir(parents=True)
     path = folder / "trials.json"
-    make = partial(RememberedTrials, None, path, {"game": "Pong", "seed": 0})
+    make = partial(TrialMemory, path, {"game": "Pong", "seed": 0})
     for i in range(20):
         make().remember(f"key {i}", Trial(float(i), 300 + i, 7_000))
 
@@ -273,17 +273,14 @@ def test_a_damaged_file_is_refused_or_read_as_it_was_saved(
 
 
 def main() -> None:
-    count = int(sys.argv[1])
-    figures: dict[str, Any] = {}
+    count, figures = int(sys.argv[1]), {}
     torch.set_num_threads(1)
     for kind in KINDS:
         begin = time.process_time()
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
-            counts = damage(kind, Path(folder) / "run", count)
-        figures[kind.__name__] = {
-            **dict(sorted(counts.items())),
-            "cpu_seconds": round(time.process_time() - begin, 1),
-        }
+            counts = dict(sorted(damage(kind, Path(folder) / "run", count).items()))
+        seconds = round(time.process_time() - begin, 1)
+        figures[kind.__name__] = {**counts, "cpu_seconds": seconds}
     print(json.dumps({"cases_of_each_kind": count, "kinds": figures}))
 
 

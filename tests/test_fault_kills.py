@@ -33,7 +33,7 @@ def make_trainer(folder: Path, kind: str = "DIAYN") -> Any:
 
 
 def live(folder: Path, report: int, frames: int = TOTAL, kind: str = "DIAYN") -> None:
-    """One life of the run: go on where it stood, and report every checkpoint that is written."""
+    """One life of the run: continue where it stood, and report every checkpoint that is written."""
     trainer = make_trainer(folder, kind)
     if any(folder.glob("checkpoint-*")):
         trainer.load(folder)

@@ -137,6 +137,12 @@ class TestPageAtTheEnd:
         assert "Curves" not in page
         assert capsys.readouterr().err.startswith("Left out the curves of the page: No module")
 
+    def test_without_jinja2_the_run_lacks_its_page(self, tmp_path, monkeypatch, capsys) -> None:
+        without(monkeypatch, "jinja2")
+        assert not self.end(tmp_path, lambda path: None)
+        assert (tmp_path / "metrics.json").is_file()
+        assert capsys.readouterr().err.startswith("Left out index.html: No module named 'jinja2'")
+
 
 class Failing(Logger):
     """A logger whose disk is full from its second value on."""

@@ -45,22 +45,10 @@ OPTIONAL = {"planners.drawing": "matplotlib", "planners.export": "networkx"}
 # What is still wrong today: lines go, and none comes.
 KNOWN = {
     "envs.gym_envs": "lab mazes",
-    "trainers.figures.animation": "experiments",
-    "trainers.figures.atari_results": "runs",
-    "trainers.figures.chapter_3": "experiments runs",
-    "trainers.figures.chapter_4": "experiments runs",
-    "trainers.figures.comparison_page": "experiments runs",
-    "trainers.figures.curve_panels": "runs",
-    "trainers.figures.dissertation": "runs",
-    "trainers.figures.goal_figures": "experiments",
-    "trainers.figures.report": "runs",
-    "trainers.figures.run_page": "experiments runs",
-    "trainers.runs.folder": "experiments",
     "trainers.runs.run": "experiments",
     "trainers.runs.sweep": "experiments",
 }
 KNOWN_CIRCLES = {
-    "trainers.experiments.demo trainers.figures.animation",
     "planners.mcts planners.growth",
     "planners.search planners.scored_descent",
     "planners.tree planners.drawing",

@@ -11,34 +11,13 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
     from torchrl_hmcts.trainers.collectors import CollectorError
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
-    from torchrl_hmcts.trainers.experiments.atari.agent import (
-        AtariAgent,
-        AtariProgress,
-        AtariSearch,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.goals import (
-        Candidate,
-        GoalFinder,
-        GoalSearch,
-    )
+    from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch
+    from torchrl_hmcts.trainers.experiments.atari.fine_tuning import OptionGoals
     from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
-    from torchrl_hmcts.trainers.experiments.atari.learned_sources import (
-        DIAYNSource,
-        DistilledSource,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.options import Options, WorkerSource, load_options
-    from torchrl_hmcts.trainers.experiments.atari.sources import (
-        ActionSetSource,
-        ActionSource,
-        BestSource,
-        GoalSource,
-        RepeatSource,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.trained_sources import (
-        FineTunedSource,
-        OptionGoals,
-        RetrainedSource,
-    )
+    from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
+    from torchrl_hmcts.trainers.experiments.atari.options import Options
+    from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
+    from torchrl_hmcts.trainers.experiments.atari.sources import TrainedSource
     from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import (
         GoalEpisodes,
         GoalTrack,
@@ -74,48 +53,36 @@ if TYPE_CHECKING:
 
 __all__ = [
     "A3CTrainer",
-    "ActionSetSource",
-    "ActionSource",
     "AtariAgent",
-    "AtariProgress",
+    "AtariKit",
     "AtariSearch",
-    "BestSource",
-    "Candidate",
     "CollectorError",
     "Controllability",
-    "DIAYNSource",
     "DIAYNTrainer",
     "DemoConfig",
-    "DistilledSource",
     "DurableRotation",
     "ExpertIterationTrainer",
     "GeneratorStates",
     "GoalEpisodes",
-    "FineTunedSource",
     "OptionGoals",
-    "RetrainedSource",
     "SearchGuide",
     "FolderInUse",
-    "GoalFinder",
-    "GoalSearch",
-    "GoalSource",
     "GoalTrack",
     "GrowSkills",
     "HMCTSTrainer",
     "LearnerError",
     "MazeNetwork",
     "Options",
-    "RepeatSource",
     "ResumableTrainer",
     "RunningEpisodes",
+    "RuleSource",
     "ScriptedExpert",
     "SearchCoverage",
     "SharedRMSprop",
     "SkillRewardHook",
     "StateCoverage",
     "TilePlanner",
-    "WorkerSource",
-    "load_options",
+    "TrainedSource",
     "make_goal_env",
     "make_guided_planner",
     "make_skill_optimizer",
@@ -129,30 +96,19 @@ __all__ = [
 # Imported when asked for: the command line answers --help without loading torch.
 _MODULES = {
     "A3CTrainer": "a3c.trainer",
-    "ActionSetSource": "experiments.atari.sources",
-    "ActionSource": "experiments.atari.sources",
     "AtariAgent": "experiments.atari.agent",
-    "AtariProgress": "experiments.atari.agent",
+    "AtariKit": "experiments.atari.kit",
     "AtariSearch": "experiments.atari.agent",
-    "BestSource": "experiments.atari.sources",
-    "Candidate": "experiments.atari.goals",
     "CollectorError": "collectors",
     "Controllability": "skills.controllability",
-    "DIAYNSource": "experiments.atari.learned_sources",
     "DIAYNTrainer": "diayn",
     "DemoConfig": "runs.config",
-    "DistilledSource": "experiments.atari.learned_sources",
     "DurableRotation": "saving.checkpoints",
     "ExpertIterationTrainer": "expert_iteration",
     "GeneratorStates": "saving.run_state",
     "GoalEpisodes": "experiments.waterworld.goal_episodes",
-    "FineTunedSource": "experiments.atari.trained_sources",
-    "OptionGoals": "experiments.atari.trained_sources",
-    "RetrainedSource": "experiments.atari.trained_sources",
+    "OptionGoals": "experiments.atari.fine_tuning",
     "SearchGuide": "experiments.atari.guide",
-    "GoalFinder": "experiments.atari.goals",
-    "GoalSearch": "experiments.atari.goals",
-    "GoalSource": "experiments.atari.sources",
     "GoalTrack": "experiments.waterworld.goal_episodes",
     "GrowSkills": "skills.growing",
     "HMCTSTrainer": "hmcts",
@@ -160,8 +116,8 @@ _MODULES = {
     "LearnerError": "a3c.learner_processes",
     "MazeNetwork": "experiments.waterworld.networks",
     "Options": "experiments.atari.options",
-    "RepeatSource": "experiments.atari.sources",
     "ResumableTrainer": "saving.resume",
+    "RuleSource": "experiments.atari.rules",
     "RunningEpisodes": "saving.run_state",
     "ScriptedExpert": "experiments.waterworld.scripted_expert",
     "SearchCoverage": "skills.growing",
@@ -169,8 +125,7 @@ _MODULES = {
     "SkillRewardHook": "skills.reward_hook",
     "StateCoverage": "skills.coverage",
     "TilePlanner": "experiments.waterworld.goal_planning",
-    "WorkerSource": "experiments.atari.options",
-    "load_options": "experiments.atari.options",
+    "TrainedSource": "experiments.atari.sources",
     "make_goal_env": "experiments.waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
     "make_skill_optimizer": "diayn",

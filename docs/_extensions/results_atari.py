@@ -75,7 +75,7 @@ def sources(data: dict[str, Any]) -> str:
         found = [
             r for r in rows if (r["source"], r["game"], r["protocol"]) == (source, game, protocol)
         ]
-        # An episode that goes on is cut off: it might have scored more.
+        # An episode that would continue is cut off: it might have scored more.
         return ", ".join(f"{r['score']:g}{'' if r['ended'] else '+'}" for r in found) or "-"
 
     table_rows = []

@@ -28,7 +28,7 @@ stand the file it is made of and the command that made that file. Times are of t
 and vary with what else they do; counts of steps and mazes do not.
 [Commands and data](../results/README.md) lists all of them in one place.
 
-## Beside the source
+## Beside the dissertation
 
 What the dissertation reports in numbers or plain words, and what was measured here.
 
@@ -178,7 +178,7 @@ def beside_the_source(results: Path = RESULTS) -> str:
                 len(found),
             ]
         )
-    text = table(["experiment", "source", "here", "seeds here"], rows)
+    text = table(["experiment", "dissertation", "here", "seeds here"], rows)
     path = results / "atari/runs.json"
     runs = load(path) if path.exists() else []
     games = [[*row[:2], row[4], f"{row[2]} x {row[3]}", best(runs, row[0])] for row in ATARI]
@@ -187,7 +187,8 @@ def beside_the_source(results: Path = RESULTS) -> str:
         + "\nAtari (table 5.1: highest score in 10 million time steps, 6 seeds; table A.1: best "
         + "mean of seven algorithms of OpenAI Baselines):\n\n"
         + table(
-            ["game", "source", "best of Baselines", "its options x base steps", "here, best"], games
+            ["game", "dissertation", "best of Baselines", "its options x base steps", "here, best"],
+            games,
         )
     )
 

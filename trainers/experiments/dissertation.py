@@ -38,28 +38,20 @@ class Sources:
 class SourceFigure:
     """A figure or table of the dissertation.
 
-    Args:
-        name: its number, or ``"table5.1"``.
-        shows: its content there.
-        draws: name of the function ``draw(figure, sources, path) -> caption`` in
-            :mod:`~torchrl_hmcts.trainers.experiments.dissertation_figures`; it raises
-            :class:`MissingData` if it lacks something.
-        data: that ours is drawn from.
-        commands: that make the data; ``{seed}`` stands for 0, 1, 2.
-        argument: of that function, e.g. the game.
-        ending: of the file.
+    ``draws`` names a function ``draw(figure, sources, path) -> caption`` of the module
+    ``dissertation_figures``; it raises :class:`MissingData` if it lacks something.
 
     Example:
         >>> find_figure("3.6").data
         'docs/results/goals/goal_agent.json, or runs of waterworld_goals and waterworld_a3c'
     """
 
-    name: str
-    shows: str
+    name: str  # its number, or "table5.1"
+    shows: str  # its content there
     draws: str
-    data: str = "drawn afresh"
-    commands: tuple[str, ...] = ()
-    argument: str = ""
+    data: str = "drawn afresh"  # that ours is drawn from
+    commands: tuple[str, ...] = ()  # that make the data; {seed} stands for 0, 1, 2
+    argument: str = ""  # of the function, e.g. the game
     ending: str = ".png"
 
     @property

@@ -22,7 +22,7 @@ from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 _PALE, _GREY = "#b9c4d6", "#71717a"
 _SMOOTHED = 80  # points from which on a curve of a page is drawn pale, with its moving average
 
-Points = tuple[Sequence[float], Sequence[float]]
+Points = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray]
 """Steps, ascending, and values: ``[P]`` each."""
 
 
@@ -81,8 +81,8 @@ def legend_of_all(figure: Figure, *, ncols: int) -> None:
     """Write one legend for all axes below a figure."""
     pairs = [axes.get_legend_handles_labels() for axes in figure.axes]
     shown = {name: line for lines, names in pairs for line, name in zip(lines, names, strict=True)}
-    place = "outside lower center"
-    figure.legend(shown.values(), shown, loc=place, ncols=ncols, frameon=False, fontsize=9)
+    lines, names = list(shown.values()), list(shown)
+    figure.legend(lines, names, loc="outside lower center", ncols=ncols, frameon=False, fontsize=9)
 
 
 def panel(name: str, groups: Sequence[Sequence[Points]], x_label: str = "steps") -> str:
@@ -156,7 +156,7 @@ def plot_training(
         for color, (name, seeds) in zip(COLORS, runs.items(), strict=False):
             curves = [(seed["training_steps"], seed[shown.entry]) for seed in seeds]
             few = min(len(steps) for steps, _ in curves) <= 40
-            points = {"marker": "o", "markersize": 4} if few else {}
+            points: dict[str, Any] = {"marker": "o", "markersize": 4} if few else {}
             draw_band(axes, curves, color=color, label=name, linewidth=2.2, **points)
             if shown.dotted:
                 below = common_steps([(s["training_steps"], s[shown.dotted[0]]) for s in seeds])

@@ -366,8 +366,9 @@ def legend_below(figure: Figure, legend: Legend, *, ncols: int) -> None:
     handles: Any = legend.legend_handles  # typed as if one could be None
     names = [text.get_text() for text in legend.get_texts()]
     legend.remove()
-    place = "outside lower center"
-    figure.legend(handles, names, loc=place, ncols=ncols, fontsize=9, frameon=False)
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=ncols, fontsize=9, frameon=False
+    )
 
 
 def _colors(options: Sequence[int]) -> np.ndarray:

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
 from torchrl_hmcts.trainers.saving.files import write_text
 
 _MEDIA = {".png": "image/png", ".gif": "image/gif"}
@@ -88,7 +86,7 @@ class Section:
 
     @property
     def filled(self) -> bool:
-        """Whether anything stands below the heading."""
+        """Is true if anything stands below the heading."""
         return any(
             (self.link, self.code, self.pictures, self.panels, self.columns, self.tables)
         ) or bool(self.inside or (self.words and not self.title))
@@ -96,6 +94,9 @@ class Section:
 
 def write_sections(path: str | Path, title: str, sections: Sequence[Section]) -> None:
     """Write a page in one move."""
+    # Here, so that a run without it loses no more than its page.
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     folder = FileSystemLoader(Path(__file__).parent)
     environment = Environment(
         loader=folder,

@@ -55,9 +55,9 @@ def finish(
     with left_out("what was still to be drawn"):
         yield pictures
     with left_out("index.html"):
-        page = {"title": title, "pictures": pictures.captions}
-        write_page(out / "index.html", metrics=metrics, keys=keys, **page)
-        print(f"Pictures and figures: {out / 'index.html'}")
+        file = out / "index.html"
+        write_page(file, title=title, metrics=metrics, pictures=pictures.captions, keys=keys)
+        print(f"Pictures and figures: {file}")
 
 
 def write_page(
@@ -198,8 +198,8 @@ def config_tables(run: RunFolder) -> list[Table]:
     for key, value in run.config.items():
         default, meaning = run.keys.get(key, (value, ""))
         shown = shown_path(value) if isinstance(value, str) else _exact(value)
-        was = {} if value == default else {"title": f"default: {_exact(default)}"}
-        rows.append((Cell(key, code=True), Cell(shown, kind="changed", **was), meaning))
+        was = "" if value == default else f"default: {_exact(default)}"
+        rows.append((Cell(key, code=True), Cell(shown, kind="changed", title=was), meaning))
     return [Table(rows, ("key", "value", "meaning"), kind="stack")] if rows else []
 
 

@@ -28,7 +28,7 @@ from torchrl_hmcts.trainers.saving.run_state import (
 )
 from torchrl_hmcts.trainers.saving.stopping import patient, raise_if_asked, stop_asked, unbroken
 
-FIRST_SAVE_SECONDS = 5.0  # of training, after which there is a checkpoint whatever the interval
+FIRST_SAVE_SECONDS = 5.0  # of training, after which there is a checkpoint at any interval
 SAVE_SECONDS = 60.0  # between two checkpoints, at most
 
 
@@ -125,9 +125,8 @@ class ResumableTrainer(Trainer):
         if isinstance(collector, Collector):
             self._episodes = RunningEpisodes(collector)
             self.register_module("running_episodes", self._episodes)
-            self.register_module(
-                "generators", GeneratorStates(env=collector.env, policy=collector._wrapped_policy)
-            )
+            policy = collector._wrapped_policy  # the one that acts
+            self.register_module("generators", GeneratorStates(env=collector.env, policy=policy))
 
     @property
     def history(self) -> dict[str, list[float]]:

@@ -1,4 +1,4 @@
-"""What a run leaves in its folder, and how it is read again.
+"""Files that a run leaves in its folder, and reading them again.
 
 ========================  ======================================================================
 ``run.json``              experiment, config, commands, versions, machine, status; written first
@@ -54,18 +54,7 @@ class RunCurve:
 
 @dataclass
 class RunFolder:
-    """A run as its folder tells it; what is missing is empty.
-
-    Args:
-        path: the folder.
-        record: content of ``run.json``.
-        metrics: content of ``metrics.json``, without config and versions.
-        evaluations: content of ``evaluation.json``.
-        title: heading of the page.
-        pictures: captions by file; only files that are there.
-        curves: by name.
-        damage: a sentence for each file that cannot be read; its content is empty.
-        keys: default and meaning of each key of its experiment, where these are known.
+    """A run as its folder tells it; fields of what is missing are empty.
 
     Example:
         >>> RunFolder(Path("runs/one"), {"config": {"seed": 3}}).seed
@@ -73,13 +62,14 @@ class RunFolder:
     """
 
     path: Path
-    record: dict[str, Any] = field(default_factory=dict)
-    metrics: dict[str, Any] = field(default_factory=dict)
-    evaluations: list[dict[str, Any]] = field(default_factory=list)
-    title: str = ""
-    pictures: dict[str, str] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)  # run.json
+    metrics: dict[str, Any] = field(default_factory=dict)  # metrics.json without config, versions
+    evaluations: list[dict[str, Any]] = field(default_factory=list)  # evaluation.json
+    title: str = ""  # heading of the page
+    pictures: dict[str, str] = field(default_factory=dict)  # captions of files that are there
     curves: dict[str, RunCurve] = field(default_factory=dict)
-    damage: list[str] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)  # a sentence a file that cannot be read
+    # Default and meaning of each key of its experiment, where these are known.
     keys: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
 
     @property
@@ -104,7 +94,7 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether it came to its end; one that is being extended has not yet."""
+        """True once it came to its end; one that is being extended has not yet."""
         return bool(self.metrics) and self.status in ("", "finished")
 
     @property

@@ -66,18 +66,19 @@ class RunningEpisodes:
 
     @property
     def complete(self) -> bool:
-        """Whether the env's whole state is in the tensordict."""
+        """True if the env's whole state is in the tensordict."""
         env = self.collector.env
         return bool(env._supports_set_state or not env.batch_locked)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the episodes as they stand: their entries, and what the collector counts."""
-        carrier = self.collector._carrier
+        carrier = self.collector._carrier  # nothing public says where the episodes stand
         state: dict[str, Any] = {
             "batch_size": list(carrier.batch_size),
             "entries": carrier.to_dict(convert_tensors=False),
         }
         if self.collector.track_traj_ids:
+            # The numbers of episodes; put back once the collector has loaded, see below.
             state["traj_pool"] = self.collector._traj_pool.state_dict()
         return state
 
@@ -228,7 +229,7 @@ class BufferAdapter(PlainStateAdapter):
 
     def save(self, component: Any, path: Path, **options: Any) -> Any:
         storage = component.storage
-        rows = getattr(storage, "_storage", None)
+        rows = getattr(storage, "_storage", None)  # behind the filled part, which storage[:] is
         if isinstance(rows, torch.Tensor | TensorDictBase) and storage.ndim == 1:
             rows[len(storage) :].zero_()
         return super().save(component, path, **options)
