@@ -10,23 +10,22 @@ read, not repeated. Writes the figures, and Figure 3.6 as a PNG beside them.
 
 from __future__ import annotations
 
-import argparse
-import csv
 import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
-import torch
+from table import markdown, read_arguments, write
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.trainers.experiments import find_experiment
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.agents import play_mazes
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import play_mazes
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
 from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
 from torchrl_hmcts.trainers.figures.curves import learning_panels, plot_training
 from torchrl_hmcts.trainers.runs.config import parse_overrides
+from torchrl_hmcts.trainers.saving.run_folder import read_curves
 
 NAMES = {"waterworld_goals": "goal-based agent", "waterworld_a3c": "A3C without goals"}
 
@@ -36,84 +35,64 @@ def run(name: str, seed: int, runs: Path, overrides: list[str]) -> dict[str, Any
     experiment, out = find_experiment(name), runs / f"{name}_{seed}"
     words = [f"seed={seed}", f"out={out}", *overrides]
     config = parse_overrides(experiment.config_class, words)
-    wanted = dataclasses.asdict(config)
-    metrics: dict[str, Any] = {}
-    if (out / "metrics.json").exists():
-        metrics = json.loads((out / "metrics.json").read_text())
-    if metrics.get("config") != wanted:
-        if (out / "checkpoints").exists():
-            config = dataclasses.replace(config, resume=True)
-        experiment(config)
-        metrics = json.loads((out / "metrics.json").read_text())
-    return {**metrics, "curve": read_curve(out / "curves.csv")}
-
-
-def read_curve(path: Path) -> dict[str, list[float]]:
-    """The test curve in a run's curves.csv."""
-    curve: dict[str, list[float]] = {"training_steps": [], "solved_share": [], "episode_steps": []}
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            if row["name"] == "eval_solved_share":
-                curve["training_steps"].append(int(row["frames"]))
-                curve["solved_share"].append(round(float(row["value"]), 4))
-            elif row["name"] == "eval_episode_steps":
-                curve["episode_steps"].append(round(float(row["value"]), 1))
-    return curve
+    file = out / "metrics.json"
+    metrics: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    if metrics.get("config") != dataclasses.asdict(config):
+        experiment(dataclasses.replace(config, resume=(out / "checkpoints").exists()))
+        metrics = json.loads(file.read_text())
+    metrics["config"] = {k: v for k, v in metrics["config"].items() if k not in ("out", "resume")}
+    curves = read_curves(out)
+    steps = [int(step) for step in curves["eval_solved_share"].steps]
+    curve: dict[str, list[Any]] = {"training_steps": steps}
+    for key, digits in (("solved_share", 4), ("episode_steps", 1)):
+        curve[key] = [round(value, digits) for value in curves[f"eval_{key}"].values]
+    return {**metrics, "curve": curve}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--agents", nargs="+", default=list(NAMES), choices=list(NAMES))
-    parser.add_argument("--runs", type=Path, default=Path("runs/goal_agent"))
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="of both experiments")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    results: dict[str, Any] = {
-        "command": "python benchmarks/goal_agent.py --seeds "
-        + " ".join(map(str, arguments.seeds))
-        + "".join(f" {word}" for word in arguments.overrides),
-        "agents": {},
-    }
-    expert_env = make_goal_env(maze_pool("test"))
-    rows = []
+    arguments = read_arguments(
+        __doc__,
+        {"overrides": ["toy=true"], "seeds": [0]},
+        seeds=[0, 1, 2],
+        agents=list(NAMES),
+        runs=str(Path("runs/goal_agent")),
+        overrides=([""], "key=value of both experiments"),
+    )
+    overrides = [word for word in arguments.overrides if word]
+    command = ["python benchmarks/goal_agent.py --seeds", *map(str, arguments.seeds), *overrides]
+    agents: dict[str, list[dict[str, Any]]] = {"scripted expert": []}
+    env = make_goal_env(maze_pool("test"))
     for seed in arguments.seeds:
-        starts = make_starts(expert_env.base_env, 342, seed)
-        test = play_mazes(ScriptedExpert(), expert_env, starts).summary()
-        results["agents"].setdefault("scripted expert", []).append({"seed": seed, "test": test})
-        rows.append(("scripted expert", seed, "", "", test))
+        test = play_mazes(ScriptedExpert(), env, make_starts(env.base_env, 342, seed)).summary()
+        agents["scripted expert"].append({"seed": seed, "test": test})
     for name in arguments.agents:
-        for seed in arguments.seeds:
-            metrics = run(name, seed, arguments.runs, arguments.overrides)
-            metrics["config"] = {
-                k: v for k, v in metrics["config"].items() if k not in ("out", "resume")
-            }
-            results["agents"].setdefault(NAMES[name], []).append(metrics)
-            for kind in ("test", "test_greedy"):
-                agent = NAMES[name] + (", greedy" if kind == "test_greedy" else "")
-                steps, seconds = metrics["train_base_steps"], metrics["train_seconds"]
-                rows.append((agent, seed, steps, seconds, metrics[kind]))
-    print("| agent | seed | training steps | s | solved | steps (solved) | steps (all) |")
-    print("|---|---|---|---|---|---|---|")
-    for agent, seed, steps, seconds, test in rows:
-        print(
-            f"| {agent} | {seed} | {steps} | {seconds} | {test['solved']} of {test['mazes']} | "
-            f"{test['base_steps_mean']} | {test['base_steps_mean_all']} |"
-        )
+        runs = [run(name, seed, Path(arguments.runs), overrides) for seed in arguments.seeds]
+        agents[NAMES[name]] = runs
+    rows = [
+        (agent + ", greedy" * (kind == "test_greedy"), row, row[kind])
+        for agent, runs in agents.items()
+        for row in runs
+        for kind in ("test", "test_greedy")
+        if kind in row
+    ]
+    columns = {
+        "agent": lambda row: row[0],
+        "seed": lambda row: row[1]["seed"],
+        "training steps": lambda row: row[1].get("train_base_steps", ""),
+        "s": lambda row: row[1].get("train_seconds", ""),
+        "solved": lambda row: f"{row[2]['solved']} of {row[2]['mazes']}",
+        "steps (solved)": lambda row: row[2]["base_steps_mean"],
+        "steps (all)": lambda row: row[2]["base_steps_mean_all"],
+    }
+    print(markdown(rows, columns))
+    write(arguments, {"command": " ".join(command), "agents": agents})
     if arguments.out is not None:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(results, indent=1) + "\n")
         curves = {
-            agent: [run["curve"] for run in runs]
-            for agent, runs in results["agents"].items()
-            if "curve" in runs[0]
+            NAMES[name]: [r["curve"] for r in agents[NAMES[name]]] for name in arguments.agents
         }
+        title = f"Random mazes with and without goals, {len(arguments.seeds)} seeds"
         plot_training(
-            curves,
-            learning_panels(1_000),
-            arguments.out.with_suffix(".png"),
-            title=f"Random mazes with and without goals, {len(arguments.seeds)} seeds",
+            curves, learning_panels(1_000), arguments.out.with_suffix(".png"), title=title
         )
 
 

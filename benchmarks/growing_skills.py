@@ -39,7 +39,7 @@ from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers import DIAYNTrainer, GrowSkills, SearchCoverage
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.transforms import DisplacementTransform, SkillMaskTransform, SkillTransform
 
 ROOM = 12

@@ -24,7 +24,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 from torchrl_hmcts.trainers.figures.curves import Panel, plot_training
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 

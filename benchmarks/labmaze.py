@@ -18,24 +18,18 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from table import markdown, read_arguments
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.lab.evaluation import (
-    frames_curve,
-    solve_mazes,
-    solve_with_wrong_model,
-    wrong_models,
-)
-from torchrl_hmcts.trainers.experiments.lab.training import curve_script_frames, train_worker
-from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
+from torchrl_hmcts.trainers.experiments.kits.lab import LabMazeKit, wrong_models
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.skills import learn, make_loss, solve
 from torchrl_hmcts.trainers.figures.curves import plot_training, solving_panels
 
 ERROR = 0.05
@@ -79,8 +73,10 @@ def trained(
     if not path.exists():
         parts.results.pop(f"{name} training", None)
 
+    kit = LabMazeKit(config)
+
     def train() -> dict[str, Any]:
-        worker = train_worker(config)
+        worker = learn(kit)
         path.parent.mkdir(parents=True, exist_ok=True)
         torch.save(worker.loss.state_dict(), path)
         return {
@@ -88,70 +84,73 @@ def trained(
             "base_steps": worker.steps,
             "rounds": worker.rounds,
             "cpu_seconds": worker.seconds,
-            "curve": frames_curve(worker.tests, config.frames_per_step, config.max_frames),
+            "curve": kit.frames_curve(worker.tests),
         }
 
     parts(f"{name} training", train)
-    loss = make_worker_loss(config.num_skills, seed=config.seed)
+    loss = make_loss(kit)
     loss.load_state_dict(torch.load(path, weights_only=True))
     return SkillPolicy(loss.actor_network, deterministic=True)
+
+
+def solved(config: LabMazeConfig, worker: SkillPolicy, **changes: Any) -> dict[str, Any]:
+    """First trials with some keys changed."""
+    kit = LabMazeKit(dataclasses.replace(config, **changes))
+    return kit.figures(solve(kit, worker))
 
 
 def run(config: LabMazeConfig, args: argparse.Namespace, parts: Parts) -> None:
     """Measure everything with DIAYN's worker of one seed."""
     key = f"{config.algorithm} {config.seed}"
     worker = trained(config, parts, args.work)
-
-    def solve(size: int, config: LabMazeConfig = config) -> dict[str, Any]:
-        mazes = args.mazes if size <= 15 else args.large_mazes
-        return solve_mazes(config, worker, size=size, mazes=mazes)
-
     for size in args.sizes:
-        parts(f"{key} size {size}", lambda size=size: solve(size))
+        mazes = args.mazes if size <= 15 else args.large_mazes
+        parts(
+            f"{key} size {size}",
+            lambda size=size, mazes=mazes: solved(config, worker, size=size, mazes=mazes),
+        )
+    kit = LabMazeKit(config)
     for name, real in list(wrong_models(ERROR).items())[: args.wrong_models]:
         parts(
             f"{key} wrong model, {name}",
-            lambda real=real: solve_with_wrong_model(config, worker, mazes=args.mazes, **real),
+            lambda real=real: kit.solve_with_wrong_model(worker, args.mazes, **real),
         )
-    fixed = dataclasses.replace(config, stall_steps=0)
-    parts(f"{key} fixed length, size 9", lambda: solve(9, fixed))
+    parts(
+        f"{key} fixed length, size 9",
+        lambda: solved(config, worker, size=9, mazes=args.mazes, stall_steps=0),
+    )
 
 
 def compare(config: LabMazeConfig, args: argparse.Namespace, parts: Parts, name: str) -> None:
     """Measure another way of training in the 9 x 9 mazes."""
     worker = trained(config, parts, args.work, name)
-    parts(f"{name} size 9", lambda: solve_mazes(config, worker, size=9, mazes=args.mazes))
+    parts(f"{name} size 9", lambda: solved(config, worker, size=9, mazes=args.mazes))
 
 
 def table(results: dict[str, Any]) -> str:
     """The figures in Markdown."""
-    lines = [
-        "| worker, seed, mazes | solved at the first trial | frames to the goal, mean | script "
-        "| ratio | simulated frames, mean | expansions, mean (max) | planning, CPU s a maze |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, x in results.items():
-        if " size " in name:
-            lines.append(
-                f"| {name} | {x['solved']} of {x['mazes']} | {x['frames']['mean']:,.0f} | "
-                f"{x['script_frames']['mean']:,.0f} | {x['frames_over_script']:.2f} | "
-                f"{x['simulated_frames']['mean']:,.0f} | "
-                f"{x['expansions']['mean']:,.0f} ({x['expansions_max']:,}) | "
-                f"{x['plan_cpu_seconds']['mean']:.2f} |"
-            )
-    lines += [
-        "",
-        "| worker, seed, real env | solved by planning again | by the first plan alone "
-        "| frames, mean | plans, mean |",
-        "|---|---|---|---|---|",
-    ]
-    for name, x in results.items():
-        if "wrong model" in name:
-            lines.append(
-                f"| {name} | {x['solved']} of {x['mazes']} | {x['solved_by_the_first_plan']} | "
-                f"{x['frames']['mean']:,.0f} | {x['num_plans']['mean']:.1f} |"
-            )
-    return "\n".join(lines)
+    solved = {
+        "worker, seed, mazes": lambda row: row[0],
+        "solved at the first trial": lambda row: f"{row[1]['solved']} of {row[1]['mazes']}",
+        "frames to the goal, mean": lambda row: f"{row[1]['frames']['mean']:,.0f}",
+        "script": lambda row: f"{row[1]['script_frames']['mean']:,.0f}",
+        "ratio": lambda row: f"{row[1]['frames_over_script']:.2f}",
+        "simulated frames, mean": lambda row: f"{row[1]['simulated_frames']['mean']:,.0f}",
+        "expansions, mean (max)": lambda row: (
+            f"{row[1]['expansions']['mean']:,.0f} ({row[1]['expansions_max']:,})"
+        ),
+        "planning, CPU s a maze": lambda row: f"{row[1]['plan_cpu_seconds']['mean']:.2f}",
+    }
+    wrong = {
+        "worker, seed, real env": lambda row: row[0],
+        "solved by planning again": lambda row: f"{row[1]['solved']} of {row[1]['mazes']}",
+        "by the first plan alone": lambda row: row[1]["solved_by_the_first_plan"],
+        "frames, mean": lambda row: f"{row[1]['frames']['mean']:,.0f}",
+        "plans, mean": lambda row: f"{row[1]['num_plans']['mean']:.1f}",
+    }
+    sizes = [row for row in results.items() if " size " in row[0]]
+    models = [row for row in results.items() if "wrong model" in row[0]]
+    return f"{markdown(sizes, solved)}\n\n{markdown(models, wrong)}"
 
 
 def _short(result: dict[str, Any]) -> str:
@@ -160,19 +159,17 @@ def _short(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--mazes", type=int, default=200, help="test mazes of up to 15 x 15")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[9, 15, 31])
-    parser.add_argument("--large-mazes", type=int, default=40, help="test mazes of larger sizes")
-    parser.add_argument("--wrong-models", type=int, default=4, help="of four, two signs each")
-    parser.add_argument("--out", type=Path, default=Path("labmaze.json"))
-    parser.add_argument("--work", type=Path, default=Path("runs/labmaze_benchmark"))
-    parser.add_argument("--quick", action="store_true", help="one seed, one size, 20 mazes")
-    args = parser.parse_args()
-    if args.quick:
-        args.seeds, args.sizes, args.mazes, args.wrong_models = args.seeds[:1], [9], 20, 2
-    torch.set_num_threads(1)
+    args = read_arguments(
+        __doc__,
+        {"seeds": [0], "sizes": [9], "mazes": 20, "wrong_models": 2},
+        seeds=[0, 1, 2],
+        mazes=(200, "test mazes of up to 15 x 15"),
+        sizes=[9, 15, 31],
+        large_mazes=(40, "test mazes of larger sizes"),
+        wrong_models=(4, "of four, two signs each"),
+        work="runs/labmaze_benchmark",
+    )
+    args.out, args.work = args.out or Path("labmaze.json"), Path(args.work)
     known = ("seeds", "out", "work")  # more seeds may join what is there
     parts = Parts(args.out, {k: v for k, v in vars(args).items() if k not in known})
     configs = [LabMazeConfig(seed=seed) for seed in args.seeds]
@@ -185,7 +182,7 @@ def main() -> None:
         compare(longer, args, parts, f"diayn-160k {config.seed}")
     for kind, title in (("diayn", "DIAYN"), ("hmcts", "Algorithm 3")):
         curves = [parts.results[f"{kind} {c.seed} training"]["curve"] for c in configs]
-        script = float(np.mean([curve_script_frames(config) for config in configs]))
+        script = float(np.mean([LabMazeKit(config).script_frames() for config in configs]))
         plot_training(
             {title: curves},
             solving_panels(script),
@@ -198,4 +195,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

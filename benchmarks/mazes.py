@@ -13,9 +13,14 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
-from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env, make_training_env
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.kits.waterworld import (
+    make_option_env,
+    make_starts,
+    make_training_env,
+)
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.skills import learn
 
 RADIUS = 0.7  # of the novelty test, tiles
 __all__ = ["RADIUS", "demo_loss", "greedy", "make_option_env", "make_starts", "planner", "solve"]
@@ -24,7 +29,7 @@ __all__ = ["RADIUS", "demo_loss", "greedy", "make_option_env", "make_starts", "p
 def demo_loss(seed: int, weights: str | None = None) -> Any:
     """Train the demo's worker; or read its weights from a file, only to try a script out."""
     if weights is None:
-        return train_worker(DemoConfig(seed=seed))[1]
+        return learn(make_kit(DemoConfig(seed=seed))).loss
     loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=seed)
     loss.load_state_dict(torch.load(weights.format(seed=seed), weights_only=True))
     return loss

@@ -22,20 +22,20 @@ from typing import Any
 
 import torch
 from mazes import demo_loss, greedy, make_option_env, planner
+from real_episodes import EpisodesInEachMaze, act
 from table import markdown, read_arguments, write
 from torchrl.envs import EnvBase, TransformedEnv
-
-from torchrl_hmcts.envs import maze_pool
-from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillPolicy
-from torchrl_hmcts.planners import HierarchicalPolicy, SearchBudget
-from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
+from waterworld_options import (
     OptionModelConfig,
     error_by_horizon,
     make_model_env,
     record_transitions,
     train_option_model,
 )
-from torchrl_hmcts.trainers.experiments.waterworld.real_episodes import EpisodesInEachMaze, act
+
+from torchrl_hmcts.envs import maze_pool
+from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillPolicy
+from torchrl_hmcts.planners import HierarchicalPolicy, SearchBudget
 from torchrl_hmcts.transforms import OptionTransform
 
 OPTION_STEPS, GAMMA, TIME_LIMIT = 25, 0.99, 1_000

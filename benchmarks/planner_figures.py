@@ -34,8 +34,7 @@ from torchrl_hmcts.planners import (
     tree_search,
 )
 from torchrl_hmcts.planners.tree import EDGE, NODE
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 
 clock = time.thread_time
 

@@ -42,7 +42,7 @@ from torchrl_hmcts.objectives import (
     SkillObjective,
 )
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 from torchrl_hmcts.transforms import SkillReward
 
 SKILLS = 4

@@ -10,10 +10,10 @@ sampled. Needs `pip install stable-baselines3`.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
-from pathlib import Path
+from functools import partial
+from itertools import product
 from typing import Any
 
 import gymnasium
@@ -22,9 +22,10 @@ import stable_baselines3
 import torch
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
+from table import read_arguments, write
 
 from torchrl_hmcts.envs import TorchRLGymnasiumEnv, WaterworldMazeEnv, maze_pool
-from torchrl_hmcts.trainers.experiments.demo import make_starts
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
 
 ALGORITHMS = {"A2C": A2C, "PPO": PPO}
 
@@ -80,45 +81,33 @@ def test(model: Any, seed: int, mazes: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--algorithms", nargs="+", default=list(ALGORITHMS), choices=ALGORITHMS)
-    parser.add_argument("--frames", type=int, default=2_000_000)
-    parser.add_argument("--copies", type=int, default=16)
-    parser.add_argument("--mazes", type=int, default=342)
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    results = []
-    for name in arguments.algorithms:
-        for seed in arguments.seeds:
-            envs = DummyVecEnv(
-                [lambda i=i, s=seed: make_env(1_000 * s + i) for i in range(arguments.copies)]
-            )
-            model = ALGORITHMS[name]("MlpPolicy", envs, seed=seed, device="cpu")
-            begin = time.perf_counter()
-            model.learn(arguments.frames)
-            seconds = time.perf_counter() - begin
-            results.append(
-                {
-                    "algorithm": name,
-                    "seed": seed,
-                    "train_base_steps": arguments.frames,
-                    "train_seconds": round(seconds, 1),
-                    "test": test(model, seed, arguments.mazes),
-                }
-            )
-            print(json.dumps(results[-1]), flush=True)
-            if arguments.out is not None:
-                arguments.out.parent.mkdir(parents=True, exist_ok=True)
-                report = {
-                    "command": "python benchmarks/stable_baselines.py --seeds "
-                    + " ".join(map(str, arguments.seeds))
-                    + f" --frames {arguments.frames}",
-                    "stable_baselines3": stable_baselines3.__version__,
-                    "runs": results,
-                }
-                arguments.out.write_text(json.dumps(report, indent=1) + "\n")
+    arguments = read_arguments(
+        __doc__,
+        {"frames": 4_000, "mazes": 3},
+        seeds=[0],
+        algorithms=list(ALGORITHMS),
+        frames=2_000_000,
+        copies=16,
+        mazes=342,
+    )
+    seeds = " ".join(map(str, arguments.seeds))
+    report: dict[str, Any] = {
+        "command": f"python benchmarks/stable_baselines.py --seeds {seeds} "
+        f"--frames {arguments.frames}",
+        "stable_baselines3": stable_baselines3.__version__,
+        "runs": [],
+    }
+    for name, seed in product(arguments.algorithms, arguments.seeds):
+        makers = [partial(make_env, 1_000 * seed + i) for i in range(arguments.copies)]
+        model = ALGORITHMS[name]("MlpPolicy", DummyVecEnv(makers), seed=seed, device="cpu")
+        begin = time.perf_counter()
+        model.learn(arguments.frames)
+        row = {"algorithm": name, "seed": seed, "train_base_steps": arguments.frames}
+        row["train_seconds"] = round(time.perf_counter() - begin, 1)
+        row["test"] = test(model, seed, arguments.mazes)
+        report["runs"].append(row)
+        print(json.dumps(row), flush=True)
+        write(arguments, report)
 
 
 if __name__ == "__main__":

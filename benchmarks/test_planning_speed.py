@@ -12,8 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env, make_starts
 
 pytestmark = pytest.mark.benchmark
 

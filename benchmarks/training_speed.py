@@ -30,7 +30,7 @@ from torch.nn import functional as F
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
 SKILLS, ACTIONS, COPIES, FRAMES, BATCH, BUFFER = 4, 4, 32, 64, 256, 20_000
 GAMMA, ALPHA, TAU, CLIP = 0.95, 0.3, 0.05, 10.0

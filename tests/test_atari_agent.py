@@ -278,10 +278,10 @@ def test_a_run_is_evaluated_with_what_it_found_and_learned(tmp_path, no_pictures
     ("wrong", "message"),
     [
         ({"protocol": "random"}, "deterministic, sticky; got 'random'"),
-        ({"ratio": 0.0}, "ratio > 0.0.*got 0.0"),
-        ({"gamma": 1.5}, "gamma > 0.0 and <= 1.0; got 1.5"),
-        ({"frames": 0}, "frames >= 1; got 0"),
-        ({"num_processes": -2}, "num_processes >= -1; got -2"),
+        ({"ratio": 0.0}, "ratio must be above 0; got 0.0"),
+        ({"gamma": 1.5}, r"gamma must be in \(0, 1\]; got 1.5"),
+        ({"frames": 0}, "frames must be at least 1; got 0"),
+        ({"num_processes": -2}, "num_processes must be at least -1; got -2"),
     ],
 )
 def test_a_config_that_cannot_be_is_refused(wrong, message) -> None:

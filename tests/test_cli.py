@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment, find_experiment
-from torchrl_hmcts.trainers.experiments.registry import field_docs
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.runs.config import config_keys
 
 ALL = [*EXPERIMENTS.values()]
 
 
 @pytest.mark.parametrize("experiment", ALL, ids=lambda e: e.name)
 def test_every_key_of_an_experiment_has_a_default_and_a_sentence(experiment: Experiment) -> None:
-    meanings = field_docs(experiment.config_class)
-    for field in fields(experiment.config_class):
-        assert meanings[field.name].endswith("."), field.name
+    for name, (_, meaning) in config_keys(experiment.config_class).items():
+        assert meaning.endswith("."), name
     assert experiment.config_class().out == f"runs/{experiment.name}"
     assert callable(experiment.function)
 
@@ -70,9 +67,7 @@ def test_ctrl_c_ends_with_the_command_that_continues(tmp_path, capsys, monkeypat
     def interrupted(config) -> dict:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(
-        "torchrl_hmcts.trainers.experiments.waterworld.run.run_waterworld", interrupted
-    )
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.goals.run_goals", interrupted)
     assert main(["train", "experiment=waterworld_a3c", "out=runs/my own"]) == 130
     assert "Continue with: hmcts train 'resume=runs/my own'" in capsys.readouterr().err
 
@@ -97,9 +92,9 @@ def test_an_experiment_is_found_by_name() -> None:
     ],
 )
 def test_another_folder_is_advised_only_where_it_helps(message: str, helps: bool) -> None:
-    from torchrl_hmcts.trainers.command_line.running import _with_advice
+    from torchrl_hmcts.trainers.command_line.running import with_advice
 
-    advised = _with_advice(OSError(message), "hmcts train resume=runs/a")
+    advised = with_advice(message, "hmcts train resume=runs/a")
     advice = "Continue with: hmcts train resume=runs/a, or choose another folder with out=DIR."
     assert advised.endswith(advice) == helps
     assert ".." not in advised

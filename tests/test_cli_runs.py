@@ -35,17 +35,6 @@ def test_a_run_records_experiment_config_command_versions_and_machine(run: Path)
     assert str(run.parent) not in (run / "run.json").read_text()
 
 
-def test_a_demo_is_tested_again_in_other_mazes(tmp_path) -> None:
-    out = tmp_path / "demo"
-    assert main(["demo", "toy=true", f"out={out}", "log_level=warning"]) == 0
-    solved = json.loads((out / "metrics.json").read_text())["solved"]
-    assert main(["evaluate", f"run={out}"]) == 0
-    assert main(["evaluate", f"run={out}", "expansions=1", "seed=1"]) == 0
-    same, fewer = json.loads((out / "evaluation.json").read_text())["evaluations"]
-    assert same["results"]["test"]["solved"] == solved
-    assert fewer["results"]["test"]["expansions"]["mean"] <= 4.0  # leaves of one wave
-
-
 def test_values_are_logged_as_csv_while_it_trains(run: Path) -> None:
     with (run / "log" / "scalars" / "eval_solved_share.csv").open() as file:
         logged = [(int(step), float(value)) for step, value in csv.reader(file)]
@@ -117,7 +106,7 @@ def test_resume_goes_on_with_the_saved_config(tmp_path, monkeypatch) -> None:
         seen.append(config)
         return {}
 
-    path = "torchrl_hmcts.trainers.experiments.lab.run.run_labmaze"
+    path = "torchrl_hmcts.trainers.experiments.skills.run_skills"
     monkeypatch.setattr(path, remembered)
     out = tmp_path / "run"
     assert main(["train", "experiment=labmaze", "seed=7", "train_frames=8000", f"out={out}"]) == 0
@@ -153,7 +142,7 @@ def test_a_run_that_is_stopped_is_recorded_so(tmp_path, monkeypatch, capsys) -> 
     def interrupted(config) -> dict:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.lab.run.run_labmaze", interrupted)
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.skills.run_skills", interrupted)
     assert main(["train", "experiment=labmaze", f"out={tmp_path}"]) == 130
     assert json.loads((tmp_path / "run.json").read_text())["status"] == "stopped"
 
@@ -163,7 +152,7 @@ def test_log_level_warning_is_silent_on_standard_output(tmp_path, monkeypatch, c
         print("talking")
         return {}
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.lab.run.run_labmaze", talks)
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.skills.run_skills", talks)
     words = ["train", "experiment=labmaze", f"out={tmp_path}"]
     assert main(words) == 0
     assert "talking" in capsys.readouterr().out
@@ -186,7 +175,7 @@ def test_help_says_what_a_verb_needs_and_where_results_go(capsys, verb) -> None:
 @pytest.mark.parametrize("logger", ["tensorboard", "wandb"])
 def test_values_go_to_other_loggers_as_well(tmp_path, logger) -> None:
     pytest.importorskip(logger)
-    from torchrl_hmcts.trainers.runs.config import DemoConfig
+    from torchrl_hmcts.trainers.experiments.settings import DemoConfig
     from torchrl_hmcts.trainers.runs.loggers import make_logger
 
     made = make_logger(DemoConfig(out=str(tmp_path), logger=logger))

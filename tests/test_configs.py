@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,17 +14,23 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig
 from torchrl.envs import EnvBase
 
 import torchrl_hmcts.envs
 import torchrl_hmcts.objectives
 import torchrl_hmcts.planners
 import torchrl_hmcts.transforms
-from torchrl_hmcts.planners import PUCT, UCT, Gumbel, RadiusNovelty
+from torchrl_hmcts.planners import PUCT, UCT, Gumbel, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.configs import COMPONENTS, argument_docs, config_of, named, to_yaml
-from torchrl_hmcts.trainers.experiments import EXPERIMENTS
+from torchrl_hmcts.trainers.command_line.words import expand, parse_config
+from torchrl_hmcts.trainers.configs import COMPONENTS, config_of
+from torchrl_hmcts.trainers.experiments import EXPERIMENTS, find_experiment
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.registry import DEMO
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.skills import learn
+from torchrl_hmcts.trainers.parts import build, differences, merged, named
 
 CONFIGS = [(f"{g}={n}", named(p)) for g, names in COMPONENTS.items() for n, p in names.items()]
 INTERNAL = {"_target_", "_component_", "_partial_"}
@@ -71,18 +78,6 @@ def test_a_config_has_the_keywords_and_defaults_of_its_class(name: str, componen
             assert named(config[key]) is parameter.default, key
         else:
             assert config[key] == as_written(parameter.default), key
-
-
-@pytest.mark.parametrize(("name", "component"), CONFIGS, ids=[name for name, _ in CONFIGS])
-def test_the_yaml_explains_every_key_in_the_words_of_the_docstring(
-    name: str, component: type
-) -> None:
-    written = to_yaml(component)
-    assert set(OmegaConf.create(written)) == {*keywords(component), "_target_", "_component_"}
-    if component.__module__.startswith("torchrl_hmcts"):
-        assert set(argument_docs(component)) >= set(keywords(component))
-        comments = sum(line.startswith("# ") for line in written.splitlines())
-        assert comments >= len(keywords(component))
 
 
 # Built by others, or no part that one would choose in a config.
@@ -329,3 +324,84 @@ def test_experiments_compose_too(name: str) -> None:
     assert isinstance(config, DictConfig)
     assert instantiate(config.experiment).seed == 5
     assert config.experiment.out == f"runs/{name}"
+
+
+class TestParts:
+    """Parts of an agent over a kit, as they are typed on the command line."""
+
+    def test_what_differs_from_the_kits_own_is_kept(self) -> None:
+        words = ["objective=metra", "objective.slack=0.01", "planner/tree_policy=puct", "mazes=7"]
+        words += ["planner/novelty=radius", "planner.novelty.radius=0.5", "trainer.buffer_size=99"]
+        config = parse_config(find_experiment("labmaze"), words)
+        assert config.mazes == 7
+        assert config.objective["_component_"] == "torchrl_hmcts.objectives.METRAEncoderLoss"
+        assert config.objective["slack"] == 0.01
+        assert config.planner["novelty"] == {"radius": 0.5}  # key and all else as in the kit
+        assert build(**config.planner["tree_policy"]) == PUCT()
+        assert (config.trainer, config.loss) == ({"buffer_size": 99}, {})
+
+    def test_the_kits_own_part_chosen_by_name_changes_nothing(self) -> None:
+        words = ["objective=diayn", "planner/novelty=radius", "planner/budget=search"]
+        assert parse_config(DEMO, words) == DemoConfig()
+
+    def test_another_class_takes_over_what_it_needs(self) -> None:
+        config = parse_config(DEMO, ["planner/novelty=width"])
+        novelty = build(**config.planner["novelty"])
+        assert repr(novelty) == repr(WidthNovelty("position"))
+
+    def test_further_words_change_a_configuration_that_is_composed(self) -> None:
+        before = parse_config(DEMO, ["planner/tree_policy=puct", "planner.tree_policy.c=3"])
+        after = parse_config(DEMO, ["planner.tree_policy.c_base=20", "novelty_radius=2"], before)
+        assert build(**after.planner["tree_policy"]) == PUCT(c=3.0, c_base=20.0)
+        planner = make_kit(after).planner_part()
+        assert merged(planner, after.planner)["novelty"]["radius"] == 2.0
+
+    @pytest.mark.parametrize(
+        ("word", "message"),
+        [
+            ("objective=metr", "Unknown objective 'metr'. Did you mean: metra"),
+            ("planner/tree_polcy=puct", "Did you mean: planner/tree_policy"),
+            ("planner/tree_policy=puctt", "Unknown tree_policy 'puctt'. Did you mean: puct"),
+            ("planner.nvelty.radius=1", "Did you mean: planner.novelty.radius"),
+            ("planner.waves_in_flihgt=2", "Did you mean: planner.waves_in_flight"),
+            ("planner.leaves_per_wave=many", "planner.leaves_per_wave"),
+            ("loss.gama=0.9", "Did you mean: loss.gamma"),
+            ("planner/transpositions=by_key", "planner.transpositions needs key"),
+            ("planner.novelty.radius=-1", "radius"),
+            ("planner", "no key=value"),
+        ],
+    )
+    def test_what_cannot_be_composed_names_the_nearest(self, word: str, message: str) -> None:
+        with pytest.raises((ValueError, TypeError), match=re.escape(message)):
+            parse_config(DEMO, [word])
+
+    @pytest.mark.parametrize("name", COMPONENTS["objective"])
+    def test_every_objective_learns_a_batch(self, name: str) -> None:
+        config = parse_config(DEMO, [f"objective={name}", "train_base_steps=64"])
+        learned = learn(make_kit(config))
+        assert learned.steps == 64
+        assert learned.loss.objective.num_skills == 4
+
+    @pytest.mark.parametrize(
+        ("other", "changes"),
+        [
+            ({"c": 1, "part": {"a": 1}}, {}),
+            ({"c": 2, "part": {"a": 1}}, {"c": 2}),
+            ({"c": 1, "part": None}, {"part": None}),
+            ({"c": 1, "part": {"a": 5}}, {"part": {"a": 5}}),
+            ({"c": 1, "part": {"_component_": "x"}}, {"part": {"_component_": "x"}}),
+        ],
+    )
+    def test_differences_are_what_makes_the_one_of_the_other(
+        self, other: Any, changes: Any
+    ) -> None:
+        own = {"c": 1, "part": {"a": 1}}
+        assert differences(own, other) == changes
+        assert merged(own, changes) == other
+
+
+def test_a_sweep_of_commas_is_every_combination() -> None:
+    words = ["seed=0,1", "objective=metra,lsd", "planner.novelty.key=[a,b]"]
+    runs = expand(words)
+    assert len(runs) == 4
+    assert runs[1] == ["seed=0", "objective=lsd", "planner.novelty.key=[a,b]"]

@@ -70,34 +70,12 @@ def _no_target_warning(monkeypatch: pytest.MonkeyPatch) -> None:
 # Actor and policy
 
 
-def test_actions_keep_within_their_bounds() -> None:
-    actor = SkillActor(2, SPEC, 4, in_keys=["velocity"])
-    td = make_data(500)
-    for policy in (actor, SkillPolicy(actor), SkillPolicy(actor, deterministic=True)):
-        action = policy(td.copy())["action"]
-        assert SPEC.expand(500, 2).is_in(action)
-    assert not SkillPolicy(actor)(td)["action"].requires_grad
-
-
 def test_a_batched_spec_has_the_bounds_of_one_action() -> None:
     env = make_env(3)
     actor = SkillActor(2, env.action_spec, 4, in_keys=["velocity"])
     assert actor.spec["action"].shape == (2,)
     data = env.rollout(2, SkillPolicy(actor))
     assert env.action_spec.unsqueeze(1).expand(3, 2, 2).is_in(data["action"])
-
-
-def test_the_policy_shares_the_actors_parameters_and_takes_the_squashed_mean() -> None:
-    actor = SkillActor(2, SPEC, 4, in_keys=["velocity"])
-    policy = SkillPolicy(actor, deterministic=True)
-    assert {id(p) for p in policy.parameters()} == {id(p) for p in actor.parameters()}
-    td = make_data(20)
-    loc = actor.module[0](td.copy())["loc"]
-    expected = loc.tanh() * torch.tensor([1.0, 2.0]) + torch.tensor([0.0, 2.0])
-    torch.testing.assert_close(policy(td)["action"], expected.detach())
-    torch.testing.assert_close(
-        policy(td)["action"], actor.get_dist(td).deterministic_sample.detach()
-    )
 
 
 def test_the_policy_samples_from_the_actors_distribution() -> None:

@@ -36,7 +36,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
 )
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.transforms import OptionTransform
 

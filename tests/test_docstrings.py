@@ -141,9 +141,13 @@ def parameters(value: Any) -> list[str]:
 
 def sentences_below_fields(value: Any) -> set[str]:
     """The fields of a dataclass that have a string below them."""
-    from torchrl_hmcts.trainers.experiments.registry import field_docs
+    from torchrl_hmcts.trainers.runs.config import config_keys
 
-    return set(field_docs(value)) if dataclasses.is_dataclass(value) else set()
+    return (
+        set({name for name, (_, said) in config_keys(value).items() if said})
+        if dataclasses.is_dataclass(value)
+        else set()
+    )
 
 
 def undocumented_parameters(value: Any) -> list[str]:

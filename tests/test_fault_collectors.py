@@ -23,7 +23,7 @@ from torchrl.collectors import Collector
 
 from torchrl_hmcts.trainers.collectors import CollectorError, RestartingCollector
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
 BATCH, TOTAL = 64, 640
 
@@ -152,7 +152,7 @@ def test_the_command_line_says_how_to_go_on(tmp_path: Path, monkeypatch: Any, ca
     def dies(config: Any) -> dict:
         raise CollectorError("A process that collects died (Death).")
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.lab.run.run_labmaze", dies)
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.skills.run_skills", dies)
     assert main(["train", "experiment=labmaze", f"out={tmp_path}"]) == 1
     said = capsys.readouterr().err
     again = f"Or continue with: hmcts train resume={tmp_path}"

@@ -33,7 +33,7 @@ from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer, ExpertIterationTrainer, HMCTSTrainer
 from torchrl_hmcts.trainers.experiments.registry import load_config
-from torchrl_hmcts.trainers.runs.config import DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     PlainStateAdapter,
@@ -52,7 +52,7 @@ def diayn(folder: Path) -> Kind:
 
 
 def hmcts(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+    from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
     loss = DIAYNTrainer.make_loss(make_training_env(), num_skills=4, hidden=(8,), seed=0)
     planner = partial(
@@ -103,11 +103,12 @@ def _of_trainer(make: Callable[[], Any]) -> Kind:
 
 
 def demo(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.demo import train_worker
-    from torchrl_hmcts.trainers.experiments.evaluations import load_networks
+    from torchrl_hmcts.trainers.experiments.kits import make_kit
+    from torchrl_hmcts.trainers.experiments.skills import learn
+    from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
     config = DemoConfig(train_base_steps=128, out=str(folder))
-    _, loss = train_worker(config, save_dir=folder / "checkpoints")
+    loss = learn(make_kit(config), save_dir=folder / "checkpoints").loss
 
     def load() -> Any:
         load_networks(loss, folder)

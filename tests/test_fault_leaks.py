@@ -18,7 +18,7 @@ from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
 MIB = 2**20
 MAX_MIB, MAX_OBJECTS = 16.0, 500  # what is allowed over the long runs

@@ -32,12 +32,12 @@ from torchrl.trainers import Trainer
 
 from torchrl_hmcts import envs, modules, objectives, planners, trainers, transforms
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.waterworld.config import (
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
+from torchrl_hmcts.trainers.experiments.settings import (
+    LabMazeConfig,
     WaterworldA3CConfig,
     WaterworldGoalsConfig,
 )
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # torch may warn of what it then accepts
 Good = Callable[[], tuple[Callable[..., Any], dict[str, Any]]]
@@ -247,7 +247,6 @@ GOOD: dict[str, Good] = {
         ScriptedExpert={},
         SharedRMSprop={"params": lambda: [nn.Parameter(torch.zeros(2))]},
         GrowSkills={"prior": lambda: modules.GrowingSkillPrior(4), "coverage": float},
-        MazeNetwork={"mazes": lambda: maze(), "channels": 2, "hidden": 2},
         DIAYNTrainer={
             "env": lambda: make_training_env(copies=1),
             "loss_module": lambda: skill_loss(),
@@ -282,7 +281,7 @@ GOOD: dict[str, Good] = {
 }
 COSTLY = {  # milliseconds each; the others take microseconds
     *("DIAYNTrainer", "HMCTSTrainer", "A3CTrainer", "ExpertIterationTrainer", "MCTSPlanner"),
-    *("WaterworldMazeEnv", "LabMazeEnv", "GridworldMazeEnv", "MazeNetwork"),
+    *("WaterworldMazeEnv", "LabMazeEnv", "GridworldMazeEnv"),
     *("DIAYNLoss", "DiscreteSkillSACLoss", "SkillSACLoss", "A3CLoss", "OptionModel"),
     *("IntraOptionQLoss", "OptionTerminationLoss", "ExpertIterationLoss", "SkillDynamicsLoss"),
 }

@@ -32,9 +32,12 @@ from torchrl_hmcts.envs import (
 )
 from torchrl_hmcts.modules import SkillActor
 from torchrl_hmcts.planners import Root, Transition, tree_search
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.waterworld.config import WaterworldGoalsConfig
-from torchrl_hmcts.trainers.runs.config import DemoConfig, parse_overrides
+from torchrl_hmcts.trainers.experiments.settings import (
+    DemoConfig,
+    LabMazeConfig,
+    WaterworldGoalsConfig,
+)
+from torchrl_hmcts.trainers.runs.config import parse_overrides
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     find_damage,

@@ -23,8 +23,8 @@ from torchrl_hmcts.envs import (
     shortest_path_lengths,
 )
 from torchrl_hmcts.envs.mazes.rendering import DOT_COLOR, PLAYER_COLOR, TARGET_COLOR
-from torchrl_hmcts.trainers.experiments.demo import make_starts
-from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import (
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
     GoalEpisodes,
     GoalTrack,
     run_goal_episodes,

@@ -18,27 +18,26 @@ from torch import Tensor
 
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
 from torchrl_hmcts.trainers.evaluation import Results
-from torchrl_hmcts.trainers.experiments import find_experiment
-from torchrl_hmcts.trainers.experiments.evaluations import evaluate_labmaze
-from torchrl_hmcts.trainers.experiments.lab import training
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.lab.evaluation import (
-    _with_second_search,
-    frames_curve,
-    solve_mazes,
-    solve_with_wrong_model,
-    wrong_models,
-)
-from torchrl_hmcts.trainers.experiments.lab.run import run_labmaze
-from torchrl_hmcts.trainers.experiments.lab.script import ShortestPathScript
-from torchrl_hmcts.trainers.experiments.lab.training import train_worker
-from torchrl_hmcts.trainers.experiments.lab.worker import (
+from torchrl_hmcts.trainers.experiments import find_experiment, skills
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.kits.lab import (
     TRAINING_MAZES,
+    LabMazeKit,
+    frames_curve,
     held_out_seeds,
     make_lab_env,
-    make_option_env,
     make_starts,
-    make_worker_loss,
+    wrong_models,
+)
+from torchrl_hmcts.trainers.experiments.kits.lab_script import ShortestPathScript
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.skills import (
+    evaluate_skills,
+    learn,
+    make_loss,
+    run_skills,
+    solve,
+    with_second_search,
 )
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import OptionTransform
@@ -62,7 +61,7 @@ WORKER = TensorDictModule(push, ["skill", "heading"], ["action"])
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("labmaze")
-    return out, run_labmaze(LabMazeConfig(seed=1, out=str(out), toy=True))
+    return out, run_skills(LabMazeConfig(seed=1, out=str(out), toy=True))
 
 
 class TestRun:
@@ -87,7 +86,7 @@ class TestRun:
         self, toy: tuple[Path, dict[str, Any]]
     ) -> None:
         out, metrics = toy
-        again = evaluate_labmaze(LabMazeConfig(seed=1, out=str(out), toy=True))
+        again = evaluate_skills(LabMazeConfig(seed=1, out=str(out), toy=True))
         assert again["checkpoint"].startswith("worker-")
         for name in ("mazes", "solved", "unsolved", "expansions"):
             assert again["test"][name] == metrics["test"][name], name
@@ -97,7 +96,7 @@ class TestRun:
     ) -> None:
         out, metrics = toy
         rows = list(csv.DictReader((out / "curves.csv").read_text().splitlines()))
-        names = {row["curve"] for row in rows}
+        names = {row["name"] for row in rows}
         losses = {"loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator"}
         assert names == losses | {"frames", "solved", "solved_frames"}
         assert max(int(r["training_frames"]) for r in rows) == metrics["training_frames"]
@@ -112,8 +111,8 @@ class TestRun:
         self, toy: tuple[Path, dict[str, Any]]
     ) -> None:
         out, metrics = toy
-        config = LabMazeConfig(**{**metrics["config"], "resume": True})
-        again = train_worker(config, save_dir=out / "checkpoints")
+        kit = make_kit(LabMazeConfig(**metrics["config"]))
+        again = learn(kit, save_dir=out / "checkpoints", resume=True)
         assert again.steps == metrics["training_base_steps"]
         assert again.rounds == metrics["training_rounds"]
 
@@ -123,7 +122,7 @@ def test_diayn_alone_learns_within_its_frames_and_is_tried_before_and_after() ->
         algorithm="diayn", train_frames=600, expansions=2, curve_mazes=2, curve_points=1
     )
     assert config.train_steps == 128  # two batches of 64 steps of 4 frames
-    trained = train_worker(config)
+    trained = learn(make_kit(config))
     assert trained.steps == 128
     assert frames_curve(trained.tests, 4, 10_800)["training_steps"] == [0.0, 512.0]
 
@@ -147,19 +146,19 @@ def test_the_worker_that_solved_the_most_mazes_is_kept_of_several_the_latest(
         two = np.full(2, 7)
         return Results(yes, yes, two, two, two, two, two)
 
-    monkeypatch.setattr(training, "plan_and_execute", scripted)
+    monkeypatch.setattr(skills, "plan_and_execute", scripted)
     config = LabMazeConfig(
         algorithm="diayn", train_frames=600, curve_mazes=2, curve_points=2, keep="best"
     )
-    trained = train_worker(config)
-    policy = trained.policy
+    trained = learn(make_kit(config))
+    policy = trained.worker
     assert trained.worker_step == 64 * kept  # never 0: what has not learned shows no skills
     assert len(seen) == 3
     assert not torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[1], seen[2])
     assert [torch.equal(next(policy.parameters()), actor) for actor in seen].index(True) == kept
     seen.clear()
-    last = train_worker(dataclasses.replace(config, keep="last")).policy
+    last = learn(make_kit(dataclasses.replace(config, keep="last"))).worker
     assert torch.equal(next(last.parameters()), seen[2])
 
 
@@ -175,7 +174,7 @@ def test_algorithm_3_learns_within_its_frames_and_logs_the_same_losses() -> None
         curve_points=1,
     )
     assert config.train_steps == 600 - 2 * 1 * 5 * 25  # two rounds may still be under way
-    trained = train_worker(config)
+    trained = learn(make_kit(config))
     assert config.train_steps <= trained.steps <= 600
     assert trained.rounds > 2
     losses = ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator")
@@ -195,7 +194,7 @@ def test_the_experiment_is_registered() -> None:
         ({"option_frames": 90}, "option_frames=90 is no whole number of base steps"),
         ({"train_frames": 255}, "train_frames=255 are too few"),
         ({"algorithm": "hmcts", "train_frames": 9_000}, "train_frames=9000 are too few"),
-        ({"keep": "first"}, "keep is one of ('best', 'last'); got 'first'"),
+        ({"keep": "first"}, "keep is one of best, last; got 'first'"),
         ({"mazes": 0}, "mazes must be at least 1; got 0"),
         ({"stall_steps": -1}, "stall_steps must be at least 0; got -1"),
     ],
@@ -231,7 +230,8 @@ class TestMazes:
 class TestOptions:
     def test_a_player_at_a_wall_ends_its_option_and_one_on_the_way_does_not(self) -> None:
         """Walls are met at 116.1; 25 steps of 4 frames to the east or north end before a wall."""
-        env = make_option_env(WORKER, mazes=[ROOM])
+        kit = LabMazeKit(LabMazeConfig())
+        env = kit.make_options(make_lab_env(mazes=[ROOM]), WORKER)
         state = env.base_env.make_state(0, (117.0, 117.0), 90.0)  # the south-west corner
         durations = [
             env.step(state.clone().set("option", torch.tensor(skill)))["next", "duration"].item()
@@ -240,13 +240,14 @@ class TestOptions:
         assert durations == [25, 25, 2, 2]  # east, north, west, south
 
     def test_without_stall_steps_every_option_lasts(self) -> None:
-        env = make_option_env(WORKER, mazes=[ROOM], stall_steps=0)
+        kit = LabMazeKit(LabMazeConfig(stall_steps=0))
+        env = kit.make_options(make_lab_env(mazes=[ROOM]), WORKER)
         state = env.base_env.make_state(0, (117.0, 117.0), 90.0)
         after = env.step(state.set("option", torch.tensor(2)))["next"]
         assert after["duration"].item() == 25
 
     def test_the_worker_sees_no_place(self) -> None:
-        loss = make_worker_loss(seed=0)
+        loss = make_loss(LabMazeKit(LabMazeConfig()))
         assert set(loss.actor_network.in_keys) == {"body_velocity", "heading", "skill"}
 
 
@@ -280,13 +281,18 @@ class TestScript:
             ShortestPathScript(LabMazeEnv([["****", "*P *", "****"]]))
 
 
+def solved(config: LabMazeConfig, worker: Any) -> dict[str, Any]:
+    kit = LabMazeKit(config)
+    return kit.figures(solve(kit, worker), timed=1)
+
+
 class TestEvaluation:
     config = LabMazeConfig(
         mazes=4, expansions=200, improve_expansions=10, max_frames=1_500, stall_steps=0
     )
 
     def test_a_worker_of_the_four_directions_solves_all_at_the_first_trial(self) -> None:
-        figures = solve_mazes(self.config, WORKER, timed=1)
+        figures = solved(self.config, WORKER)
         assert (figures["mazes"], figures["solved"], figures["unsolved"]) == (4, 4, [])
         assert 1.0 < figures["frames_over_script"] < 3.0
         assert figures["frames_over_script"] == pytest.approx(
@@ -296,7 +302,7 @@ class TestEvaluation:
     def test_a_worker_that_stands_still_solves_none_in_two_searches(self) -> None:
         config = dataclasses.replace(self.config, mazes=2, expansions=3, stall_steps=2)
         still = TensorDictModule(lambda skill: skill * 0 + 8, ["skill"], ["action"])
-        figures = solve_mazes(config, still, timed=1)
+        figures = solved(config, still)
         assert (figures["found"], figures["solved"], figures["unsolved"]) == (0, 0, [0, 1])
         assert figures["second_searches"] == 2
         assert math.isnan(figures["frames_over_script"])
@@ -307,14 +313,14 @@ class TestEvaluation:
             return Results(np.array(found), np.array(found), *numbers)
 
         first, second = results([True, False, True], 10), results([True], 7)
-        both = _with_second_search(first, np.array([1]), second)
+        both = with_second_search(first, np.array([1]), second)
         assert both.solved.tolist() == [True, True, True]
         assert both.simulated_steps.tolist() == both.expansions.tolist() == [10, 17, 10]
         assert both.episode_steps.tolist() == both.plan_options.tolist() == [10, 7, 10]
 
     def test_planning_again_solves_what_one_plan_of_a_wrong_model_does_not(self) -> None:
         real = wrong_models(0.05)["faster clock, less friction"]
-        figures = solve_with_wrong_model(self.config, WORKER, mazes=4, **real)
+        figures = LabMazeKit(self.config).solve_with_wrong_model(WORKER, mazes=4, **real)
         assert figures["solved"] == 4
         assert figures["solved_by_the_first_plan"] < 4
         assert figures["num_plans"]["mean"] > 2

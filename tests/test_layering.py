@@ -45,15 +45,9 @@ OPTIONAL = {"planners.drawing": "matplotlib", "planners.export": "networkx"}
 # What is still wrong today: lines go, and none comes.
 KNOWN = {
     "envs.gym_envs": "lab mazes",
-    "trainers.runs.run": "experiments",
-    "trainers.runs.sweep": "experiments",
 }
 KNOWN_CIRCLES = {
-    "planners.mcts planners.growth",
-    "planners.search planners.scored_descent",
-    "planners.tree planners.drawing",
-    "planners.tree planners.export",
-    *(f"envs.gym.snapshots envs.gym.{n}" for n in "atari box2d minigrid mujoco tables".split()),
+    f"envs.gym.snapshots envs.gym.{n}" for n in "atari box2d minigrid mujoco tables".split()
 }
 
 
@@ -194,7 +188,7 @@ TYPING = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    "
         ("trainers.a3c.trainer", f"{LAZY}from torchrl_hmcts.trainers.figures import report"),
         ("trainers.diayn", f"{LAZY}from torchrl_hmcts.trainers.runs import folder"),
         ("trainers.figures.plots", "from torchrl_hmcts.trainers.experiments import demo"),
-        ("trainers.experiments.demo", f"{LAZY}from torchrl_hmcts.trainers import cli"),
+        ("trainers.experiments.skills", f"{LAZY}from torchrl_hmcts.trainers import cli"),
     ],
 )
 def test_the_check_catches_a_violation(module: str, source: str) -> None:
@@ -209,7 +203,7 @@ def test_the_check_catches_a_violation(module: str, source: str) -> None:
         ("planners.drawing", f"{LAZY}from matplotlib import pyplot"),
         ("envs.mazes.layouts", "import pymunk\nfrom . import rendering"),
         ("envs.atari.pool", "from torchrl_hmcts.envs.gym import settable"),
-        ("trainers.experiments.demo", "from torchrl_hmcts import envs, planners"),
+        ("trainers.experiments.skills", "from torchrl_hmcts import envs, planners"),
         ("trainers.cli", "from torchrl_hmcts.trainers.saving.files import x"),
     ],
 )

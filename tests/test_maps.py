@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torchrl_hmcts.envs import LabMazeEnv, WaterworldMazeEnv, maze_from_text
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.planners.drawing import OPTION_COLORS
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
 from torchrl_hmcts.trainers.figures.maps import (
     FeatureMap,
     LabMap,

@@ -11,15 +11,10 @@ from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.experiments.waterworld.agents import (
-    MazeNetwork,
-    make_maze_networks,
-    play_mazes,
-)
-from torchrl_hmcts.trainers.experiments.waterworld.config import (
-    WaterworldA3CConfig,
-    WaterworldGoalsConfig,
-)
+from torchrl_hmcts.trainers.experiments.goals import make_maze_networks
+from torchrl_hmcts.trainers.experiments.settings import WaterworldA3CConfig, WaterworldGoalsConfig
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import play_mazes
+from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
 
 
 @pytest.fixture
@@ -29,11 +24,15 @@ def env() -> WaterworldMazeEnv:
 
 
 def test_a_network_sees_places_from_the_middle_and_speeds_in_what_thrust_reaches() -> None:
-    network = MazeNetwork(6, 1, hidden=4, half_size=4.5)
+    keys = ["observation", "velocity", "goals"]
+    network = make_maze_networks(make_goal_env(), in_keys=keys)[1].module
     seen: list[torch.Tensor] = []
-    network.layers.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
-    network(torch.tensor([0.0, 9.0]), torch.tensor([2.0, -1.0]), torch.tensor([1.0, -2.0]))
-    assert seen[0].tolist() == [-1.0, 1.0, 1.0, -0.5, 0.5, -1.0]
+    network.layers[0].register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    size = network.layers[0].in_features - 8
+    network(
+        torch.tensor([0.0, *[9.0] * (size - 1)]), torch.tensor([2.0, -1.0]), 2.0 * torch.ones(6)
+    )
+    assert seen[0].tolist() == [-1.0, *[1.0] * (size - 1), 1.0, -0.5, *[1.0] * 6]
 
 
 def test_at_first_all_actions_are_about_equally_likely(env) -> None:
@@ -95,7 +94,7 @@ def test_an_experiment_writes_its_folder_and_goes_on_from_it(name: str, tmp_path
     assert metrics["test"]["mazes"] == 3
     assert ("num_plans_mean" in metrics["test"]) == (name == "waterworld_goals")
     rows = (tmp_path / "curves.csv").read_text().splitlines()
-    assert rows[0] == "name,frames,value"
+    assert rows[0] == "name,base_steps,value"
     assert any(row.startswith("eval_solved_share,") for row in rows)
     page = (tmp_path / "index.html").read_text()
     for picture in tmp_path.glob("*.png"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Categorical, OneHot, Unbounded
+from torchrl.data import Bounded, Categorical, OneHot, TensorSpec, Unbounded
 
 from torchrl_hmcts.modules import (
     ConcatSkillMLP,
@@ -149,27 +149,34 @@ def test_actor_and_critic_take_another_network_by_its_class() -> None:
     assert torch.equal(action, actor.get_dist(td).probs.argmax(-1))
 
 
-@pytest.mark.parametrize("spec", [Categorical(4), OneHot(4)], ids=["categorical", "one-hot"])
-@pytest.mark.parametrize("deterministic", [True, False])
-def test_actor_and_policy_write_actions_of_the_spec(spec: object, deterministic: bool) -> None:
+SPECS = [Categorical(4), OneHot(4), Bounded(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0]))]
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: type(spec).__name__)
+def test_actor_and_policy_write_actions_of_the_spec(spec: TensorSpec) -> None:
     actor = SkillActor(3, spec, num_skills=3, in_keys=["velocity", "extra"])
-    td = features(6)
-    for module in (actor, SkillPolicy(actor, deterministic=deterministic)):
+    td = features(200)
+    for module in (actor, SkillPolicy(actor), SkillPolicy(actor, deterministic=True)):
         action = module(td.clone())["action"].to(spec.dtype)
-        assert spec.expand(6, *spec.shape).is_in(action)
+        assert spec.expand(200, *spec.shape).is_in(action)
     assert SkillPolicy(actor)(td)["action"].dtype == spec.dtype
 
 
-def test_the_policy_shares_the_actors_parameters_and_takes_the_mode() -> None:
-    actor = SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"])
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: type(spec).__name__)
+def test_the_policy_shares_the_actors_parameters_and_takes_the_best(spec: TensorSpec) -> None:
+    actor = SkillActor(2, spec, num_skills=3, in_keys=["velocity"])
     policy = SkillPolicy(actor, deterministic=True)
     assert {id(p) for p in policy.parameters()} == {id(p) for p in actor.parameters()}
     td = features(50)
     torch.nn.init.normal_(actor.network.heads.weight)
-    mode = actor.get_dist(td.clone()).probs.argmax(-1)
-    action = policy(td)["action"]
-    assert torch.equal(action, mode)
+    action = policy(td.clone())["action"]
     assert not action.requires_grad
+    best = actor.get_dist(td).deterministic_sample.detach()
+    torch.testing.assert_close(action, best.to(action.dtype))
+    if isinstance(spec, Bounded):
+        loc = actor.module[0](td)["loc"].detach()
+        middle, half_range = (spec.low + spec.high) / 2, (spec.high - spec.low) / 2
+        torch.testing.assert_close(action, middle + half_range * loc.tanh())
 
 
 def test_the_policy_samples_from_the_actors_distribution() -> None:

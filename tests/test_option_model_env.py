@@ -6,19 +6,15 @@ from typing import Any
 
 import pytest
 import torch
+from maze_window import MazeWindow
+from real_episodes import EpisodesInEachMaze, act
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl.envs.utils import check_env_specs
-
-from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text, maze_pool
-from torchrl_hmcts.modules import OptionMemory, OptionModel, OptionModelEnv
-from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty
-from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.experiments.waterworld.maze_window import MazeWindow
-from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
+from waterworld_options import (
     OptionModelConfig,
     error_by_horizon,
     make_model_env,
@@ -27,7 +23,11 @@ from torchrl_hmcts.trainers.experiments.waterworld.option_model import (
     relabel_targets,
     train_option_model,
 )
-from torchrl_hmcts.trainers.experiments.waterworld.real_episodes import EpisodesInEachMaze, act
+
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text, maze_pool
+from torchrl_hmcts.modules import OptionMemory, OptionModel, OptionModelEnv
+from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty
+from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.transforms import OptionTransform
 
 LENGTH = 7

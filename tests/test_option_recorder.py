@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
@@ -199,11 +199,3 @@ def test_an_env_that_hands_nothing_out_is_refused() -> None:
 def test_nothing_to_record_is_refused() -> None:
     with pytest.raises(ValueError, match=r"\['skill'\], of which none"):
         OptionRecorder(["skill"])
-
-
-def test_it_refuses_data_and_the_workers_of_a_batched_env() -> None:
-    recorder = OptionRecorder(["state"])
-    with pytest.raises(RuntimeError, match="hold what it writes already"):
-        recorder(TensorDict(batch_size=[2]))
-    with pytest.raises(RuntimeError, match="Put it outside"):
-        SerialEnv(2, lambda: make_env(OptionRecorder(["state"])))

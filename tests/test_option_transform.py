@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from functools import partial
 
 import pytest
@@ -17,8 +15,6 @@ from torchrl.data import (
     Bounded,
     Categorical,
     Composite,
-    LazyTensorStorage,
-    ReplayBuffer,
     Unbounded,
 )
 from torchrl.envs import (
@@ -261,13 +257,6 @@ class TestAgainstALoop:
         assert after["state"].tolist() == [2, 1]
         assert after["duration"].tolist() == [[1], [1]]
 
-    def test_one_base_step_per_option_is_the_base_env(self):
-        env, td = chain(start=[0, 4], batch=[2])
-        after = step_next(macro(env, max_steps=1), td, [RIGHT, RIGHT])
-        plain = env.step(td.copy().set("action", torch.tensor([RIGHT, RIGHT])))["next"]
-        assert_close(after, plain)
-        assert after["duration"].tolist() == [[1], [1]]
-
     @pytest.mark.parametrize("batch", BATCHES)
     def test_nested_keys(self, batch):
         env = NestedChainEnv()
@@ -303,10 +292,6 @@ class TestAgainstALoop:
         td["option"] = nn.functional.one_hot(option, 2).bool()
         after = one_hot.step(td.clone())["next"]
         assert_close(after, by_hand(env, td.set("option", option), skill_is_action()))
-
-    def test_gamma_one_adds_up_the_rewards(self):
-        env, td = chain(start=1)
-        assert step_next(macro(env, gamma=1.0), td, RIGHT)["reward"].item() == pytest.approx(0)
 
     def test_a_root_can_be_stepped_again_with_another_option(self):
         """What the first step left under "next" is of no consequence for the second."""
@@ -522,33 +507,6 @@ class TestRollouts:
 
 
 class TestOtherTransforms:
-    def test_those_before_it_see_base_steps(self):
-        base = TransformedEnv(
-            ChainEnv(6, reward_per_step=-0.25),
-            Compose(StepCounter(max_steps=7), RewardScaling(0.5, 2.0)),
-        )
-        env = TransformedEnv(
-            ChainEnv(6, reward_per_step=-0.25),
-            Compose(
-                StepCounter(max_steps=7),
-                RewardScaling(0.5, 2.0),
-                OptionTransform(skill_is_action(), 2, 3, GAMMA),
-            ),
-        )
-        check_env_specs(env)
-        td = env.reset(TensorDict(batch_size=[2]))
-        counts, truncated = [], []
-        for _ in range(3):
-            td["option"] = torch.tensor([LEFT, RIGHT])
-            after = env.step(td.clone())["next"]
-            assert_close(after[0], by_hand(base, td[0], skill_is_action(), 3))
-            counts.append(after["step_count"][0].item())
-            truncated.append(after["truncated"][0].item())
-            td = after.exclude("reward")
-        assert counts == [3, 6, 7]
-        assert truncated == [False, False, True]
-        assert after["duration"][0] == 1
-
     def test_those_after_it_see_macro_steps(self):
         env = TransformedEnv(
             ChainEnv(6, reward_per_step=-0.25),
@@ -727,20 +685,6 @@ class TestOwnership:
         td = macro(ChainEnv(6), worker).rollout(3)
         assert not td["next", "reward"].requires_grad
 
-    @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
-    def test_a_copy_of_the_env_steps_as_the_original(self, duplicate):
-        worker = TensorDictModule(Hidden(), ["skill"], ["action"])
-        env = TransformedEnv(
-            ChainEnv(6), Compose(StepCounter(7), OptionTransform(worker, 2, 4, GAMMA))
-        )
-        td = env.reset(TensorDict(batch_size=[3]))
-        td["option"] = torch.tensor([LEFT, RIGHT, RIGHT])
-        expected = env.step(td.clone())["next"]
-        twin = duplicate(env)
-        assert_close(twin.step(td.clone())["next"], expected)
-        assert_close(duplicate(twin).step(td.clone())["next"], expected)
-        check_env_specs(twin)
-
     def test_a_clone_serves_a_second_env_with_the_same_worker(self):
         transform = OptionTransform(skill_is_action(), 2, 4, GAMMA)
         first = TransformedEnv(ChainEnv(6), transform)
@@ -872,16 +816,6 @@ class TestBadInput:
         env.reward_spec = Composite(reward=Unbounded((1,)), cost=Unbounded((1,)))
         with pytest.raises(ValueError, match="sums one reward; ChainEnv has the rewards .*cost"):
             macro(env)
-
-    def test_a_replay_buffer_is_no_place_for_it(self):
-        buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=2)
-        buffer.extend(macro(ChainEnv(6)).rollout(3))
-        buffer.append_transform(OptionTransform(skill_is_action(), 2, 4))
-        with pytest.raises(RuntimeError, match="stored data hold what it writes.*TransformedEnv"):
-            buffer.sample()
-        for td in (ChainEnv(6).rollout(3), macro(ChainEnv(6)).rollout(3)):
-            with pytest.raises(RuntimeError, match="no meaning in a replay buffer"):
-                buffer.extend(td)
 
     def test_one_transform_cannot_serve_two_envs(self):
         env = macro(ChainEnv(6))

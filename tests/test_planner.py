@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import time
 from typing import Any
 
@@ -977,40 +974,3 @@ def test_elements_that_a_rollout_no_longer_steps_are_not_planned_for() -> None:
     assert rollout["next", "done"][:, -1].all()
     # Calls alternate: one of the search, one of the rollout itself.
     assert [len(call) for call in env.calls] == [3, 3, 2, 2] + [1, 1] * 4
-
-
-# ---------------------------------------------------------------------- without the compiler
-
-WITHOUT_NUMBA = """
-import sys
-import numpy as np
-from torchrl_hmcts.planners import PUCT, UCT, MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.testing import ChainEnv
-
-env = ChainEnv(6)
-out = {}
-for i, policy in enumerate((UCT(), PUCT())):
-    for j, expand in enumerate(("one", "all")):
-        planner = MCTSPlanner(
-            env, tree_policy=policy, expand=expand, leaves_per_wave=2, backup="max",
-            novelty=RadiusNovelty("state", 1.5), budget=SearchBudget(expansions=30),
-        )
-        tree = planner.search(env.reset()).tree
-        for name in ("parent", "option", "visits", "flags", "value", "path_return"):
-            out[f"{name}{i}{j}"] = tree.nodes[name][0, : tree.num_nodes[0]]
-np.savez(sys.argv[1], **out)
-"""
-
-
-def test_the_kernels_run_as_plain_python_too(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    command = [sys.executable, "-W", "error", "-c", WITHOUT_NUMBA, str(tmp_path / "python.npz")]
-    subprocess.run(command, check=True, env=environment, cwd=tmp_path, timeout=120)
-    monkeypatch.setattr(sys, "argv", ["", str(tmp_path / "numba.npz")])
-    exec(compile(WITHOUT_NUMBA, "<search>", "exec"), {})
-    python, numba = np.load(tmp_path / "python.npz"), np.load(tmp_path / "numba.npz")
-    assert python.files == numba.files
-    for name in numba.files:
-        np.testing.assert_allclose(python[name], numba[name], rtol=1e-5, err_msg=name)

@@ -20,15 +20,15 @@ ALLOWED = {
 }
 OTHERS = {  # of other packages
     *("_enabled", "_impl", "_load_data"),  # numba's cache: compiling.py
-    *("_exit",),  # os._exit
+    *("_exit", "_replace"),  # os._exit; a NamedTuple's
 }
 # What is there today: names go, and none comes.
 KNOWN = {
-    *("_TensorClassMeta", "_alpha", "_alpha_loss", "_cached_detached_qvalue_params"),
-    *("_checkpoint_path", "_clear_weakrefs", "_complete_done", "_compute_target_v2"),
+    *("_TensorClassMeta", "_alpha", "_alpha_loss"),
+    *("_clear_weakrefs", "_compute_target_v2"),
     *("_decode_state_dict_value", "_encode_state_dict_value", "_foreach_lerp_", "_get_str"),
-    *("_get_time_dim", "_get_tuple", "_local_path", "_modules", "_new_unsafe", "_optim_count"),
-    *("_reduce_loss", "_sources", "_targets", "_traj_pool", "_validate_step", "_value_estimator"),
+    *("_get_time_dim", "_get_tuple", "_modules", "_new_unsafe", "_optim_count"),
+    *("_reduce_loss", "_sources", "_targets", "_traj_pool", "_value_estimator"),
     *("_version", "_wrapped_policy"),
 }
 

@@ -27,7 +27,9 @@ def test_pictures_and_links_of_the_readme_exist():
 @pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")
 @pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
 @pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
-@pytest.mark.parametrize(("name", "least"), [("planning.md", 7), ("skills.md", 7), ("atari.md", 2)])
+@pytest.mark.parametrize(
+    ("name", "least"), [("planning.md", 7), ("skills.md", 7), ("kits.md", 2), ("atari.md", 2)]
+)
 def test_every_python_block_of_a_page_runs(name, least, capsys):
     if name == "atari.md":
         pytest.importorskip("ale_py")

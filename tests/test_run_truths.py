@@ -13,14 +13,13 @@ import torch
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.figures.run_page import write_run_page
-from torchrl_hmcts.trainers.runs.config import DemoConfig
 from torchrl_hmcts.trainers.runs.run import open_run
-from torchrl_hmcts.trainers.runs.worker_file import find_worker, save_worker
 from torchrl_hmcts.trainers.saving.files import read_json, write_json
 from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run
+from torchrl_hmcts.trainers.saving.worker_file import find_worker, load_networks, save_worker
 
 
 def finish(out: Path, metrics: dict[str, Any], **captions: str) -> str:
@@ -184,7 +183,7 @@ class TestEvaluations:
     ) -> None:
         finish(tmp_path, {"solved": 1})
         monkeypatch.setattr(
-            "torchrl_hmcts.trainers.experiments.evaluations.evaluate_demo",
+            "torchrl_hmcts.trainers.experiments.skills.evaluate_skills",
             lambda config: {"test": {"frames": float("nan"), "solved": np.int64(3)}},
         )
         capsys.readouterr()
@@ -199,7 +198,7 @@ class TestEvaluations:
         self, tmp_path: Path, monkeypatch: Any, capsys: Any
     ) -> None:
         monkeypatch.setattr(
-            "torchrl_hmcts.trainers.experiments.evaluations.evaluate_demo", lambda config: {}
+            "torchrl_hmcts.trainers.experiments.skills.evaluate_skills", lambda config: {}
         )
         with open_run(DemoConfig(out=str(tmp_path))):
             assert main(["evaluate", f"run={tmp_path}"]) == 0

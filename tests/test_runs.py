@@ -21,15 +21,18 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.waterworld.config import WaterworldGoalsConfig
-from torchrl_hmcts.trainers.runs.config import DemoConfig, RunConfig, home, parse_overrides
+from torchrl_hmcts.trainers.experiments.settings import (
+    DemoConfig,
+    LabMazeConfig,
+    WaterworldGoalsConfig,
+)
+from torchrl_hmcts.trainers.runs.config import RunConfig, home, parse_overrides
 from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 CONFIGS = (DemoConfig, LabMazeConfig, WaterworldGoalsConfig, AtariConfig)
-DEMO = "torchrl_hmcts.trainers.experiments.demo.run_demo"
+DEMO = "torchrl_hmcts.trainers.experiments.skills.run_skills"
 
 
 @pytest.fixture(autouse=True)
@@ -351,7 +354,7 @@ def other_process(opened: str, until: str) -> Any:
     """A process that opens a run and is killed at the end of the context."""
     code = (
         "import time\n"
-        "from torchrl_hmcts.trainers.runs.config import DemoConfig\n"
+        "from torchrl_hmcts.trainers.experiments.settings import DemoConfig\n"
         "from torchrl_hmcts.trainers.runs.run import open_run\n"
         f"with {opened}: time.sleep(100)"
     )

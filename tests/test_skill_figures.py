@@ -13,7 +13,7 @@ from torchrl_hmcts.envs import maze_from_text
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_option_env
 from torchrl_hmcts.trainers.figures.curves import Panel, common_steps, plot_training
 
 PUSH = TensorDictModule(lambda skill: skill, ["skill"], ["action"])  # skill z: thrust z

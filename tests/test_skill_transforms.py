@@ -281,7 +281,7 @@ def test_bad_arguments_are_refused_with_their_value() -> None:
         SkillTransform(0)
     with pytest.raises(ValueError, match="max_skill_steps >= 1; got 0"):
         SkillTransform(2, 0)
-    with pytest.raises(ValueError, match=r"shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"shape \(2,\)"):
         SkillTransform(2, prior=[0.2, 0.3, 0.5])
     with pytest.raises(ValueError, match="none negative"):
         SkillTransform(2, prior=[-1.0, 1.0])

@@ -13,7 +13,6 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.planners import (
-    PUCT,
     UCT,
     MCTSPlanner,
     MostVisited,
@@ -205,33 +204,6 @@ def test_descents_go_to_outcomes_in_proportion_to_their_samples() -> None:
     assert len(below) == 2
     share = below["visits"] / below["visits"].sum()
     np.testing.assert_allclose(share, below["samples"] / 20, atol=0.02)
-
-
-@pytest.mark.parametrize("policy", [UCT(), PUCT(), uct_in_python])
-def test_a_stochastic_bandit_is_judged_without_bias(policy: Any) -> None:
-    # alpha = 1: a new draw at every visit. Means 1/2 and 0, standard deviations 1/2 and sqrt(3);
-    # UCT samples adaptively, so compare with two standard errors or so of 40 searches.
-    env = DiceEnv(BANDIT, BANDIT_ENDS, seed=1)
-    planner = planner_in(
-        env, 200, chance=ProgressiveWidening(k=1, alpha=1), expand="one", tree_policy=policy
-    )
-    td = env.reset(TensorDict({"state": torch.zeros(40, dtype=torch.int64)}, [40]), set_state=True)
-    search = planner.search(td)
-    edges = search.tree.edges[:, 0]
-    assert (edges["samples"] == edges["visits"]).all()
-    assert (search.roots["revisits"] == 0).all()
-    n = edges["samples"].astype(float)
-    mean = (edges["value"] * n).sum(0) / n.sum(0)
-    errors = np.array([0.5, math.sqrt(3.0)]) / np.sqrt(n.sum(0))
-    assert abs(mean[0] - 0.5) < 3 * errors[0]
-    assert abs(mean[1]) < 3 * errors[1]
-    for b in range(40):
-        check_tree(search, ProgressiveWidening(k=1, alpha=1), b)
-    # Without chance the first draw is all the search ever sees.
-    once = MCTSPlanner(
-        env, tree_policy=policy, budget=SearchBudget(simulations=50, until_plan=False)
-    ).search(env.reset())
-    assert once.tree.edges[0, 0]["samples"].tolist() == [1, 1]
 
 
 def test_terminal_outcomes_are_drawn_again_and_revisited() -> None:

@@ -171,7 +171,7 @@ def test_a_stopped_run_is_recorded_and_says_how_to_continue(
     tmp_path, monkeypatch, capsys, signum: int, status: int
 ) -> None:
     monkeypatch.setattr(
-        "torchrl_hmcts.trainers.experiments.demo.run_demo", lambda config: send(signum)
+        "torchrl_hmcts.trainers.experiments.skills.run_skills", lambda config: send(signum)
     )
     assert main(["demo", f"out={tmp_path}/run"]) == status
     assert read_run(tmp_path / "run").status == "stopped"
@@ -184,7 +184,7 @@ def test_a_process_that_the_same_signal_ended_makes_no_failed_run(tmp_path, monk
             send()
             raise RuntimeError("a process was killed by SIGINT")
 
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.demo.run_demo", killed)
+    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.skills.run_skills", killed)
     assert main(["demo", f"out={tmp_path}/run"]) == 130
     assert read_run(tmp_path / "run").status == "stopped"
 

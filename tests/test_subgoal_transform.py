@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, RewardSum, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, RewardSum, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.planners import GoalPlanner, MCTSPlanner
@@ -541,13 +541,3 @@ def test_missing_entries_are_named() -> None:
     td = env.reset().exclude("plan").set("action", torch.tensor(RIGHT))
     with pytest.raises(KeyError, match="Start from env.reset"):
         env.step(td)
-
-
-def test_it_is_not_for_replay_buffers() -> None:
-    with pytest.raises(RuntimeError, match="replay buffer"):
-        SubgoalTransform(Ahead())(TensorDict({}, []))
-
-
-def test_it_can_stand_among_other_transforms() -> None:
-    env = TransformedEnv(Plane((2,)), Compose(SubgoalTransform(Ahead()), RewardSum()))
-    check_env_specs(env)

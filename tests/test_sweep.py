@@ -13,12 +13,13 @@ from sqlalchemy.pool import NullPool
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, Experiment
-from torchrl_hmcts.trainers.runs.config import DemoConfig, RunConfig
-from torchrl_hmcts.trainers.runs.sweep_space import Choice, Range, parse_space
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.runs.config import RunConfig
 from torchrl_hmcts.trainers.saving.locking import folder_locked
 from torchrl_hmcts.trainers.saving.run_folder import start_record
 
 optuna = pytest.importorskip("optuna")
+sweeps = pytest.importorskip("torchrl_hmcts.trainers.runs.sweep")
 
 
 @dataclass
@@ -87,32 +88,30 @@ def test_what_varies_is_typed_as_lists_and_ranges() -> None:
         "novelty_radius=0.1..10:log",
         "out=x",
     ]
-    space, fixed = parse_space(DemoConfig, words)
-    assert space == [
-        Choice("num_skills", (3, 4, 6)),
-        Range("gamma", 0.9, 0.99, integer=False),
-        Range("option_steps", 10, 50, integer=True, step=20),
-        Range("novelty_radius", 0.1, 10.0, integer=False, log=True),
-    ]
+    space, fixed = sweeps.parse_space(DemoConfig, words)
+    assert space == {
+        "num_skills": optuna.distributions.CategoricalDistribution((3, 4, 6)),
+        "gamma": optuna.distributions.FloatDistribution(0.9, 0.99),
+        "option_steps": optuna.distributions.IntDistribution(10, 50, step=20),
+        "novelty_radius": optuna.distributions.FloatDistribution(0.1, 10.0, log=True),
+    }
     assert fixed == ["out=x"]
 
 
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("gama=1..2", "Did you mean: gamma"),
         ("gamma=[0.9]", "leaves nothing to choose"),
         ("gamma=[0.9,high]", "high"),
         ("gamma=2..1", "empty range"),
         ("gamma=0..1:log", "lower end above 0"),
         ("mazes=1..2.5", "no range of whole numbers"),
         ("mazes=1..9:20", "steps of 20"),
-        ("mazes", "no key=value"),
     ],
 )
 def test_what_makes_no_sense_is_refused(word: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        parse_space(DemoConfig, [word])
+        sweeps.parse_space(DemoConfig, [word])
 
 
 def test_a_sweep_finds_the_best_and_each_trial_is_a_run(tmp_path, capsys) -> None:
@@ -313,13 +312,16 @@ def test_any_storage_of_optunas_will_do(tmp_path) -> None:
     ("words", "message"),
     [
         (["trials=2"], "nothing varies"),
-        (["x=[1,2]", "trials=none"], "whole number above 0; got 'none'"),
+        (["x=[1,2]", "trials=none"], "whole number; got 'none'"),
         (["x=[1,2]", "trials=1", "objective=test.w"], "no figure 'test.w'. It has: test.cost"),
+        (["x=[1,2]", "trails=3"], "Unknown key 'trails'. Did you mean: trials"),
         (["y=[1,2]"], "Unknown key 'y'"),
+        (["x"], "no key=value"),
         (["seed=-3..3"], "seed must be 0 to 4294967295; got -3"),
         (["seed=[0,-1]"], "seed must be 0 to 4294967295; got -1"),
         (["seed=0..1e20"], "seed must be 0 to 4294967295; got 1"),
         (["x=0..inf"], "two finite ends"),
+        (["x=[1,2]", "trials=0"], "whole number above 0; got '0'"),
         (["x=[1,2]", "trials=1.5"], "whole number; got '1.5'"),
         (["x=[1,2]", "storage=trials.db"], "storage=trials.db cannot be opened"),
         (["x=[1,2]", "storage=sqlite:////nowhere/trials.db"], "cannot be opened"),

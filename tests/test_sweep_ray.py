@@ -14,7 +14,7 @@ from torchrl.collectors import Collector
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
 
 
 class Elsewhere:
@@ -76,10 +76,12 @@ def test_a_worker_is_trained_with_a_local_ray_cluster(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["config"]["collector"] == "ray"
     # The worker has learned something from what came back.
-    from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-    from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
+    from torchrl_hmcts.trainers.experiments.kits.lab import LabMazeKit
+    from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+    from torchrl_hmcts.trainers.experiments.skills import make_loss
+    from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
-    before, after = (make_worker_loss(4, seed=0) for _ in range(2))
+    before, after = (make_loss(LabMazeKit(LabMazeConfig())) for _ in range(2))
     load_networks(after, tmp_path / "run")
     pairs = zip(before.parameters(), after.parameters(), strict=True)
     assert any(not torch.equal(a, b) for a, b in pairs)

@@ -15,7 +15,6 @@ from torchrl.envs import RewardScaling, TransformedEnv
 from torchrl_hmcts.planners import (
     PUCT,
     UCT,
-    Gumbel,
     MCTSPlanner,
     NodeStatistics,
     ProgressiveWidening,
@@ -294,24 +293,6 @@ def test_transforms_of_a_simulator_that_works_beside_are_not_passed_by() -> None
     env = TransformedEnv(Beside({(0, 0): (1, 1.0, 1)}, terminal=[1]), RewardScaling(0.0, 3.0))
     planner = planner_of(env, 4, expand="one", waves_in_flight=2)
     assert planner(env.reset())["root_value"].item() == pytest.approx(3.0 / 2)
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"waves_in_flight": 0}, "waves_in_flight >= 1"),
-        ({"waves_in_flight": 64, "leaves_per_wave": 4}, "<= 255; got waves_in_flight=64"),
-        (
-            {"waves_in_flight": 2, "expand": "one", "tree_policy": Gumbel()},
-            "Gumbel halves a known number.*waves_in_flight=2",
-        ),
-    ],
-)
-def test_numbers_of_waves_that_make_no_search_are_refused(
-    keywords: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        planner_of(TableEnv(MAZE), **keywords)
 
 
 @pytest.mark.parametrize("policy", [UCT(1.0), PUCT(c=1.0, normalize="tree")])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite
@@ -101,14 +101,13 @@ def complete_done(env: EnvBase, after: TensorDictBase, spec: Composite | None = 
     if all(after.get(key, None) is not None for key in env.done_keys):
         return
     spec = env.full_done_spec_unbatched if spec is None else spec
-    for key, leaf in spec.items(True, True):
-        if after.get(key, None) is not None:
-            continue
+    missing = [key for key in spec.keys(True, True) if after.get(key, None) is None]
+    for key in missing:
         *group, last = parts(key)
-        other = {"done": "terminated", "terminated": "done"}.get(last)
-        value = after.get((*group, other), None) if other else None
+        other = (*group, {"done": "terminated", "terminated": "done"}.get(last, last))
+        value = None if unravel_key(other) in missing else after.get(other)
         if value is None:
-            value = leaf.zero(after.batch_size)
+            value = spec[key].zero(after.batch_size)
         elif last == "done" and (cut := after.get((*group, "truncated"), None)) is not None:
             value = value | cut
         after.set(key, value)

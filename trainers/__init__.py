@@ -1,8 +1,13 @@
 """Trainers, experiments and the command line."""
 
+# ruff: noqa: F401  the imports below are the list of public names
+
 from __future__ import annotations
 
+import ast
 import importlib
+import inspect
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,7 +23,8 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.atari.options import Options
     from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
     from torchrl_hmcts.trainers.experiments.atari.sources import TrainedSource
-    from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import (
+    from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+    from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
         GoalEpisodes,
         GoalTrack,
         run_goal_episodes,
@@ -28,17 +34,12 @@ if TYPE_CHECKING:
         make_goal_env,
         make_tile_planner,
     )
-    from torchrl_hmcts.trainers.experiments.waterworld.networks import (
-        MazeNetwork,
-        shortest_distances,
-    )
     from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
     from torchrl_hmcts.trainers.expert_iteration import (
         ExpertIterationTrainer,
         make_guided_planner,
     )
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-    from torchrl_hmcts.trainers.runs.config import DemoConfig
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
     from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
@@ -51,93 +52,25 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
     from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
 
-__all__ = [
-    "A3CTrainer",
-    "AtariAgent",
-    "AtariKit",
-    "AtariSearch",
-    "CollectorError",
-    "Controllability",
-    "DIAYNTrainer",
-    "DemoConfig",
-    "DurableRotation",
-    "ExpertIterationTrainer",
-    "GeneratorStates",
-    "GoalEpisodes",
-    "OptionGoals",
-    "SearchGuide",
-    "FolderInUse",
-    "GoalTrack",
-    "GrowSkills",
-    "HMCTSTrainer",
-    "LearnerError",
-    "MazeNetwork",
-    "Options",
-    "ResumableTrainer",
-    "RunningEpisodes",
-    "RuleSource",
-    "ScriptedExpert",
-    "SearchCoverage",
-    "SharedRMSprop",
-    "SkillRewardHook",
-    "StateCoverage",
-    "TilePlanner",
-    "TrainedSource",
-    "make_goal_env",
-    "make_guided_planner",
-    "make_skill_optimizer",
-    "make_tile_planner",
-    "plain_checkpoint",
-    "probe_controllability",
-    "run_goal_episodes",
-    "shortest_distances",
-]
+
+def _places() -> dict[str, str]:
+    """The module of each public name, read from the imports above."""
+    tree = ast.parse(inspect.getsource(sys.modules[__name__]))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    return {
+        alias.name: str(line.module)
+        for line in block.body
+        if isinstance(line, ast.ImportFrom)
+        for alias in line.names
+    }
+
 
 # Imported when asked for: the command line answers --help without loading torch.
-_MODULES = {
-    "A3CTrainer": "a3c.trainer",
-    "AtariAgent": "experiments.atari.agent",
-    "AtariKit": "experiments.atari.kit",
-    "AtariSearch": "experiments.atari.agent",
-    "CollectorError": "collectors",
-    "Controllability": "skills.controllability",
-    "DIAYNTrainer": "diayn",
-    "DemoConfig": "runs.config",
-    "DurableRotation": "saving.checkpoints",
-    "ExpertIterationTrainer": "expert_iteration",
-    "GeneratorStates": "saving.run_state",
-    "GoalEpisodes": "experiments.waterworld.goal_episodes",
-    "OptionGoals": "experiments.atari.fine_tuning",
-    "SearchGuide": "experiments.atari.guide",
-    "GoalTrack": "experiments.waterworld.goal_episodes",
-    "GrowSkills": "skills.growing",
-    "HMCTSTrainer": "hmcts",
-    "FolderInUse": "saving.locking",
-    "LearnerError": "a3c.learner_processes",
-    "MazeNetwork": "experiments.waterworld.networks",
-    "Options": "experiments.atari.options",
-    "ResumableTrainer": "saving.resume",
-    "RuleSource": "experiments.atari.rules",
-    "RunningEpisodes": "saving.run_state",
-    "ScriptedExpert": "experiments.waterworld.scripted_expert",
-    "SearchCoverage": "skills.growing",
-    "SharedRMSprop": "a3c.shared_optimizers",
-    "SkillRewardHook": "skills.reward_hook",
-    "StateCoverage": "skills.coverage",
-    "TilePlanner": "experiments.waterworld.goal_planning",
-    "TrainedSource": "experiments.atari.sources",
-    "make_goal_env": "experiments.waterworld.goal_planning",
-    "make_guided_planner": "expert_iteration",
-    "make_skill_optimizer": "diayn",
-    "make_tile_planner": "experiments.waterworld.goal_planning",
-    "plain_checkpoint": "saving.checkpoints",
-    "probe_controllability": "skills.controllability",
-    "run_goal_episodes": "experiments.waterworld.goal_episodes",
-    "shortest_distances": "experiments.waterworld.networks",
-}
+_PLACES = _places()
+__all__ = sorted(_PLACES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return getattr(importlib.import_module(_PLACES[name]), name)

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from torchrl_hmcts.trainers.command_line.listing import summaries
+from torchrl_hmcts.trainers.command_line.running import Failure
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVEL_HELP
 from torchrl_hmcts.trainers.experiments.registry import DEMO
 
@@ -25,12 +26,16 @@ keys and defaults:
   {LOG_LEVEL_HELP}"""
 
 _TRAIN = f"""\
-Train and test one experiment.
+Train and test one experiment, or the agent over a kit of your choice with parts of your choice.
 
     hmcts train experiment=labmaze seed=1 out=runs/labmaze_1
     hmcts train resume=runs/labmaze_1                      continues it, with the saved config
     hmcts train experiment=labmaze seed=1 out=runs/labmaze_1 resume=true train_frames=80000
                                                            continues it for longer
+    hmcts train kit=labmaze objective=metra planner/tree_policy=puct planner.novelty.radius=0.5
+                                                           with other parts, by their names
+    hmcts train -m kit=waterworld seed=0,1,2 objective=diayn,lsd
+                                                           every combination, a run each
 
 A folder that holds a run is refused, unless resume= or overwrite=true is given. Without out= the
 run goes to runs/NAME, or the next of runs/NAME_2, ... that holds none.
@@ -50,7 +55,7 @@ Test the newest checkpoint of a run again, finished or stopped, with other start
     hmcts evaluate run=runs/labmaze_1 seed=7 size=15 mazes=40
 
 needs   the run's folder, with run.json (or metrics.json) and checkpoints/
-writes  evaluation.json into that folder, one entry per choice of keys, and its page anew
+writes  evaluation.json into that folder, one entry per choice of keys, and its page again
 
 Keys are those of the run's experiment (hmcts list NAME); those not given are as in the run.
   {LOG_LEVEL_HELP}"""
@@ -100,7 +105,7 @@ _LIST = "List the experiments; the keys of one with their defaults and meaning; 
 
 _VERBS = {
     "demo": ("learn four skills and solve random mazes (about a minute)", _DEMO, "train:demo"),
-    "train": ("run an experiment, or go on with one", _TRAIN, "train:train"),
+    "train": ("run an experiment, or continue one", _TRAIN, "train:train"),
     "evaluate": ("test a run again with other settings", _EVALUATE, "evaluate:evaluate"),
     "report": ("write the page of runs, or draw a figure", _REPORT, "report:report"),
     "sweep": ("search for good values of an experiment's keys", _SWEEP, "sweep:sweep"),
@@ -131,8 +136,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         importlib.import_module(f"torchrl_hmcts.trainers.command_line.{module}"), name
     )
     try:
-        status = run(arguments.words)
+        status = run([*["-m"] * getattr(arguments, "many", False), *arguments.words])
         sys.stdout.flush()
+    except Failure as error:
+        print(error, file=sys.stderr)
+        return error.status
     except KeyboardInterrupt:  # in what is no run, e.g. `hmcts report`
         print(f"\nhmcts {arguments.verb}: stopped.", file=sys.stderr)
         return 130
@@ -158,6 +166,9 @@ def _parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         made.add_argument("words", nargs="*", metavar=_WORDS.get(verb, "key=value"))
+        if verb == "train":
+            words = "run every combination of values with commas"
+            made.add_argument("-m", action="store_true", dest="many", help=words)
     return parser
 
 

@@ -1,7 +1,7 @@
 """Configs of every swappable class, in Hydra's store beside TorchRL's own groups.
 
 A config is made from the signature of its class: the same keywords, the same defaults. The meaning
-of a keyword stands in the docstring of the class, from which :func:`to_yaml` takes it.
+of a keyword stands in the docstring of the class, and nowhere else.
 
 Parts of a planner and of a loss go to their places by themselves: after ``planner=mcts``,
 ``tree_policy=puct`` is ``planner.tree_policy``; after ``loss=discrete_skill_sac``,
@@ -21,136 +21,96 @@ Example:
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import importlib
 import inspect
 import re
-import textwrap
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
 import torchrl.trainers.algorithms.configs  # noqa: F401  fills the store with TorchRL's own
+from hydra import compose, initialize
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import MISSING, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from torchrl.trainers.algorithms.configs.common import ConfigBase
 from torchrl.trainers.algorithms.configs.envs import EnvConfig
 from torchrl.trainers.algorithms.configs.objectives import LossConfig
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS
+from torchrl_hmcts.trainers.parts import constructors, keywords_of, named
+from torchrl_hmcts.trainers.runs.config import unknown_key
 
-_TARGET = "torchrl_hmcts.trainers.configs.build"
+_TARGET = "torchrl_hmcts.trainers.parts.build"
+_INTERNAL = ("_target_", "_partial_")
 _PLAIN = (bool, int, float, str)  # types that Hydra checks; any other may be a config or a list
 
-_PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
+# Classes by group. Where no name is given, it is that of the class in snake case, less the group.
+_PACKAGES: Mapping[str, Mapping[str, str]] = {
     "torchrl_hmcts.objectives": {
-        "loss": {
-            "a3c": "A3CLoss",
-            "diayn": "DIAYNLoss",
-            "discrete_skill_sac": "DiscreteSkillSACLoss",
-            "expert_iteration": "ExpertIterationLoss",
-            "intra_option_q": "IntraOptionQLoss",
-            "option_model": "OptionModelLoss",
-            "option_termination": "OptionTerminationLoss",
-            "skill_prior": "SkillPriorLoss",
-            "skill_sac": "SkillSACLoss",
-        },
-        "objective": {
-            "dads": "SkillDynamicsLoss",
-            "diayn": "SkillDiscriminatorLoss",
-            "lsd": "LSDEncoderLoss",
-            "metra": "METRAEncoderLoss",
-        },
+        "loss": "A3CLoss DIAYNLoss DiscreteSkillSACLoss ExpertIterationLoss "
+        "IntraOptionQLoss OptionModelLoss OptionTerminationLoss SkillPriorLoss SkillSACLoss",
+        "objective": "dads=SkillDynamicsLoss diayn=SkillDiscriminatorLoss lsd=LSDEncoderLoss "
+        "metra=METRAEncoderLoss",
     },
     "torchrl_hmcts.transforms": {
-        "transform": {
-            "displacement": "DisplacementTransform",
-            "option": "OptionTransform",
-            "option_recorder": "OptionRecorder",
-            "skill": "SkillTransform",
-            "skill_mask": "SkillMaskTransform",
-            "skill_reward": "SkillReward",
-            "stall": "StallTransform",
-            "subgoal": "SubgoalTransform",
-        },
+        "transform": "DisplacementTransform OptionTransform "
+        "OptionRecorder SkillTransform SkillMaskTransform skill_reward=SkillReward StallTransform "
+        "SubgoalTransform",
     },
     "torchrl_hmcts.planners": {
-        "planner": {"mcts": "MCTSPlanner"},
-        "tree_policy": {
-            "gumbel": "Gumbel",
-            "puct": "PUCT",
-            "torchrl_score": "TorchRLScore",
-            "uct": "UCT",
-        },
-        "novelty": {"radius": "RadiusNovelty", "width": "WidthNovelty"},
-        "final_choice": {
-            "best_plan": "BestPlan",
-            "highest_value": "HighestValue",
-            "most_visited": "MostVisited",
-            "sampled_visits": "SampledVisits",
-        },
-        "budget": {"search": "SearchBudget"},
-        "root_noise": {"dirichlet": "DirichletNoise"},
-        "chance": {"progressive_widening": "ProgressiveWidening"},
-        "transpositions": {"by_key": "Transpositions"},
-        "leaf_evaluator": {
-            "mixed": "MixedEvaluator",
-            "policy_value": "PolicyValueEvaluator",
-            "rollout": "RolloutEvaluator",
-            "value": "ValueEvaluator",
-        },
-        "rollout": {"tree": "TreeRollout"},
-        "option_prior": {"module": "ModulePrior"},
-        "control": {
-            "goals": "GoalPlanner",
-            "hierarchical": "HierarchicalPolicy",
-        },
+        "planner": "mcts=MCTSPlanner",
+        "tree_policy": "Gumbel PUCT torchrl_score=TorchRLScore UCT",
+        "novelty": "radius=RadiusNovelty width=WidthNovelty",
+        "final_choice": "BestPlan HighestValue MostVisited SampledVisits",
+        "budget": "search=SearchBudget",
+        "root_noise": "dirichlet=DirichletNoise",
+        "chance": "ProgressiveWidening",
+        "transpositions": "by_key=Transpositions",
+        "leaf_evaluator": "mixed=MixedEvaluator policy_value=PolicyValueEvaluator "
+        "rollout=RolloutEvaluator value=ValueEvaluator",
+        "rollout": "tree=TreeRollout",
+        "option_prior": "module=ModulePrior",
+        "control": "goals=GoalPlanner hierarchical=HierarchicalPolicy",
     },
     "torchrl_hmcts.modules": {
-        "model": {
-            "skill_action_critic": "SkillActionCritic",
-            "skill_actor": "SkillActor",
-            "skill_critic": "SkillCritic",
-            "skill_discriminator": "SkillDiscriminator",
-            "skill_dynamics": "SkillDynamics",
-            "skill_encoder": "SkillEncoder",
-            "skill_policy": "SkillPolicy",
-            "termination_network": "TerminationNetwork",
-        },
-        "skill_prior": {
-            "fixed": "FixedSkillPrior",
-            "growing": "GrowingSkillPrior",
-            "learned": "LearnedSkillPrior",
-        },
-        "termination": {"learned": "LearnedTermination", "stall": "StallTermination"},
+        "model": "SkillActionCritic SkillActor SkillCritic SkillDiscriminator "
+        "SkillDynamics SkillEncoder SkillPolicy TerminationNetwork",
+        "skill_prior": "fixed=FixedSkillPrior growing=GrowingSkillPrior learned=LearnedSkillPrior",
+        "termination": "learned=LearnedTermination stall=StallTermination",
     },
     "torchrl_hmcts.envs": {
-        "env": {
-            "atari_ram": "AtariRAMEnv",
-            "gridworld": "GridworldMazeEnv",
-            "labmaze": "LabMazeEnv",
-            "settable_gym": "SettableGymEnv",
-            "stateless": "StatelessSimulator",
-            "waterworld": "WaterworldMazeEnv",
-        },
+        "env": "atari_ram=AtariRAMEnv gridworld=GridworldMazeEnv labmaze=LabMazeEnv "
+        "settable_gym=SettableGymEnv stateless=StatelessSimulator waterworld=WaterworldMazeEnv",
     },
     "torchrl_hmcts.trainers": {
-        "trainer": {"a3c": "A3CTrainer", "diayn": "DIAYNTrainer", "hmcts": "HMCTSTrainer"},
-        "hook": {"skill_reward": "SkillRewardHook"},
+        "trainer": "a3c=A3CTrainer diayn=DIAYNTrainer hmcts=HMCTSTrainer",
+        "hook": "skill_reward=SkillRewardHook",
     },
-    "torchrl.data": {
-        "action_spec": {
-            "bounded": "Bounded",
-            "categorical": "Categorical",
-            "one_hot": "OneHot",
-        },
-    },
+    "torchrl.data": {"action_spec": "Bounded Categorical OneHot"},
 }
+
+
+def _names(classes: str, group: str) -> dict[str, str]:
+    """Classes by their names in a group."""
+    found = {}
+    for word in classes.split():
+        name, _, component = word.rpartition("=")
+        short = re.sub(f"{group}$", "", component, flags=re.IGNORECASE)
+        found[name or re.sub("(?<=[a-z])(?=[A-Z])", "_", short).lower()] = component
+    return found
+
+
 COMPONENTS: Mapping[str, Mapping[str, str]] = {
-    group: {name: f"{package}.{component}" for name, component in names.items()}
+    group: {name: f"{package}.{component}" for name, component in _names(names, group).items()}
     for package, groups in _PACKAGES.items()
     for group, names in groups.items()
 }
@@ -203,106 +163,13 @@ def config_of(component: type, base: type = ComponentConfig) -> Any:
     hints = _hints(component)
     fields: list[Any] = [
         (name, hints.get(name, Any), _as_field(parameter.default))
-        for name, parameter in _keywords(component).items()
+        for name, parameter in keywords_of(component).items()
     ]
     fields += [("_component_", str, path), ("_target_", str, _TARGET)]
     made = dataclasses.make_dataclass(f"{component.__name__}Config", fields, bases=(base,))
     made.__module__ = __name__
     made.__doc__ = f"Keys of :class:`~{path}`."
     return made
-
-
-def build(_component_: str, **keywords: Any) -> Any:
-    """Build a component from the entries of its config.
-
-    Lists become tuples where the keyword is a (nested) key. Names become what they name where the
-    default is a class or function, e.g. ``activation="torch.nn.Tanh"``. A loss that calls its
-    critic ``qvalue_network`` also takes it as ``critic_network``, as TorchRL's trainer configs
-    pass it.
-
-    Args:
-        _component_: path of its class, e.g. ``"torchrl_hmcts.planners.UCT"``.
-        **keywords: of the class.
-
-    Returns:
-        The component.
-
-    Example:
-        >>> build("torchrl_hmcts.planners.UCT", c=0.5)
-        UCT(c=0.5)
-    """
-    component = named(_component_)
-    parameters = _keywords(component)
-    if "critic_network" not in parameters and "qvalue_network" in parameters:
-        critic = keywords.pop("critic_network", None)
-        if critic is not None:
-            keywords["qvalue_network"] = critic
-    return component(
-        **{name: _typed(value, parameters.get(name)) for name, value in keywords.items()}
-    )
-
-
-def named(path: str) -> Any:
-    """Return what a dotted path names.
-
-    Args:
-        path: e.g. ``"torch.nn.ReLU"``.
-
-    Example:
-        >>> named("torch.nn.ReLU").__name__
-        'ReLU'
-    """
-    module, _, name = path.rpartition(".")
-    return getattr(importlib.import_module(module), name)
-
-
-def to_yaml(component: type) -> str:
-    """Write the config of a class as yaml: every key with its default, its meaning above it.
-
-    Args:
-        component: class with a config.
-
-    Example:
-        >>> from torchrl_hmcts.planners import UCT
-        >>> print(to_yaml(UCT))
-        # exploration constant, in units of the return. Default ``1.0``.
-        c: 1.0
-        _target_: torchrl_hmcts.trainers.configs.build
-        _component_: torchrl_hmcts.planners.UCT
-        <BLANKLINE>
-    """
-    meanings = argument_docs(component)
-    parts = []
-    fields = [f for f in dataclasses.fields(config_of(component)) if f.name != "_partial_"]
-    for field in sorted(fields, key=lambda f: f.name.startswith("_")):
-        if field.name in meanings:
-            parts.append(textwrap.indent(textwrap.fill(meanings[field.name], 96), "# "))
-        factory = field.default_factory
-        value = field.default if factory is dataclasses.MISSING else factory()
-        parts.append(OmegaConf.to_yaml({field.name: value}).rstrip())
-    return "\n".join(parts) + "\n"
-
-
-def argument_docs(component: type) -> dict[str, str]:
-    """Return the meaning of each argument from the docstrings of a class and those it extends.
-
-    Args:
-        component: class whose docstring has a section ``Args:``.
-
-    Example:
-        >>> from torchrl_hmcts.planners import UCT
-        >>> argument_docs(UCT)
-        {'c': 'exploration constant, in units of the return. Default ``1.0``.'}
-    """
-    docs: dict[str, str] = {}
-    entry = r"^(\w+(?:, \w+)*)(?: \([^\n]*?\))?: (.*?)(?=^\w|\Z)"
-    for cls in reversed(component.__mro__):
-        text = inspect.cleandoc(vars(cls).get("__doc__") or "")
-        section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
-        body = textwrap.dedent(section[1]) if section else ""
-        for names, meaning in re.findall(entry, body, re.MULTILINE | re.DOTALL):
-            docs.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
-    return docs
 
 
 def register_configs() -> None:
@@ -339,37 +206,10 @@ def _public_path(component: type) -> str:
     return f"{component.__module__}.{component.__qualname__}"
 
 
-_VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-
-
-def _constructors(component: type) -> Iterator[Any]:
-    """The constructor of a class, and where it takes ``**keywords`` those that it hands them to."""
-    for cls in component.__mro__:
-        init = vars(cls).get("__init__")
-        if init is None:
-            continue
-        if cls is not component and not cls.__module__.startswith("torchrl_hmcts"):
-            return
-        yield init
-        kinds = [parameter.kind for parameter in inspect.signature(init).parameters.values()]
-        if inspect.Parameter.VAR_KEYWORD not in kinds:
-            return
-
-
-def _keywords(component: type) -> dict[str, inspect.Parameter]:
-    """The parameters of a constructor that have a name of their own."""
-    found: dict[str, inspect.Parameter] = {}
-    for init in _constructors(component):
-        for name, parameter in inspect.signature(init).parameters.items():
-            if name != "self" and parameter.kind not in _VARIABLE:
-                found.setdefault(name, parameter)
-    return found
-
-
 def _hints(component: type) -> dict[str, Any]:
     """The annotations that Hydra can check: plain types and None; others are left to the class."""
     checked = {}
-    for init in _constructors(component):
+    for init in constructors(component):
         try:
             hints = typing.get_type_hints(init)
         except NameError:  # a name that only type checkers import
@@ -404,24 +244,139 @@ def _as_plain(value: Any) -> Any:
     return value
 
 
-def _typed(value: Any, parameter: inspect.Parameter | None) -> Any:
-    """A value of a config as the parameter takes it."""
-    if isinstance(value, DictConfig | ListConfig):
-        value = OmegaConf.to_container(value, resolve=True)
-    if parameter is None:
-        return value
-    default = parameter.default
-    is_name = default is not inspect.Parameter.empty and (
-        callable(default) or isinstance(default, torch.dtype)
+def compose_parts(
+    own: Mapping[str, Mapping[str, Any]], words: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Compose components with Hydra; return them with all their keywords.
+
+    Args:
+        own: entries of the components at their defaults, by part, e.g. ``"planner"``.
+        words: ``PART=NAME`` and ``PART/GROUP=NAME`` choose a class, ``PART.KEY=VALUE`` a keyword.
+
+    Returns:
+        The components by part.
+
+    Raises:
+        ValueError: if there is no such part, name or keyword (the nearest are named), a value is
+            not of its type, or a keyword without a default is missing.
+
+    Example:
+        >>> own = {"planner": {"_component_": "torchrl_hmcts.planners.MCTSPlanner"}}
+        >>> words = ["planner/tree_policy=puct", "planner.tree_policy.c=2.5"]
+        >>> compose_parts(own, words)["planner"]["tree_policy"]["c"]
+        2.5
+    """
+    config = {part: full(node) for part, node in own.items()}
+    known = [*_flat(config), *_choices(config)]
+    overrides = []
+    for word in words:
+        key, separator, name = word.partition("=")
+        place, group = key.replace("/", "."), key.rpartition("/")[2]
+        if not separator:
+            raise ValueError(f"{word!r} is no key=value, e.g. planner/tree_policy=puct.")
+        if "/" not in key and key not in config:
+            overrides.append(word)
+            continue
+        parent, _, last = place.rpartition(".")
+        where: Any = {"": config}.get(parent) or _at(config, parent)
+        if group not in COMPONENTS or not isinstance(where, dict) or last not in where:
+            raise ValueError(unknown_key(key, _choices(config)))
+        if name not in COMPONENTS[group]:
+            near = difflib.get_close_matches(name, COMPONENTS[group], cutoff=0.4)
+            names = ", ".join(near or COMPONENTS[group])
+            raise ValueError(f"Unknown {group} {name!r}. Did you mean: {names}?")
+        before, path = where[last] or {}, COMPONENTS[group][name]
+        if before.get("_component_") != path:  # the same class keeps its keywords
+            needed = [n for n, p in keywords_of(named(path)).items() if p.default is p.empty]
+            where[last] = {n: before[n] for n in needed if n in before}
+            known += [f"{place}.{keyword}" for keyword in keywords_of(named(path))]
+            overrides.append(f"+{group}@{place}={name}")
+    store = ConfigStore.instance()
+    store.store(name="hmcts", node={"defaults": ["_self_"], **config})
+    try:
+        composed = _compose(overrides)
+    except (HydraException, OmegaConfBaseException) as error:
+        for key in (word.partition("=")[0] for word in words):
+            if "/" not in key and key not in known:
+                raise ValueError(unknown_key(key, known)) from None
+        raise ValueError(" ".join(str(error).split()).partition(" full_key:")[0]) from None
+    found = {part: _clean(part, composed[part], top=True) for part in config}
+    return found
+
+
+def _compose(overrides: Sequence[str]) -> dict[str, Any]:
+    here = (
+        nullcontext() if GlobalHydra.instance().is_initialized() else initialize(version_base=None)
     )
-    kind = str(parameter.annotation)
-    if isinstance(value, list) and "NestedKey" in kind:
-        if "Sequence[NestedKey]" in kind:
-            return [tuple(key) if isinstance(key, list) else key for key in value]
-        return tuple(value)
-    if isinstance(value, str) and is_name:
-        return named(value)
-    return value
+    with here:
+        config = compose("hmcts", list(overrides))
+    found: Any = OmegaConf.to_container(config, resolve=True)
+    return found
+
+
+def full(node: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a component with the defaults of its class.
+
+    Args:
+        node: path of the class in ``"_component_"``, and keywords; nested ones too.
+
+    Example:
+        >>> full({"_component_": "torchrl_hmcts.planners.UCT"})
+        {'c': 1.0, '_component_': 'torchrl_hmcts.planners.UCT'}
+    """
+    defaults: Any = OmegaConf.to_container(
+        OmegaConf.structured(config_of(named(node["_component_"])))
+    )
+    entries = {k: v for k, v in defaults.items() if k not in _INTERNAL and v != MISSING}
+    for key, value in node.items():
+        entries[key] = (
+            full(value) if isinstance(value, Mapping) and "_component_" in value else value
+        )
+    return entries
+
+
+def _clean(place: str, node: dict[str, Any], top: bool = False) -> dict[str, Any]:
+    """The entries of a composed component, their types checked; nothing needed is missing."""
+    node = {k: v for k, v in node.items() if k not in _INTERNAL}
+    missing = [key for key, value in node.items() if value == MISSING]
+    if missing and not top:
+        raise ValueError(f"{place} needs {missing[0]}: give {place}.{missing[0]}=VALUE.")
+    node = {k: v for k, v in node.items() if v != MISSING}
+    plain = {k: v for k, v in node.items() if not isinstance(v, Mapping)}
+    try:
+        OmegaConf.merge(OmegaConf.structured(config_of(named(node["_component_"]))), plain)
+    except OmegaConfBaseException as error:
+        key = getattr(error, "key", None) or getattr(error, "full_key", "")
+        raise ValueError(f"{place}.{key}: {str(error).splitlines()[0]}.") from None
+    for key, value in node.items():
+        if isinstance(value, Mapping) and "_component_" in value:
+            node[key] = _clean(f"{place}.{key}", dict(value))
+    return node
+
+
+def _at(config: Mapping[str, Any], place: str) -> Any:
+    for name in place.split("."):
+        config = config.get(name) or {}
+    return config
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """The places of all values in nested dicts."""
+    found = []
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            found += _flat(value, f"{prefix}{key}.")
+        elif not key.startswith("_"):
+            found.append(prefix + key)
+    return found
+
+
+def _choices(config: Mapping[str, Any]) -> list[str]:
+    """The keys that choose a class."""
+    chosen = [part for part in config if part in COMPONENTS]
+    return chosen + [
+        f"{p}/{key}" for p, node in config.items() for key in node if key in COMPONENTS
+    ]
 
 
 register_configs()

@@ -308,7 +308,7 @@ def make_skill_optimizer(
 
     Examples:
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+        >>> from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
         >>> loss = DIAYNTrainer.make_loss(make_training_env(copies=1))
         >>> [(g["name"], g["lr"]) for g in make_skill_optimizer(loss).param_groups]
         [('actor', 0.002), ('critic', 0.003), ('objective', 0.01)]

@@ -67,9 +67,11 @@ def make_guided_planner(
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
         >>> from torchrl_hmcts.trainers.expert_iteration import make_guided_planner
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
         >>> env = WaterworldMazeEnv(observation=False)  # plans base steps, for example
-        >>> make_guided_planner(env, MazeNetwork(env.mazes)).num_options
+        >>> network = TensorDictModule(
+        ...     lambda velocity: (torch.zeros(*velocity.shape[:-1], 4), velocity[..., :1]),
+        ...     ["velocity"], ["logits", "state_value"])
+        >>> make_guided_planner(env, network).num_options
         4
     """
     guide = PolicyValueEvaluator(network, uniform_share=uniform_share)

@@ -118,7 +118,7 @@ class HMCTSTrainer(OffPolicyTrainer):
         >>> from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer
         >>> from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
+        >>> from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
         >>> loss = DIAYNTrainer.make_loss(make_training_env(), num_skills=4, seed=0)
         >>> trainer = HMCTSTrainer(
         ...     partial(WaterworldMazeEnv, observation=False), loss,

@@ -33,7 +33,7 @@ print("length of the plan:", td["plan_length"][0].item(), "tiles")
 import matplotlib.pyplot as plt
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.trainers import make_tile_planner
-from torchrl_hmcts.trainers.experiments.demo import make_starts
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
 
 tests = make_goal_env(maze_pool("test"), observation=False)
 mazes = tests.base_env
@@ -87,7 +87,7 @@ plt.show()
 
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.trainers import A3CTrainer
-from torchrl_hmcts.trainers.experiments.waterworld.agents import make_maze_networks
+from torchrl_hmcts.trainers.experiments.goals import make_maze_networks
 
 FRAMES = 60_000
 actor, critic = make_maze_networks(

@@ -93,8 +93,8 @@ class FixedSkillPrior(SkillPrior):
         p = _per_skill("FixedSkillPrior", "weights", weights, num_skills, default=1.0)
         if not ((p >= 0).all() and (p > 0).any()):
             raise ValueError(
-                "FixedSkillPrior needs weights of which none is negative and one is positive at "
-                f"least; got weights={p.tolist()}."
+                "FixedSkillPrior needs weights, none negative and one positive at least; got "
+                f"weights={p.tolist()}."
             )
         self.register_buffer("p", p / p.sum())
 

@@ -107,7 +107,7 @@ class _TrainsObjective(Reduction):
 
     def _shared_keys(self) -> set[str]:
         """Returns the names of keys that the objective reads under the same name."""
-        if "objective" not in self._modules:
+        if not hasattr(self, "objective"):  # TorchRL's constructor is at work
             return set()
         own, other = self._AcceptedKeys, self.objective._AcceptedKeys
         return set(own.__dataclass_fields__) & set(other.__dataclass_fields__)
@@ -120,7 +120,7 @@ class _TrainsObjective(Reduction):
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
-        if "objective" not in self._modules:
+        if not hasattr(self, "objective"):
             return
         # The parent forgets what the critics read of the next state, and nests tuples in tuples.
         action = unravel_key(self.tensor_keys.action)
@@ -178,7 +178,7 @@ class _TrainsObjective(Reduction):
         out = {
             "loss_actor": loss_actor,
             "loss_qvalue": loss_qvalue,
-            "loss_alpha": self._reduce(self._alpha_loss(log_prob), tensordict),
+            "loss_alpha": self._reduce(self.alpha_loss(log_prob), tensordict),
             **critics,
             **skills,
             "alpha": self._alpha,

@@ -20,6 +20,7 @@ from torchrl_hmcts.planners.tree import (
     CLOSED,
     EDGE,
     EXPANDED,
+    MANY_ROOTS,
     NODE,
     PRUNED,
     RECORD,
@@ -30,7 +31,6 @@ from torchrl_hmcts.planners.tree import (
 from torchrl_hmcts.planners.variant_kernels import outcome, refresh_twins, wants_sample
 
 COMPILED = not numba.config.DISABLE_JIT
-MANY = 64  # roots from which on they go down in step
 BLOCK = 32  # trees that go down in step: what they touch fits in the first-level cache
 AHEAD = 4  # outcomes; by so many the insertion is ahead in asking for memory
 _float32, _int64 = np.dtype(np.float32), np.dtype(np.int64)
@@ -114,7 +114,7 @@ def _walk_together(nodes, edges, roots, s, gumbel, first, last):
 @njit(error_model="numpy", _nrt=False)
 def walk(nodes, edges, roots, record, gumbel):
     """Walk down in step where there are many trees; return whether :func:`select` continues."""
-    if roots.shape[0] < MANY or record[0]["mark"]:
+    if roots.shape[0] < MANY_ROOTS or record[0]["mark"]:
         return False
     for first in range(0, roots.shape[0], BLOCK):
         last = min(first + BLOCK, roots.shape[0])

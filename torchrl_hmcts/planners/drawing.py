@@ -185,8 +185,8 @@ def plot_tree(
         handles = _option_handles(shown, labels, option_names is not None)
         handles += _node_handles(shown)
         for number in dict.fromkeys([fewest, round((fewest * most) ** 0.5), most]):
-            size = {"markersize": diameter(number), "markeredgewidth": 0.5}
-            handles.append(_dot(plural(number, "visit"), **size))
+            style = {"markersize": diameter(number), "markeredgewidth": 0.5}
+            handles.append(_dot(plural(number, "visit"), **style))
         _add_legend(ax, handles)
     return ax
 

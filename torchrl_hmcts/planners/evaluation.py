@@ -89,9 +89,10 @@ class NodeEvaluator:
             TypeError: if a part returns no tensor.
             ValueError: if a part returns another shape, or numbers that no search can use.
         """
+        m, num_options = td.batch_size[0], self.num_options
+        priors, values = np.zeros((0, num_options), np.float32), np.zeros(m, np.float32)
         if not self._parts:
-            m = td.batch_size[0]
-            return np.zeros((0, self.num_options), np.float32), np.zeros(m, np.float32)
+            return priors, values
         td = td.clone()  # what is stored must not depend on what the parts do with it
         found = Evaluation()
         if self.leaf_evaluator is not None:
@@ -99,20 +100,15 @@ class NodeEvaluator:
             found = answer if isinstance(answer, Evaluation) else Evaluation(values=answer)
         if self.option_prior is not None:
             answer = self.option_prior(_with_seeds(self.option_prior, td, seeds))
-            found = found._replace(
-                priors=answer.priors if isinstance(answer, Evaluation) else answer
-            )
-        m, priors, values = td.batch_size[0], found.priors, found.values
-        return (
-            np.zeros((0, self.num_options), np.float32)
-            if priors is None
-            else check_priors(priors, (m, self.num_options), "option prior").float().numpy(),
-            np.zeros(m, np.float32)
-            if values is None
-            else np.where(
-                terminated, np.float32(0.0), check_values(values, m, "leaf evaluator").numpy()
-            ),
-        )
+            prior = answer.priors if isinstance(answer, Evaluation) else answer
+            found = found._replace(priors=prior)
+        if found.priors is not None:
+            checked = check_priors(found.priors, (m, num_options), "option prior")
+            priors = checked.float().numpy()
+        if found.values is not None:
+            checked = check_values(found.values, m, "leaf evaluator")
+            values = np.where(terminated, np.float32(0.0), checked.numpy())
+        return priors, values
 
 
 def check_priors(priors: Any, shape: tuple[int, int], reader: str) -> Tensor:

@@ -17,7 +17,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_hmcts.checks import real_number, whole_number
-from torchrl_hmcts.direct_calls import is_plain
+from torchrl_hmcts.direct_calls import has_hooks, is_plain
 from torchrl_hmcts.planners.evaluation import (
     SEED_KEY,
     Evaluation,
@@ -452,7 +452,7 @@ class _Network:
 
     def __call__(self, td: TensorDictBase) -> list[Tensor]:
         inner = self._inner
-        if self._direct and not (inner._forward_hooks or inner._forward_pre_hooks):
+        if self._direct and not has_hooks(inner):
             out = inner.module(*(td.get(key) for key in self.in_keys))
             outputs = out if isinstance(out, tuple) else (out,)
             if len(outputs) == self._num_outputs:

@@ -39,6 +39,10 @@ from torchrl_hmcts.planners.subtree import find_end, reroot
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree_policies import UCT, TreePolicy
 
+_WRITTEN = (
+    *("plan_found", "root_value", "root_visits"),
+    *("num_simulations", "num_expansions", "num_simulated_steps"),
+)
 _PARTS = {part.name for part in fields(SearchSettings)}
 
 
@@ -190,15 +194,7 @@ class MCTSPlanner(TensorDictModuleBase):
             whole_number("MCTSPlanner", "seed", seed)
         self._seeds = None if seed is None else np.random.SeedSequence(int(seed))
         self.in_keys = list(self.simulator.root_keys)
-        self.out_keys = [
-            self.option_key,
-            "plan_found",
-            "root_value",
-            "root_visits",
-            "num_simulations",
-            "num_expansions",
-            "num_simulated_steps",
-        ]
+        self.out_keys = [self.option_key, *_WRITTEN]
         self.last_search: Search | None = None
 
     def __getattr__(self, name: str) -> Any:
@@ -229,18 +225,17 @@ class MCTSPlanner(TensorDictModuleBase):
         def column(array: np.ndarray) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(array)).view(*shape, 1)
 
-        entries = {
-            self.option_key: option,
-            "plan_found": column(search.best_node >= 0),
-            "root_value": column(tree.nodes["value"][:, 0]),
-            "root_visits": torch.from_numpy(tree.edges["visits"][:, 0].astype(np.int64)).view(
-                *shape, self.num_options
-            ),
-            "num_simulations": column(search.num_simulations),
-            "num_expansions": column(search.num_expansions),
-            "num_simulated_steps": column(search.num_base_steps),
-        }
-        for key, value in entries.items():
+        visits = torch.from_numpy(tree.edges["visits"][:, 0].astype(np.int64))
+        entries = (
+            option,
+            column(search.best_node >= 0),
+            column(tree.nodes["value"][:, 0]),
+            visits.view(*shape, self.num_options),
+            column(search.num_simulations),
+            column(search.num_expansions),
+            column(search.num_base_steps),
+        )
+        for key, value in zip(self.out_keys, entries, strict=True):
             tensordict.set(key, value.to(device) if device is not None else value)
         return tensordict
 

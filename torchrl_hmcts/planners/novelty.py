@@ -148,6 +148,8 @@ class RadiusNovelty(_Counted):
     ) -> None:
         self.in_keys = entry_keys("RadiusNovelty", "key", key)
         self.radius = real_number("RadiusNovelty", "radius", radius, above=0.0)
+        if scale is not None:
+            instance("RadiusNovelty", "scale", scale, Sequence, np.ndarray)
         self.scale = [1.0] * len(self.in_keys) if scale is None else list(scale)
         if len(self.scale) != len(self.in_keys):
             raise ValueError(

@@ -19,6 +19,7 @@ from torchrl_hmcts.planners.tree import (
     CLOSED,
     FORBIDDEN,
     LARGEST,
+    MANY_ROOTS,
     PENDING,
     PRUNED,
     REWARDED,
@@ -26,8 +27,6 @@ from torchrl_hmcts.planners.tree import (
 )
 from torchrl_hmcts.planners.tree_policies import CompiledPolicy
 from torchrl_hmcts.planners.tree_view import SearchTree
-
-_MANY = 64  # roots from which on trees are walked down in step
 
 
 class Wave:
@@ -273,7 +272,7 @@ class Search:
                 raise
             return Wave(self._wave[:count])
         walked = False
-        if self.num_roots >= _MANY:
+        if self.num_roots >= MANY_ROOTS:
             from torchrl_hmcts.planners.batch_kernels import walk
 
             walked = walk(tree.nodes, tree.edges, tree.roots, self.record, self.gumbel)

@@ -25,7 +25,14 @@ from torchrl.data import OneHot
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
-from torchrl_hmcts.nesting import env_name, flat_transforms, set_states, step_states
+from torchrl_hmcts.direct_calls import put
+from torchrl_hmcts.nesting import (
+    complete_done,
+    env_name,
+    flat_transforms,
+    set_states,
+    step_states,
+)
 from torchrl_hmcts.planners.keys import entry_key
 from torchrl_hmcts.planners.simulator_checks import (
     check_durations_and_masks,
@@ -83,9 +90,8 @@ class Simulator:
         extra = [unravel_key(k) for k in extra_keys]
         self._check_available(extra, "The novelty test or an evaluator")
         self.kept_keys = list(self.state_keys)
-        for name, key in (("duration_key", duration_key), ("mask_key", mask_key)):
-            key = None if key is None else entry_key("MCTSPlanner", name, key)
-            setattr(self, name, key if key in available else None)
+        self.duration_key = self._optional("duration_key", duration_key)
+        self.mask_key = self._optional("mask_key", mask_key)
         self.root_keys = list(dict.fromkeys([*self.state_keys, *extra]))
         if self.mask_key is not None:
             self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))
@@ -130,6 +136,12 @@ class Simulator:
         self.kept_keys = list(dict.fromkeys([*self.kept_keys, *keys]))
         self.root_keys = list(dict.fromkeys([*self.root_keys, *keys]))
 
+    def _optional(self, name: str, key: NestedKey | None) -> NestedKey | None:
+        """A key of the env, or None if the env has no such entry."""
+        if key is None or entry_key("MCTSPlanner", name, key) not in self._available:
+            return None
+        return entry_key("MCTSPlanner", name, key)
+
     def _check_available(self, keys: Sequence[NestedKey], reader: str) -> None:
         for key in keys:
             if key not in self._available:
@@ -171,11 +183,11 @@ class Simulator:
         option = torch.from_numpy(options)
         if self.env.device is not None and self.env.device.type != "cpu":
             option = option.to(self.env.device)
-        _put(states, self.option_key, self.encode(option))
+        put(states, self.option_key, self.encode(option))
 
     def _completed(self, states: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
         if any(_entry(after, key) is None for key in self._done_keys):
-            self.env._complete_done(self._done_spec, after)
+            complete_done(self.env, after, self._done_spec)
         for key in self.state_keys:
             if _entry(after, key) is None:  # the env leaves it as it was
                 after.set(key, states.get(key))
@@ -205,7 +217,7 @@ class Simulator:
             after = None if self._run_from is None else self._run_from(state, option)
             if after is None:
                 root = set_states(self.env, state).update(state)
-                _put(root, self.option_key, self.encode(option))
+                put(root, self.option_key, self.encode(option))
                 after = step_states(self.env, root)
             parts.append(after)
         stacked: TensorDictBase = torch.stack(parts)
@@ -308,13 +320,6 @@ def _entry(td: TensorDictBase, key: NestedKey) -> Tensor | None:
 def _required(td: TensorDictBase, key: NestedKey) -> Tensor:
     entry = _entry(td, key)
     return td.get(key) if entry is None else entry  # whose error names the key
-
-
-def _put(td: TensorDictBase, key: NestedKey, value: Tensor) -> None:
-    if isinstance(key, str):
-        td._set_str(key, value, validated=True, inplace=False, non_blocking=False)
-    else:
-        td.set(key, value)
 
 
 def _array(value: Tensor) -> np.ndarray:

@@ -85,6 +85,7 @@ WAVE = np.dtype(
     [("root", np.int64), ("node", np.int64), ("option", np.int64), ("new_node", np.int64)],
     align=True,
 )
+MANY_ROOTS = 64  # from which on trees are walked down in step
 FACTORS = 256  # visits of a node up to which its exploration factor is looked up
 # What the kernels read of a search's settings: one record instead of a dozen arguments, which cost
 # 0.1 us each a call.

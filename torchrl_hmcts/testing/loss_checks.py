@@ -6,6 +6,7 @@ Letters: *B batch of the tensordict.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -124,25 +125,25 @@ def check_loss(
         >>> check_loss(make_loss, td, gradients=gradients, checks=["gradients", "nested_keys"])
     """
     refuse_unknown("check_loss", checks, LOSS_CHECKS)
-    it = _Loss(make_loss, tensordict, tolerance, seed)
-    calls: dict[str, Callable[[], None]] = {
-        "gradients": lambda: it.gradients(gradients),
-        "target_networks": lambda: it.target_networks(targets),
-        "set_keys": lambda: it.renamed("set_keys", _flat, keys),
-        "nested_keys": lambda: it.renamed("nested_keys", _nested, keys),
-        "value_estimators": lambda: it.value_estimators(value_estimators),
-    }
+    it = _Loss(make_loss, tensordict, gradients, targets, value_estimators, keys, tolerance, seed)
     for check in checks:
-        calls.get(check, getattr(it, check, None))()  # type: ignore[misc]
+        getattr(it, f"check_{check}")()
 
 
+@dataclass
 class _Loss:
-    """The loss under test, and data for it; a method for each check."""
+    """The loss under test, and what is expected of it; a method for each check."""
 
-    def __init__(
-        self, make_loss: MakeLoss, data: TensorDictBase, tolerance: float, seed: int
-    ) -> None:
-        self._make, self.data, self.tolerance, self.seed = make_loss, data, tolerance, seed
+    make_loss: MakeLoss
+    data: TensorDictBase
+    gradients: Mapping[str, Sequence[str]] | None
+    targets: Sequence[str]
+    value_estimators: Sequence[Any]
+    keys: Sequence[str] | None
+    tolerance: float
+    seed: int
+
+    def __post_init__(self) -> None:
         loss = self.make()
         self.name = require_kind(loss, LossModule)
         with during(self.name, "on the data that check_loss was given"):
@@ -153,7 +154,7 @@ class _Loss:
         self, name: Rename = lambda key: key, *, seed: int | None = None, **kw: Any
     ) -> LossModule:
         with seeded(self.seed if seed is None else seed):
-            return self._make(name, **kw)
+            return self.make_loss(name, **kw)
 
     def run(self, loss: Any, data: TensorDictBase | None = None) -> TensorDictBase:
         with seeded(self.seed):
@@ -177,7 +178,7 @@ class _Loss:
     def close(self, one: torch.Tensor, other: torch.Tensor) -> bool:
         return torch.allclose(one, other, rtol=self.tolerance, atol=self.tolerance)
 
-    def out_keys(self) -> None:
+    def check_out_keys(self) -> None:
         loss, given = self.make(), self.data.clone()
         with seeded(self.seed):
             out = loss(given)
@@ -200,7 +201,7 @@ class _Loss:
             )
         require_same(self.data, given, f"{self.name} changed <key> of its input. Write to a copy.")
 
-    def reduction(self) -> None:
+    def check_reduction(self) -> None:
         single = self.run(self.make(reduction="none"))
         for kind in ("mean", "sum"):
             reduced = self.run(self.make(reduction=kind))
@@ -235,10 +236,10 @@ class _Loss:
         named = [(name, p.grad) for name, p in loss.named_parameters() if p.grad is not None]
         return {name for name, grad in named if bool((grad != 0).any())}
 
-    def gradients(self, gradients: Mapping[str, Sequence[str]] | None) -> None:
+    def check_gradients(self) -> None:
         names = [name for name, p in self.make().named_parameters() if p.requires_grad]
         touched = {str(key): self._touched(key) for key in self.losses}
-        if gradients is None:
+        if self.gradients is None:
             idle = set(names) - set().union(*touched.values())
             require(
                 not idle,
@@ -247,10 +248,11 @@ class _Loss:
             )
             return
         require(
-            set(touched) == set(gradients),
-            f"{self.name} has the losses {sorted(touched)}; gradients= names {sorted(gradients)}.",
+            set(touched) == set(self.gradients),
+            f"{self.name} has the losses {sorted(touched)}; gradients= names "
+            f"{sorted(self.gradients)}.",
         )
-        for key, beginnings in gradients.items():
+        for key, beginnings in self.gradients.items():
             strays = [n for n in touched[key] if not n.startswith(tuple(beginnings))]
             require(
                 not strays,
@@ -264,13 +266,13 @@ class _Loss:
                     f"{sorted({n.split('.')[0] for n in names})}.",
                 )
 
-    def target_networks(self, targets: Sequence[str]) -> None:
-        if not targets:
+    def check_target_networks(self) -> None:
+        if not self.targets:
             return
         loss = self.make()
         trainable = {id(p) for p in loss.parameters()}
         create = "Create them with convert_to_functional(..., create_target_params=True)."
-        for network in targets:
+        for network in self.targets:
             held = getattr(loss, f"target_{network}_params", None)
             require(held is not None, f"{self.name} has no target_{network}_params. {create}")
             assert held is not None
@@ -287,7 +289,7 @@ class _Loss:
                 )
 
         def data(prefix: str) -> dict[str, TensorDictBase]:
-            return {n: getattr(loss, f"{prefix}{n}_params").data.clone() for n in targets}
+            return {n: getattr(loss, f"{prefix}{n}_params").data.clone() for n in self.targets}
 
         with during(self.name, "under torchrl.objectives.SoftUpdate"):
             updater = SoftUpdate(loss, tau=0.5)
@@ -306,7 +308,7 @@ class _Loss:
             message = f"{self.name}: SoftUpdate(tau=0.5) {message}"
             require_same(half, now, message, tolerance=self.tolerance)
 
-    def dispatch(self) -> None:
+    def check_dispatch(self) -> None:
         loss = self.make()
         flat: dict[str, Any] = {}
         for key in map(unravel_key, loss.in_keys):
@@ -330,7 +332,7 @@ class _Loss:
         out = TensorDict(out, batch_size=self.expected.batch_size)
         self.equal(out, "called with tensors by keyword")
 
-    def select_out_keys(self) -> None:
+    def check_select_out_keys(self) -> None:
         for key in self.losses:
             loss = self.make().select_out_keys(key)
             out = self.run(loss)
@@ -341,11 +343,17 @@ class _Loss:
             )
             self.equal(out, f".select_out_keys({key!r})", self.expected.select(key))
 
-    def renamed(self, check: str, name: Rename, keys: Sequence[str] | None) -> None:
+    def check_set_keys(self) -> None:
+        self.renamed("set_keys", _flat)
+
+    def check_nested_keys(self) -> None:
+        self.renamed("nested_keys", _nested)
+
+    def renamed(self, check: str, name: Rename) -> None:
         loss = self.make(name)
-        fields = list(loss._AcceptedKeys.__dataclass_fields__) if keys is None else keys
+        accepted = list(loss._AcceptedKeys.__dataclass_fields__)
         new: dict[str, Any] = {}
-        for field in fields:
+        for field in accepted if self.keys is None else self.keys:
             key = getattr(self.make().tensor_keys, field)
             new[field] = [name(k) for k in key] if isinstance(key, list) else name(key)
         with during(self.name, f"in set_keys(**{new}) ({check!r})"):
@@ -369,8 +377,8 @@ class _Loss:
                 ".set_keys accepts a key of which its _AcceptedKeys know nothing",
             )
 
-    def value_estimators(self, value_estimators: Sequence[Any]) -> None:
-        for kind in value_estimators:
+    def check_value_estimators(self) -> None:
+        for kind in self.value_estimators:
             loss = self.make()
             with during(self.name, f"with make_value_estimator({kind})"):
                 loss.make_value_estimator(kind)
@@ -381,7 +389,7 @@ class _Loss:
                 f"{self.name} with make_value_estimator({kind}) gives {out.select(*self.losses)}.",
             )
 
-    def terminal_states(self) -> None:
+    def check_terminal_states(self) -> None:
         loss, data = self.make(), self.data.clone()
         names = [n for n in ("terminated", "done") if hasattr(loss.tensor_keys, n)]
         ends = [data.get(("next", getattr(loss.tensor_keys, n)), None) for n in names]
@@ -405,7 +413,7 @@ class _Loss:
                 "finite. Replace them before a network reads them: a product with 0 is NaN too.",
             )
 
-    def state_dict(self) -> None:
+    def check_state_dict(self) -> None:
         loss, other = self.make(), self.make(seed=self.seed + 1)
         at_first = set(loss.state_dict())
         self.backward(self.run(loss))
@@ -419,7 +427,7 @@ class _Loss:
             other.load_state_dict(loss.state_dict())
         self.equal(self.run(other), "with the state dict of another", self.run(loss))
 
-    def compile(self) -> None:
+    def check_compile(self) -> None:
         torch.compiler.reset()
         loss, plain = self.make(), self.make()
         expected, where = self.run(plain), "under torch.compile(fullgraph=True)"

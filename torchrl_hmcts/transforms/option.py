@@ -179,6 +179,7 @@ class OptionTransform(HasOptions):
             )
         private = [key for key in tensordict.keys() if str(key).startswith(_ROOT)]
         inner = rollout.masks.show(tensordict).exclude("_step", "next", *private)
+        inner = inner.copy()  # groups too: a transform below may rename what is in them
         inner.set(self.skill_key, self._skill(option, rollout.option_shape, tensordict.batch_size))
         if self.worker_memory == "reset":
             rollout.begin_memory(inner)

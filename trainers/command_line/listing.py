@@ -5,31 +5,32 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
-from torchrl_hmcts.trainers.command_line.running import missing, refuse
+from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, told
 from torchrl_hmcts.trainers.experiments.dissertation import FIGURES
-from torchrl_hmcts.trainers.experiments.registry import DEMO, EXPERIMENTS, find_experiment
+from torchrl_hmcts.trainers.experiments.registry import (
+    ALL_EXPERIMENTS,
+    EXPERIMENTS,
+    KITS,
+    find_experiment,
+)
 
 
 def show(words: Sequence[str]) -> int:
     """List the experiments, the keys of one, or the figures; return the exit status."""
-    if len(words) > 1:
-        return refuse("list", f"one name at most; got {' '.join(words)!r}.")
     name = words[0] if words else ""
-    try:
+    with told("list", *WRONG_WORDS):
+        if len(words) > 1:
+            raise ValueError(f"one name at most; got {' '.join(words)!r}.")
         if name in ("", "experiments"):
             print("experiments (their keys: hmcts list NAME):")
             print(summaries())
-            print("\nfigures of the dissertation: hmcts list figures")
+            print(f"\nkits (hmcts train kit=NAME): {', '.join(KITS)}")
+            print("figures of the dissertation: hmcts list figures")
         elif name == "figures":
             print(figures())
-        elif name == "demo":
-            print(DEMO.describe())
         else:
-            print(find_experiment(name).describe())
-    except ModuleNotFoundError as error:
-        return missing(error)
-    except ValueError as error:
-        return refuse("list", error)
+            known = {**KITS, **ALL_EXPERIMENTS}
+            print(known[name].describe() if name in known else find_experiment(name).describe())
     return 0
 
 

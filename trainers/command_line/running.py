@@ -11,10 +11,80 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.words import set_log_level
-from torchrl_hmcts.trainers.experiments.registry import Experiment, ExperimentError
-from torchrl_hmcts.trainers.runs.run import open_run, resume_command
+from torchrl_hmcts.trainers.experiments.registry import Experiment
+from torchrl_hmcts.trainers.runs.config import ExperimentError
+from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled
+
+WRONG_WORDS = (ValueError, TypeError, KeyError)
+_EXTRAS = {"ray": "scale", "optuna": "scale", "ale_py": "atari", "wandb": "wandb"}
+
+
+class Failure(Exception):
+    """A command has failed; the message is all that its user sees.
+
+    Args:
+        message: a line.
+        status: exit status of the command.
+    """
+
+    def __init__(self, message: str, status: int = 1) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@contextlib.contextmanager
+def told(command: str, *wrong: type[Exception], resume: Sequence[str] = ()) -> Iterator[None]:
+    """Turn errors that a user can do something about into a :class:`Failure`.
+
+    Args:
+        command: as users type it, e.g. ``"train experiment=labmaze"``.
+        *wrong: errors that come of wrong words, e.g. ``WRONG_WORDS``; exit status 2.
+        resume: holds the command that continues the run, once there is one.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        name = (error.name or "a package").partition(".")[0]
+        raise Failure(
+            f"hmcts needs {name}, which is not installed. Install the extra that has it: "
+            f"pip install 'torchrl_hmcts[{_EXTRAS.get(name, 'train')}]'"
+        ) from error
+    except (FolderInUse, ExperimentError, FloatingPointError, ImportError) as error:
+        raise Failure(f"hmcts {command}: {error}") from error
+    except wrong as error:
+        raise Failure(f"hmcts {command}: {error}", 2) from error
+    except RuntimeError as error:  # by name: torchrl's; not worth its import here
+        message = str(error)
+        if type(error).__name__ == "CollectorError" and resume:
+            message += f" Or continue with: {resume[0]}"
+        elif type(error).__name__ not in ("CheckpointError", "CollectorError"):
+            raise
+        raise Failure(f"hmcts {command}: {message}") from error
+    except OSError as error:  # e.g. a folder that cannot be written
+        message = str(error)
+        if not isinstance(error, FileNotFoundError) or error.errno is not None:
+            message = with_advice(message, *resume)
+        raise Failure(f"hmcts {command}: {message}") from error
+
+
+def with_advice(text: str, resume: str = "") -> str:
+    """Return what an OSError says, and another folder where that helps.
+
+    Args:
+        text: of the error; that the system lacks memory or files, no folder can help.
+        resume: command that continues the run.
+
+    Example:
+        >>> with_advice("No space left on device")
+        'No space left on device. Choose another folder with out=DIR.'
+    """
+    text = text.rstrip(".")
+    if any(word in text for word in ("/dev/shm", "ulimit", "TMPDIR")):
+        return f"{text}."
+    how = f"Continue with: {resume}, or choose" if resume else "Choose"
+    return f"{text}. {how} another folder with out=DIR."
 
 
 def run_experiment(
@@ -33,41 +103,23 @@ def run_experiment(
         experiment: what to run.
         config: its configuration.
         words: the whole command line, for the record.
-        log_level: how much is said.
+        log_level: how much is printed.
         fresh: no folder was named: take the first of ``out``, ``out_2``, ... that holds nothing.
     """
-    resume = ""  # how to continue, once there is a run
+    resume: list[str] = []  # how to continue, once there is a run
     try:
-        with said(log_level), signals_handled():
+        with told(name, resume=resume), printing(log_level), signals_handled():
             _ = experiment.function
             with open_run(config, experiment=experiment.name, command=words, fresh=fresh) as run:
-                resume = run.resume_command
+                resume.append(run.resume_command)
                 if run.config.out != config.out:
                     print(f"{config.out} holds a run already; this one goes to {run.config.out}.")
                 config = run.config
-                if getattr(config, "resume", False) and not run.resumes:
+                if config.resume and not run.resumes:
                     print("The run was stopped before its first checkpoint: it begins again.")
                 experiment(config)
-    except ModuleNotFoundError as error:
-        return missing(error)
-    except FolderInUse as error:
-        return fail(name, error)
-    except RuntimeError as error:
-        if type(error).__name__ == "CollectorError":
-            return fail(name, f"{error} Or continue with: {resume or resume_command(config.out)}")
-        if type(error).__name__ != "CheckpointError":  # torchrl's; not worth its import here
-            raise
-        return fail(name, error)
-    except FileNotFoundError as error:
-        if error.errno is None:  # there is no checkpoint to go on from
-            return fail(name, error)
-        return fail(name, _with_advice(error, resume))
-    except OSError as error:  # e.g. a folder that cannot be written
-        return fail(name, _with_advice(error, resume))
-    except (ExperimentError, FloatingPointError, ImportError) as error:
-        return fail(name, error)
     except KeyboardInterrupt as error:
-        how = f"{_saved(config.out)} Continue with: {resume}" if resume else "nothing was begun."
+        how = f"{_saved(config.out)} Continue with: {resume[0]}" if resume else "nothing was begun."
         print(f"\nhmcts {name}: stopped. {how}", file=sys.stderr)
         return error.status if isinstance(error, Stopped) else 130
     return 0
@@ -82,8 +134,12 @@ def _saved(out: str) -> str:
 
 
 @contextlib.contextmanager
-def said(log_level: str) -> Iterator[None]:
-    """Say as much as the level allows while in the context; warnings and errors always come."""
+def printing(log_level: str) -> Iterator[None]:
+    """Print as much as the level allows in the context; warnings and errors always come.
+
+    Args:
+        log_level: one of ``LOG_LEVELS``.
+    """
     if set_log_level(log_level):
         yield
         return
@@ -93,36 +149,3 @@ def said(log_level: str) -> Iterator[None]:
             yield
     finally:
         os.environ.pop("TQDM_DISABLE", None)
-
-
-def refuse(command: str, message: object) -> int:
-    """Say what was wrong with the words of a command; return the exit status for it."""
-    print(f"hmcts {command}: {message}", file=sys.stderr)
-    return 2
-
-
-def fail(command: str, message: object) -> int:
-    """Say what went wrong; return the exit status for it."""
-    print(f"hmcts {command}: {message}", file=sys.stderr)
-    return 1
-
-
-def missing(error: ModuleNotFoundError) -> int:
-    """Say which package is not installed and which extra has it."""
-    name = (error.name or "a package").partition(".")[0]
-    extra = {"ray": "scale", "optuna": "scale", "ale_py": "atari", "wandb": "wandb"}
-    print(
-        f"hmcts needs {name}, which is not installed. Install the extra that has it: "
-        f"pip install 'torchrl_hmcts[{extra.get(name, 'train')}]'",
-        file=sys.stderr,
-    )
-    return 1
-
-
-def _with_advice(error: OSError, resume: str = "") -> str:
-    """Another folder helps where a file could not be written, not where the system lacks more."""
-    text = str(error).rstrip(".")
-    if any(word in text for word in ("/dev/shm", "ulimit", "TMPDIR")):
-        return f"{text}."
-    how = f"Continue with: {resume}, or choose" if resume else "Choose"
-    return f"{text}. {how} another folder with out=DIR."

@@ -9,70 +9,85 @@ from glob import escape, glob
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.command_line.running import missing, refuse, run_experiment
-from torchrl_hmcts.trainers.command_line.words import LOG_LEVELS, set_log_level, split_words
+from torchrl_hmcts.trainers.command_line.running import (
+    WRONG_WORDS,
+    Failure,
+    run_experiment,
+    told,
+)
+from torchrl_hmcts.trainers.command_line.words import expand, parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import (
     DEMO,
     EXPERIMENTS,
+    KITS,
     Experiment,
     find_experiment,
     load_config,
 )
-from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, home, parse_overrides
-from torchrl_hmcts.trainers.runs.run import resume_command, run_files
+from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, home
+from torchrl_hmcts.trainers.runs.run import next_free, resume_command, run_files
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 
 def demo(words: Sequence[str]) -> int:
     """Run ``hmcts demo key=value ...``; return the exit status."""
-    resumed = [word for word in words if _names_folder(word)]
-    if resumed:
-        return refuse("demo", f"a demo is continued with: hmcts train {shlex.quote(resumed[0])}")
+    for word in filter(_names_folder, words):
+        raise Failure(f"hmcts demo: a demo is continued with: hmcts train {shlex.quote(word)}", 2)
     return _new("demo", DEMO, words, ["hmcts", "demo", *words])
 
 
 def train(words: Sequence[str]) -> int:
     """Run ``hmcts train experiment=NAME key=value ...`` or ``hmcts train resume=DIR``."""
     line = ["hmcts", "train", *words]
-    try:
-        own, rest = split_words(words, ["experiment"])
+    with told("train", *WRONG_WORDS):
+        own, rest = split_words(words, ["experiment", "kit"])
+        many = "-m" in rest
+        rest = [word for word in rest if word != "-m"]
         resumed = [word.partition("=")[2] for word in rest if _names_folder(word)]
         if len(resumed) > 1:
             raise ValueError(f"one run at a time; got resume={resumed[0]} and {resumed[1]}.")
-        if "experiment" not in own and resumed:
-            return _go_on(resumed[0], rest, own.get("log_level", "info"), line)
-        if "experiment" not in own:
+        named = [f"{key}={own[key]}" for key in ("experiment", "kit") if key in own]
+        if not named and resumed:
+            name, experiment, config = _continued(resumed[0], rest)
+            return run_experiment(name, experiment, config, line, own.get("log_level", "info"))
+        if len(named) != 1:
             raise ValueError(
-                f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))} "
-                "(all: hmcts list), or which run to go on with, resume=DIR."
+                f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))} (all: hmcts "
+                f"list), or which kit ({', '.join(KITS)}), or which run to continue, resume=DIR."
             )
         if resumed:
             raise ValueError(
-                f"resume={resumed[0]} goes on with the experiment and keys of that folder; leave "
-                f"experiment={own['experiment']} out. To change keys on the way: out=DIR "
-                "resume=true and the keys."
+                f"resume={resumed[0]} continues with the experiment and keys of that folder; leave "
+                f"{named[0]} out. To change keys on the way: out=DIR resume=true and the keys."
             )
-        experiment = find_experiment(own["experiment"])
-    except ValueError as error:
-        return refuse("train", error)
-    words = [word for word in words if not word.startswith("experiment=")]
-    return _new(f"train experiment={experiment.name}", experiment, words, line)
+        among = EXPERIMENTS if "experiment" in own else KITS
+        experiment = find_experiment(named[0].partition("=")[2], among)
+        rest = [word for word in words if word not in (*named, "-m")]
+        runs = expand(rest) if many else [rest]
+    name = f"train {named[0]}"
+    if not many:
+        return _new(name, experiment, rest, line)
+    outs = [word.partition("=")[2] for word in rest if word.startswith("out=")]
+    out = outs[0] if outs else next_free(f"runs/{experiment.name}_multirun")
+    statuses = []
+    for number, chosen in enumerate(runs):
+        chosen = [*(w for w in chosen if not w.startswith("out=")), f"out={out}/{number}"]
+        line = ["hmcts", "train", *named, *chosen]
+        print(shlex.join(line), flush=True)
+        statuses.append(_new(name, experiment, chosen, line))
+        if statuses[-1] >= 128:  # stopped
+            break
+    return max(statuses)
 
 
 def _new(name: str, experiment: Experiment, words: Sequence[str], line: Sequence[str]) -> int:
-    try:
+    with told(name, *WRONG_WORDS):
         own, rest = split_words(words, [])
-        level = own.get("log_level", "info")
-        if level not in LOG_LEVELS:
-            set_log_level(level)  # raises
-        config = parse_overrides(experiment.config_class, rest, others=["log_level"])
+        config = parse_config(experiment, rest, others=["log_level"])
         fresh = False
         if not any(word.removeprefix("env.").startswith("out=") for word in rest):
             config, fresh = _default_folder(config)
-    except ModuleNotFoundError as error:
-        return missing(error)
-    except (ValueError, TypeError) as error:
-        return refuse(name, error)
+    level = own.get("log_level", "info")
     return run_experiment(name, experiment, config, line, level, fresh=fresh)
 
 
@@ -100,20 +115,21 @@ def _fits(out: str, config: Any) -> bool:
         saved = read_run(out).config
     except ValueError:
         return False
-    return all(saved.get(key) == getattr(config, key) for key in config.KEPT)
+    return all(saved.get(key, getattr(config, key)) == getattr(config, key) for key in config.KEPT)
 
 
-def _go_on(folder: str, words: Sequence[str], level: str, line: Sequence[str]) -> int:
+def _continued(folder: str, words: Sequence[str]) -> tuple[str, Experiment, Any]:
+    """The command, the experiment and the configuration of a run that is continued."""
     others = [word for word in words if not _names_folder(word)]
     if others:
         raise ValueError(
-            f"resume={folder} goes on exactly as the run was begun; {others[0]!r} would change it. "
-            f"To change keys on the way: experiment=NAME out={folder} resume=true and the keys."
+            f"resume={folder} continues exactly as the run was begun; {others[0]!r} would change "
+            f"it. To change keys on the way: experiment=NAME out={folder} resume=true and the keys."
         )
     experiment, config = load_config(read_run(home(folder)))
     config = dataclasses.replace(config, resume=True, overwrite=False)
     name = "demo" if experiment is DEMO else f"train experiment={experiment.name}"
-    return run_experiment(name, experiment, config, line, level)
+    return name, experiment, config
 
 
 def _names_folder(word: str) -> bool:

@@ -1,18 +1,83 @@
-"""Words of the command line: keys of the command itself, and the rest."""
+"""Words of the command line: keys of the command itself, of an experiment, and of its parts."""
 
 from __future__ import annotations
 
 import logging
 import os
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
 
-from torchrl_hmcts.trainers.runs.config import home, unknown_key
+from torchrl_hmcts.trainers.experiments.registry import Experiment
+from torchrl_hmcts.trainers.runs.config import home, key_kinds, parse_overrides, unknown_key
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 LOG_LEVEL_HELP = (
-    "log_level=debug|info|warning|error: how much is said (default info; with warning\n"
+    "log_level=debug|info|warning|error: how much is printed (default info; with warning\n"
     "  and error no progress is shown either)."
 )
+
+
+def parse_config(
+    experiment: Experiment, words: Sequence[str], base: Any = None, others: Sequence[str] = ()
+) -> Any:
+    """Return the configuration of an experiment; its parts are composed with Hydra.
+
+    Args:
+        experiment: whose keys they are.
+        words: ``key=value``; ``objective=metra``, ``planner/tree_policy=puct`` and
+            ``planner.novelty.radius=0.5`` change the parts of an agent over a kit.
+        base: configuration whose values hold where no word says otherwise. Default: the defaults.
+        others: keys of the same command that belong to no configuration, to be suggested as well.
+
+    Raises:
+        ValueError: if a key or name is unknown (the nearest ones are named), or a value is wrong.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.experiments.registry import DEMO
+        >>> parse_config(DEMO, ["seed=3"]).seed
+        3
+    """
+    kinds = key_kinds(experiment.config_class)
+    names = {name for name, kind in kinds.items() if kind == "dict"}
+    chosen = [w for w in words if w.partition("=")[0].replace("/", ".").split(".")[0] in names]
+    rest = [word for word in words if word not in chosen]
+    config = parse_overrides(experiment.config_class, rest, base=base, others=others)
+    if not chosen:
+        return config
+    from torchrl_hmcts.trainers.configs import compose_parts, full
+    from torchrl_hmcts.trainers.experiments.kits import make_kit
+    from torchrl_hmcts.trainers.parts import build, differences, merged
+
+    own = make_kit(config).parts()
+    now = {part: merged(node, getattr(config, part)) for part, node in own.items()}
+    composed = compose_parts(now, chosen)
+    for part in composed["planner"].values():  # says what is wrong with a part before all work
+        if isinstance(part, dict) and "_component_" in part:
+            build(**part)
+    return replace(config, **{p: differences(full(own[p]), node) for p, node in composed.items()})
+
+
+def expand(words: Sequence[str]) -> list[list[str]]:
+    """Return the words of each run of ``-m``: all combinations of values with commas.
+
+    Args:
+        words: ``key=a,b`` takes both values, ``key=[a,b]`` and ``key="a,b"`` are one.
+
+    Example:
+        >>> expand(["seed=0,1", "toy=true"])
+        [['seed=0', 'toy=true'], ['seed=1', 'toy=true']]
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    values = []
+    for word in words:
+        (override,) = OverridesParser.create().parse_overrides([word])
+        key = word.partition("=")[0]
+        swept = override.sweep_string_iterator() if override.is_sweep_override() else None
+        values.append([word] if swept is None else [f"{key}={value}" for value in swept])
+    return [list(combination) for combination in product(*values)]
 
 
 def split_words(words: Sequence[str], own: Sequence[str]) -> tuple[dict[str, str], list[str]]:
@@ -44,6 +109,9 @@ def split_words(words: Sequence[str], own: Sequence[str]) -> tuple[dict[str, str
         if not value:
             raise ValueError(f"{key}= has no value.")
         found[key] = value
+    level = found.get("log_level", "info")
+    if level not in LOG_LEVELS:
+        raise ValueError(f"log_level is one of {', '.join(LOG_LEVELS)}; got {level!r}.")
     return found, rest
 
 
@@ -65,20 +133,15 @@ def folders_of(words: Sequence[str], own: Sequence[str]) -> list[str]:
 
 
 def set_log_level(level: str) -> bool:
-    """Set how much this process says; return whether progress is shown.
+    """Set how much this process prints; return whether progress is shown.
 
     Args:
         level: one of ``LOG_LEVELS``.
-
-    Raises:
-        ValueError: if it is none of them.
 
     Example:
         >>> set_log_level("info")
         True
     """
-    if level not in LOG_LEVELS:
-        raise ValueError(f"log_level is one of {', '.join(LOG_LEVELS)}; got {level!r}.")
     # TorchRL's own messages (a collector that shuts down, ...) are for those who ask for them.
     others = {"info": "WARNING"}.get(level, level.upper())
     os.environ.setdefault("RL_LOGGING_LEVEL", others)

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.dissertation import (
     FIGURES,
     MissingData,
@@ -21,21 +20,17 @@ from torchrl_hmcts.trainers.experiments.dissertation import (
     Sources,
     find_figure,
 )
-from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-from torchrl_hmcts.trainers.experiments.lab.training import curve_script_frames
-from torchrl_hmcts.trainers.experiments.lab.worker import (
-    held_out_seeds,
-    make_lab_env,
-    make_worker_loss,
-)
+from torchrl_hmcts.trainers.experiments.goals import make_agent_env, make_agent_loss
+from torchrl_hmcts.trainers.experiments.kits.lab import LabMazeKit, held_out_seeds, make_lab_env
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
 from torchrl_hmcts.trainers.experiments.registry import load_config, recognise
-from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import run_goal_episodes
+from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.skills import make_loss
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import run_goal_episodes
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
     make_goal_env,
     make_tile_planner,
 )
-from torchrl_hmcts.trainers.experiments.waterworld.run import make_agent_env, make_agent_loss
 from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
 from torchrl_hmcts.trainers.figures.atari_scores import draw_game, read_scores, write_table
 from torchrl_hmcts.trainers.figures.curves import (
@@ -50,6 +45,7 @@ from torchrl_hmcts.trainers.figures.maps import LabMap, plot_mazes, plot_skill_f
 from torchrl_hmcts.trainers.figures.pages import Section, picture, write_sections
 from torchrl_hmcts.trainers.figures.pictures import COLORS, STAMP, refuse_foreign, save_figure
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder, is_run, read_curves, read_run
+from torchrl_hmcts.trainers.saving.worker_file import load_networks
 
 _AGENTS = {"waterworld_goals": "goal-based agent", "waterworld_a3c": "A3C without goals"}
 _MAZES = 20  # of the test split, of which one with a rather long way is shown
@@ -179,7 +175,7 @@ def draw_skills(figure: SourceFigure, sources: Sources, path: Path) -> str:
     runs = sources.of("labmaze")
     if runs:
         config: LabMazeConfig = load_config(runs[0])[1]
-        loss = make_worker_loss(config.num_skills, seed=config.seed)
+        loss = make_loss(LabMazeKit(config))
         load_networks(loss, runs[0].path)
         generator = torch.Generator().manual_seed(config.seed)
         sampling = SkillPolicy(loss.actor_network, generator=generator)
@@ -237,7 +233,7 @@ def draw_solving(figure: SourceFigure, sources: Sources, path: Path) -> str:
     name = {"diayn": "DIAYN", "hmcts": "Algorithm 3"}[config.algorithm]
     plot_training(
         {name: curves},
-        solving_panels(curve_script_frames(config)),
+        solving_panels(LabMazeKit(config).script_frames()),
         path,
         title=f"{name}: {config.curve_mazes} held-out mazes of 9 x 9",
         x_label="frames of training",

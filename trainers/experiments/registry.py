@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import ast
 import difflib
 import importlib
-import inspect
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from torchrl_hmcts.trainers.runs.config import config_keys
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder
-
-
-class ExperimentError(ValueError):
-    """What an experiment was asked for does not fit what is there; the message says it all."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +27,7 @@ class Experiment:
         objective: figure that a sweep improves, e.g. ``"test.solved"``, larger is better; with a
             minus before it, smaller is better. Default: none, the user has to name one.
         progress: logged value by which a sweep gives up trials early. Default: none.
+        kit: its name in ``hmcts train kit=NAME``. Default: none.
 
     Example:
         >>> find_experiment("waterworld_goals").config_class(seed=3).seed
@@ -45,6 +41,7 @@ class Experiment:
     evaluate: str = ""
     objective: str = ""
     progress: str = ""
+    kit: str = ""
 
     @property
     def config_class(self) -> Any:
@@ -79,15 +76,16 @@ class Experiment:
 
     def describe(self) -> str:
         """Return its keys with their defaults and meaning, a line or two each."""
-        meanings = field_docs(self.config_class)
         lines = []
-        for field in fields(self.config_class):
-            lines.append(f"  {field.name}={field.default}")
-            lines += textwrap.wrap(
-                meanings.get(field.name, ""), 92, initial_indent=" " * 6, subsequent_indent=" " * 6
-            )
+        for key, (default, meaning) in config_keys(self.config_class).items():
+            lines.append(f"  {key}.KEY=VALUE" if default == {} else f"  {key}={default}")
+            indent = " " * 6
+            lines += textwrap.wrap(meaning, 92, initial_indent=indent, subsequent_indent=indent)
         return "\n".join(lines)
 
+
+_SKILLS = (".skills:run_skills", ".skills:evaluate_skills")
+_GOALS = (".goals:run_goals", ".goals:evaluate_goals", "test.solved_share", "eval_solved_share")
 
 EXPERIMENTS = {
     experiment.name: experiment
@@ -95,29 +93,23 @@ EXPERIMENTS = {
         Experiment(
             "waterworld_goals",
             "chapter 3's goal-based agent: tree search over tiles sets goals, A3C reaches them",
-            ".waterworld.config:WaterworldGoalsConfig",
-            ".waterworld.run:run_waterworld",
-            ".evaluations:evaluate_waterworld",
-            objective="test.solved_share",
-            progress="eval_solved_share",
+            ".settings:WaterworldGoalsConfig",
+            *_GOALS,
         ),
         Experiment(
             "waterworld_a3c",
             "chapter 3's comparison: A3C alone on the same mazes, network and budget",
-            ".waterworld.config:WaterworldA3CConfig",
-            ".waterworld.run:run_waterworld",
-            ".evaluations:evaluate_waterworld",
-            objective="test.solved_share",
-            progress="eval_solved_share",
+            ".settings:WaterworldA3CConfig",
+            *_GOALS,
         ),
         Experiment(
             "labmaze",
             "chapter 4: tree search over skills learned by DIAYN in DeepMind Lab's random maze",
-            ".lab.config:LabMazeConfig",
-            ".lab.run:run_labmaze",
-            ".evaluations:evaluate_labmaze",
+            ".settings:LabMazeConfig",
+            *_SKILLS,
             objective="test.solved",
             progress="test_solved",
+            kit="labmaze",
         ),
         Experiment(
             "atari",
@@ -126,6 +118,7 @@ EXPERIMENTS = {
             ".atari.run:run_atari",
             ".atari.run:evaluate_atari",
             objective="score_max",
+            kit="atari",
         ),
     )
 }
@@ -133,19 +126,23 @@ EXPERIMENTS = {
 DEMO = Experiment(
     "demo",
     "learn four skills and solve random mazes",
-    "..runs.config:DemoConfig",
-    ".demo:run_demo",
-    ".evaluations:evaluate_demo",
+    ".settings:DemoConfig",
+    *_SKILLS,
+    objective="solved",
+    kit="waterworld",
 )
 ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS}
-"""The experiments of ``hmcts train``, and the demo: whatever leaves a folder of a run."""
+"""The experiments of ``hmcts train``, and the demo: all that leave a folder of a run."""
+KITS = {e.kit: e for e in ALL_EXPERIMENTS.values() if e.kit}
+"""The experiments that ``hmcts train kit=NAME`` runs, by kit."""
 
 
-def find_experiment(name: str) -> Experiment:
+def find_experiment(name: str, among: Mapping[str, Experiment] = EXPERIMENTS) -> Experiment:
     """Return an experiment by name.
 
     Args:
         name: one of ``EXPERIMENTS``.
+        among: experiments by name, or by kit.
 
     Returns:
         Where its configuration, its run and its evaluation are.
@@ -159,32 +156,11 @@ def find_experiment(name: str) -> Experiment:
         ...
         ValueError: Unknown experiment 'labmaz'. Did you mean: labmaze...
     """
-    if name not in EXPERIMENTS:
-        near = difflib.get_close_matches(name, EXPERIMENTS, n=3, cutoff=0.4) or EXPERIMENTS
-        raise ValueError(f"Unknown experiment {name!r}. Did you mean: {', '.join(near)}?")
-    return EXPERIMENTS[name]
-
-
-def field_docs(config_class: type) -> dict[str, str]:
-    """Return the sentence below each field of a configuration, by the field's name.
-
-    Args:
-        config_class: a dataclass; fields of its base classes are included.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.runs.config import DemoConfig
-        >>> field_docs(DemoConfig)["gamma"]
-        'Discount per base step.'
-    """
-    docs: dict[str, str] = {}
-    for owner in reversed(config_class.__mro__[:-1]):
-        tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))
-        body = tree.body[0].body  # type: ignore[attr-defined]
-        for field, below in zip(body, body[1:], strict=False):
-            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
-                assert isinstance(field.target, ast.Name)
-                docs[field.target.id] = " ".join(ast.literal_eval(below.value).split())
-    return docs
+    if name not in among:
+        near = difflib.get_close_matches(name, among, n=3, cutoff=0.4) or among
+        what = "kit" if among is KITS else "experiment"
+        raise ValueError(f"Unknown {what} {name!r}. Did you mean: {', '.join(near)}?")
+    return among[name]
 
 
 def recognise(run: RunFolder) -> RunFolder:
@@ -199,27 +175,12 @@ def recognise(run: RunFolder) -> RunFolder:
         known = (
             (len(keys), name)
             for name in ALL_EXPERIMENTS
-            if set(run.config) <= set(keys := config_keys(name))
+            if set(run.config) <= set(keys := config_keys(ALL_EXPERIMENTS[name].config_class))
         )
         run.record["experiment"] = min(known, default=(0, ""))[1]
     if run.experiment in ALL_EXPERIMENTS:
-        run.keys = config_keys(run.experiment)
+        run.keys = config_keys(ALL_EXPERIMENTS[run.experiment].config_class)
     return run
-
-
-def config_keys(experiment: str) -> dict[str, tuple[Any, str]]:
-    """Return the default and the meaning of each key of an experiment.
-
-    Args:
-        experiment: its name.
-
-    Example:
-        >>> config_keys("demo")["gamma"][1]
-        'Discount per base step.'
-    """
-    config_class = ALL_EXPERIMENTS[experiment].config_class
-    meanings = field_docs(config_class)
-    return {key.name: (key.default, meanings.get(key.name, "")) for key in fields(config_class)}
 
 
 def load_config(run: RunFolder) -> tuple[Experiment, Any]:

@@ -208,11 +208,20 @@ def plot_losses(history: Mapping[str, Sequence[float]], base_steps: int, path: P
         "qvalue_loss_1": "Critic 2 loss",
         "loss_discriminator": "Discriminator loss",
     }
+    if "discriminator_loss" not in history:  # another objective
+        del titles["loss_discriminator"]
+        titles |= {
+            k: k.replace("_", " ") for k in ("encoder_loss", "dynamics_loss") if k in history
+        }
     figure = Figure(figsize=(9.6, 5.4), layout="constrained")
-    for axes, (key, title) in zip(figure.subplots(2, 2).flat, titles.items(), strict=True):
+    for axes, (key, title) in zip(figure.subplots(2, 2).flat, titles.items(), strict=False):
         steps = np.linspace(0, base_steps, len(history[key]), endpoint=False)
         draw_band(axes, [(steps, history[key])], color=COLORS[0], smooth=True)
         style(axes, title)
+    if "loss_discriminator" not in titles:
+        figure.supxlabel("base steps", fontsize=10)
+        save_figure(figure, path)
+        return
     twin = axes.twinx()  # of the discriminator
     draw_band(twin, [(steps, history["discriminator_accuracy"])], color=COLORS[1], smooth=True)
     twin.lines[0].remove()  # pale

@@ -1,26 +1,29 @@
-"""Configuration of the command line's experiments, as dataclasses."""
+"""Configurations of runs as dataclasses, and their keys as they are typed."""
 
 from __future__ import annotations
 
+import ast
 import difflib
 import importlib
+import inspect
 import math
 import numbers
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, ClassVar, TypeVar
-
-from torchrl_hmcts.arguments import name_arguments
 
 C = TypeVar("C")
 
-NUM_TEST_MAZES = 342
-FRAMES_PER_BATCH = 64
 LOGGERS = ("csv", "tensorboard", "wandb")
 MAX_SEED = 2**32 - 1
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 BOOL_WORDS = (*_TRUE, *_FALSE)
+
+
+class ExperimentError(ValueError):
+    """What an experiment was asked for does not fit what is there; the message says it all."""
 
 
 @dataclass
@@ -32,8 +35,8 @@ class RunConfig:
 
     Raises:
         TypeError: if a value is not of its field's type.
-        ValueError: if ``seed`` is not between 0 and 2**32 - 1, a number is not finite, or ``out``
-            is empty.
+        ValueError: if ``seed`` is not between 0 and 2**32 - 1, a number is not finite or out of its
+            range, or ``out`` is empty.
 
     Example:
         >>> RunConfig(seed=3).seed
@@ -52,12 +55,18 @@ class RunConfig:
     toy: bool = False
     """A run of seconds, to see that everything works."""
 
+    EXPERIMENT: ClassVar[str] = ""  # name of the experiment
+    TOY: ClassVar[Mapping[str, Any]] = {}  # what toy=true changes
     KEPT: ClassVar[tuple[str, ...]] = ("seed", "toy")  # a run that is resumed keeps these
     PATHS: ClassVar[tuple[str, ...]] = ("out",)
+    LEAST: ClassVar[Mapping[str, int]] = {}  # least value of a number
+    ABOVE_ZERO: ClassVar[tuple[str, ...]] = ()
+    CHOICES: ClassVar[Mapping[str, Sequence[str]]] = {}
 
     def __post_init__(self) -> None:
+        kinds = key_kinds(type(self))
         for field in fields(self):
-            value = _checked(field.name, str(field.type), getattr(self, field.name))
+            value = _checked(field.name, kinds[field.name], getattr(self, field.name))
             if field.name in self.PATHS:
                 value = home(value)
             setattr(self, field.name, value)
@@ -65,6 +74,19 @@ class RunConfig:
             raise ValueError("out is empty; name a folder, e.g. out=runs/mine.")
         if not 0 <= self.seed <= MAX_SEED:
             raise ValueError(f"seed must be 0 to {MAX_SEED}; got {self.seed}.")
+        for name, least in self.LEAST.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}.")
+        for name in self.ABOVE_ZERO:
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")
+        if not 0.0 < getattr(self, "gamma", 1.0) <= 1.0:
+            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")  # type: ignore[attr-defined]
+        for name, choices in {"logger": LOGGERS, **self.CHOICES}.items():
+            if getattr(self, name, choices[0]) not in choices:
+                raise ValueError(
+                    f"{name} is one of {', '.join(choices)}; got {getattr(self, name)!r}."
+                )
 
     def check_inputs(self) -> None:
         """Check what the run needs from outside, before anything is written.
@@ -75,6 +97,10 @@ class RunConfig:
         logger = getattr(self, "logger", "csv")
         if logger != "csv":
             need_package(logger)
+
+    def sized(self: C) -> C:
+        """Return the configuration that is run: with ``toy`` a small one."""
+        return replace(self, **self.TOY) if self.toy else self  # type: ignore[attr-defined, type-var]
 
 
 def _checked(name: str, kind: str, value: Any) -> Any:
@@ -93,8 +119,11 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         if not math.isfinite(value):
             raise ValueError(f"{name} must be a finite number; got {value!r}.")
         return float(value)
-    if isinstance(value, os.PathLike):
-        value = os.fspath(value)
+    if kind == "dict":
+        if not isinstance(value, Mapping):
+            raise TypeError(f"{name} must be a dict of changes; got {value!r}.")
+        return dict(value)
+    value = os.fspath(value) if isinstance(value, os.PathLike) else value
     if not isinstance(value, str):
         raise TypeError(f"{name} must be a text; got {value!r}.")
     if "\0" in value:
@@ -138,91 +167,6 @@ def need_package(name: str) -> None:
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
-@name_arguments
-@dataclass
-class DemoConfig(RunConfig):
-    """What ``hmcts demo`` does; every value can be given as ``key=value`` on the command line.
-
-    Raises:
-        ValueError: if a number is out of its range, ``train_base_steps`` is no multiple of 64 or
-            the logger is unknown.
-
-    Example:
-        >>> DemoConfig(seed=3).train_base_steps
-        40000
-    """
-
-    out: str = "runs/demo"
-    """Folder that receives metrics, pictures, checkpoints and the page; made if absent. Default:
-    runs/demo (runs/demo_toy with toy=true), or the next of runs/demo_2, ... that holds no run."""
-    mazes: int = 100
-    """Test mazes to solve, at most the 342 of the test split."""
-    num_skills: int = 4
-    """Skills of the worker, the options of the manager (the source's N_policies)."""
-    option_steps: int = 25
-    """Base steps of an option (the source's N_worker_samples)."""
-    skill_steps: int = 50
-    """Base steps of a mini-episode in training: long enough for the skills to part."""
-    train_base_steps: int = 40_000
-    """Base steps of worker training in the training mazes."""
-    leaves_per_wave: int = 4
-    """Leaves of the tree whose options are simulated together; more are faster, less selective."""
-    novelty_radius: float = 1.0
-    """Tiles within which a place counts as visited; about what an option covers."""
-    expansions: int = 1_000
-    """Nodes that a search may expand before it gives up."""
-    gamma: float = 0.99
-    """Discount per base step."""
-    logger: str = "csv"
-    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
-    toy: bool = False
-    """1,920 base steps of training and 3 mazes, to see in seconds that everything works."""
-
-    KEPT = ("seed", "toy", "num_skills", "skill_steps")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in (
-            "mazes",
-            "num_skills",
-            "option_steps",
-            "skill_steps",
-            "train_base_steps",
-            "expansions",
-            "leaves_per_wave",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
-        if not self.novelty_radius > 0.0:
-            raise ValueError(f"novelty_radius must be above 0 tiles; got {self.novelty_radius}.")
-        if not 0.0 < self.gamma <= 1.0:
-            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")
-        if self.train_base_steps % FRAMES_PER_BATCH:
-            raise ValueError(
-                f"train_base_steps={self.train_base_steps} is no whole number of batches of "
-                f"{FRAMES_PER_BATCH} base steps; use a multiple of {FRAMES_PER_BATCH}."
-            )
-        check_logger(self.logger)
-        if self.mazes > NUM_TEST_MAZES:
-            raise ValueError(f"mazes={self.mazes}, but the test split has {NUM_TEST_MAZES} mazes.")
-
-
-def check_logger(name: str) -> None:
-    """Check the name of a logger.
-
-    Args:
-        name: one of ``LOGGERS``.
-
-    Raises:
-        ValueError: if it is none of them.
-
-    Example:
-        >>> check_logger("csv")
-    """
-    if name not in LOGGERS:
-        raise ValueError(f"logger is one of {', '.join(LOGGERS)}; got {name!r}.")
-
-
 def parse_overrides(
     config_class: type[C],
     overrides: Sequence[str],
@@ -249,10 +193,10 @@ def parse_overrides(
             a value has the wrong type.
 
     Example:
-        >>> parse_overrides(DemoConfig, ["seed=1", "out=runs/one"]).out
+        >>> parse_overrides(RunConfig, ["seed=1", "out=runs/one"]).out
         'runs/one'
     """
-    types = {field.name: str(field.type) for field in fields(config_class)}  # type: ignore[arg-type]
+    types = key_kinds(config_class)
     given: dict[str, Any] = {}
     for word in overrides:
         word = word.removeprefix("env.")
@@ -318,3 +262,43 @@ def unknown_key(key: str, known: Sequence[str]) -> str:
     """
     near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or list(known)
     return f"Unknown key {key!r}. Did you mean: {', '.join(near)}?"
+
+
+def key_kinds(config_class: type) -> dict[str, str]:
+    """Return the types of a configuration's keys: int, float, bool, str or dict.
+
+    Args:
+        config_class: a dataclass.
+
+    Example:
+        >>> key_kinds(RunConfig)["seed"]
+        'int'
+    """
+    kinds = {field.name: field.type for field in fields(config_class)}
+    return {
+        name: str(getattr(kind, "__name__", kind)).partition("[")[0] for name, kind in kinds.items()
+    }
+
+
+def config_keys(config_class: type) -> dict[str, tuple[Any, str]]:
+    """Return the default of each key of a configuration, and the sentence below it.
+
+    Args:
+        config_class: a dataclass; fields of its base classes are included.
+
+    Example:
+        >>> config_keys(RunConfig)["resume"]
+        (False, 'Continue the run in `out` from its newest checkpoint.')
+    """
+    docs: dict[str, str] = {}
+    for owner in reversed(config_class.__mro__[:-1]):
+        tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))
+        body = tree.body[0].body  # type: ignore[attr-defined]
+        for field, below in zip(body, body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                assert isinstance(field.target, ast.Name)
+                docs[field.target.id] = " ".join(ast.literal_eval(below.value).split())
+    return {
+        field.name: ({} if field.default is MISSING else field.default, docs.get(field.name, ""))
+        for field in fields(config_class)
+    }

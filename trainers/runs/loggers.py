@@ -16,7 +16,6 @@ from typing import Any
 from torch import Tensor
 from torchrl.record.loggers import CSVLogger, Logger
 
-from torchrl_hmcts.trainers.runs.config import check_logger
 from torchrl_hmcts.trainers.saving.files import left_out
 
 Observer = Callable[[str, float, int], None]
@@ -55,12 +54,11 @@ class ScalarLoggers(Logger):
             value: a number.
             step: at which it was taken.
         """
-        value = float(value)
         if not math.isfinite(value):
             return
-        self._each(lambda logger: logger.log_scalar(name, value, step=step))
+        self._each(lambda logger: logger.log_scalar(name, float(value), step=step))
         for observer in self.observers:
-            observer(name, value, -1 if step is None else step)
+            observer(name, float(value), -1 if step is None else step)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Log a video where that is possible."""
@@ -80,7 +78,7 @@ class ScalarLoggers(Logger):
         self._each(log)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return nothing: a run that goes on appends to its files."""
+        """Return nothing: a run that is continued appends to its files."""
         return {}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -92,16 +90,15 @@ class ScalarLoggers(Logger):
 
     def _each(self, act: Callable[[Logger], None]) -> None:
         """Do something with every logger; one that fails, e.g. on a full disk, gets no more."""
-        kept = []
-        for logger in self.loggers:
+        for logger in list(self.loggers):
+            failed = True
             with left_out(f"what {type(logger).__name__} still had to log"):
                 act(logger)
-                kept.append(logger)
-        for logger in self.loggers:
-            if logger not in kept:
+                failed = False
+            if failed:
+                self.loggers.remove(logger)
                 with contextlib.suppress(Exception):  # what it could not write, it cannot now
                     _close(logger)
-        self.loggers = kept
 
     def __repr__(self) -> str:
         return f"ScalarLoggers({self.loggers})"
@@ -127,23 +124,21 @@ def make_logger(config: Any) -> ScalarLoggers:
             ``out/wandb`` and sends nothing, unless the variable ``WANDB_MODE`` is ``online``.
 
     Raises:
-        ValueError: if ``logger`` is none of the names.
         ModuleNotFoundError: if its package is not installed.
     """
-    check_logger(config.logger)
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
-    if not getattr(config, "resume", False):
+    if not config.resume:
         for old in ("log", "tensorboard"):
             shutil.rmtree(out / old, ignore_errors=True)
     loggers: list[Logger] = [CSVLogger(exp_name="log", log_dir=str(out))]
+    if config.logger != "csv":
+        importlib.import_module(config.logger)
     if config.logger == "tensorboard":
-        importlib.import_module("tensorboard")
         from torchrl.record.loggers import TensorboardLogger
 
         loggers.append(TensorboardLogger(exp_name="tensorboard", log_dir=str(out)))
     elif config.logger == "wandb":
-        importlib.import_module("wandb")
         from torchrl.record.loggers import WandbLogger
 
         offline = os.environ.get("WANDB_MODE", "offline") != "online"

@@ -1,4 +1,4 @@
-"""A run and its folder: claimed before anything is written, locked, recorded, never overwritten.
+"""A run and its folder: taken before anything is written, locked, recorded, never overwritten.
 
 Every command that writes a run opens it here: :func:`open_run`.
 """
@@ -8,21 +8,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shlex
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.experiments.registry import (
-    ALL_EXPERIMENTS,
-    ExperimentError,
-    config_keys,
-)
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.runs.config import BOOL_WORDS
+from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError, config_keys
+from torchrl_hmcts.trainers.saving.files import left_out, remove, write_csv
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
@@ -58,8 +53,8 @@ class Run:
         resumes: whether there is a checkpoint to continue from, and it was asked for.
 
     Example:
-        >>> from torchrl_hmcts.trainers.runs.config import DemoConfig
-        >>> Run(DemoConfig(out="runs/my run"), "demo").resume_command
+        >>> from torchrl_hmcts.trainers.runs.config import RunConfig
+        >>> Run(RunConfig(out="runs/my run"), "demo").resume_command
         "hmcts train 'resume=runs/my run'"
     """
 
@@ -82,14 +77,34 @@ class Run:
         """The command that continues the run exactly."""
         return resume_command(self.config.out)
 
+    def write_curves(
+        self, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], steps: str
+    ) -> None:
+        """Write ``curves.csv``, a value a row: name, step, value.
+
+        Args:
+            curves: steps and values by name.
+            steps: name of the column of the steps, which tells their unit, e.g. ``"base_steps"``.
+        """
+        rows = [
+            (name, int(step), value)
+            for name, (x, y) in curves.items()
+            for step, value in zip(x, y, strict=True)
+        ]
+        with left_out("curves.csv"):
+            write_csv(self.path / "curves.csv", ("name", steps, "value"), rows)
+
     @contextlib.contextmanager
-    def finish(self, metrics: Mapping[str, Any], *, title: str) -> Iterator[Pictures]:
+    def finish(
+        self, metrics: dict[str, Any], config: Any = None, *, title: str
+    ) -> Iterator[Pictures]:
         """Write ``metrics.json``, note that the run is finished, then pictures and the page.
 
         What cannot be drawn or written is left out, with a line on stderr.
 
         Args:
-            metrics: its figures.
+            metrics: its figures; the configuration and the versions are added to them.
+            config: as it was run. Default: that of the run.
             title: heading of the page.
 
         Yields:
@@ -97,8 +112,9 @@ class Run:
         """
         from torchrl_hmcts.trainers.figures.run_page import finish
 
-        keys = config_keys(self.experiment) if self.experiment in ALL_EXPERIMENTS else {}
-        with finish(self.path, title, metrics, keys) as pictures:
+        metrics.setdefault("config", dataclasses.asdict(self.config if config is None else config))
+        metrics.setdefault("versions", versions())
+        with finish(self.path, title, metrics, config_keys(type(self.config))) as pictures:
             end_record(self.path, "finished")
             yield pictures
 
@@ -110,7 +126,7 @@ _current: ContextVar[Run | None] = ContextVar("run", default=None)
 def open_run(
     config: Any, *, experiment: str = "", command: Sequence[str] = (), fresh: bool = False
 ) -> Iterator[Run]:
-    """Claim a folder for a run, and note in its ``run.json`` how what is done there ends.
+    """Take a folder for a run, and note in its ``run.json`` how what is done there ends.
 
     Whatever can be refused is refused before anything is written: packages and inputs that are
     missing, a folder in use, one that holds a run (unless ``config`` says ``resume`` or
@@ -119,7 +135,7 @@ def open_run(
 
     Args:
         config: of the experiment; ``out`` is the folder.
-        experiment: its name. Default: by the class of the configuration.
+        experiment: its name. Default: that of the configuration's class.
         command: words of the command line, for the record.
         fresh: take the first of ``out``, ``out_2``, ``out_3``, ... that holds nothing.
 
@@ -134,22 +150,13 @@ def open_run(
     if outer is not None and outer.config is config:
         yield outer
         return
-    if hasattr(config, "check_inputs"):
-        config.check_inputs()
-    name = experiment or next(
-        (
-            e.name
-            for e in ALL_EXPERIMENTS.values()
-            if e.config.endswith(f":{type(config).__name__}")
-        ),
-        "",
-    )
+    config.check_inputs()
+    name = experiment or config.EXPERIMENT
     with contextlib.ExitStack() as stack:
-        config = _claim(stack, config, name, fresh)
-        resumes = getattr(config, "resume", False) and has_checkpoint(config.out)
-        run = Run(config, name, resumes)
-        if getattr(config, "overwrite", False):
-            clear(run.path)
+        config = _take(stack, config, name, fresh)
+        run = Run(config, name, config.resume and _has_checkpoint(config.out))
+        if config.overwrite:
+            _clear(run.path)
         start_record(name, config, command, {"versions": versions(), "machine": machine()})
         token = _current.set(run)
         stack.callback(_current.reset, token)
@@ -175,29 +182,22 @@ def _recorded(path: Path) -> Iterator[None]:
     end_record(path, "finished")
 
 
-def _claim(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool) -> Any:
+def _take(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool) -> Any:
     """Lock the folder of a configuration, or with ``fresh`` the first free one; return it."""
     for out in _names(config.out) if fresh else [config.out]:
         chosen = dataclasses.replace(config, out=out) if fresh else config
         try:
-            _check_folder(chosen, experiment)
-            # `resume` has one: a folder that it would make is refused above.
-            Path(out).mkdir(parents=True, exist_ok=True)
-            lock = folder_locked(out)
-            lock.__enter__()
+            with contextlib.ExitStack() as locked:
+                _check_folder(chosen, experiment)
+                # `resume` has one: a folder that it would make is refused above.
+                Path(out).mkdir(parents=True, exist_ok=True)
+                locked.enter_context(folder_locked(out))
+                _check_folder(chosen, experiment)  # another may have written there meanwhile
+                stack.push(locked.pop_all())
+            return chosen
         except (FolderRefused, FolderInUse):
-            if fresh:
-                continue
-            raise
-        stack.push(lock)
-        try:
-            _check_folder(chosen, experiment)  # another may have written there meanwhile
-        except FolderRefused:
             if not fresh:
                 raise
-            stack.pop_all().close()
-            continue
-        return chosen
     raise AssertionError("names never end")
 
 
@@ -216,12 +216,8 @@ def next_free(out: str) -> str:
         >>> next_free("runs/none_there")
         'runs/none_there'
     """
-    return next(name for name in _names(out) if not _exists(name))
-
-
-def _exists(name: str) -> bool:
-    path = Path(name)
-    return path.is_file() or (path.is_dir() and any(path.iterdir()))
+    paths = map(Path, _names(out))
+    return str(next(p for p in paths if not (p.is_file() or (p.is_dir() and any(p.iterdir())))))
 
 
 def _check_folder(config: Any, experiment: str) -> None:
@@ -231,10 +227,9 @@ def _check_folder(config: Any, experiment: str) -> None:
         raise FolderRefused(
             f"out={path} is a file. Name a folder, e.g. {_word('out', next_free(config.out))}."
         )
-    resume, overwrite = (getattr(config, key, False) for key in ("resume", "overwrite"))
-    if resume and overwrite:
+    if config.resume and config.overwrite:
         raise FolderRefused("resume=true continues a run, overwrite=true replaces it: choose one.")
-    if resume:
+    if config.resume:
         _check_resumable(config, experiment)
         return
     there = run_files(path)
@@ -246,7 +241,7 @@ def _check_folder(config: Any, experiment: str) -> None:
         run = read_run(path)
         if not (run.experiment or run.metrics):  # nothing in it can be read
             run = None
-    if overwrite and run is not None:
+    if config.overwrite and run is not None:
         return
     if run is None:
         what = "a sweep" if set(there) & set(_SWEEP) else "files of the names that a run writes"
@@ -269,13 +264,13 @@ def _check_resumable(config: Any, experiment: str) -> None:
     try:
         run = read_run(path)
     except ValueError:
-        if has_checkpoint(path):  # written from Python, by an older version
+        if _has_checkpoint(path):  # written from Python, by an older version
             return
         raise FolderRefused(
             f"There is no checkpoint in {str(path)!r}, and no run to continue. Leave resume out to "
             "begin one there, or name the folder of the run."
         ) from None
-    if not has_checkpoint(path) and run.metrics:
+    if not _has_checkpoint(path) and run.metrics:
         raise FolderRefused(
             f"There is no checkpoint in {str(path / 'checkpoints')!r}, but the figures of a run "
             "that has finished. Replace it with overwrite=true, or choose another folder, e.g. "
@@ -285,7 +280,7 @@ def _check_resumable(config: Any, experiment: str) -> None:
         raise FolderRefused(f"{path} holds a run of {run.experiment}, not of {experiment}.")
     changed = [
         f"{key} was {run.config[key]!r} and is {getattr(config, key)!r} here"
-        for key in getattr(config, "KEPT", ())
+        for key in config.KEPT
         if key in run.config and run.config[key] != getattr(config, key)
     ]
     if changed:
@@ -313,39 +308,24 @@ def run_files(path: Path) -> list[str]:
     return [name for name in names if name in ours or name.startswith("trial_")]
 
 
-def has_checkpoint(path: str | Path) -> bool:
-    """Return whether a run's folder has a checkpoint, whole or not.
-
-    Args:
-        path: of the run.
-    """
+def _has_checkpoint(path: str | Path) -> bool:
+    """Whether a run's folder has a checkpoint, whole or not."""
     folder = Path(path) / "checkpoints"
     return any(folder.glob("checkpoint-*")) or (folder / "run.pt").is_file()
 
 
-def clear(path: Path) -> None:
-    """Remove what a run wrote into its folder, and nothing else.
-
-    Args:
-        path: of the run.
-    """
+def _clear(path: Path) -> None:
+    """Remove what a run wrote into its folder, and nothing else."""
     run = RunFolder(path)
     with contextlib.suppress(ValueError):
         run = read_run(path)
     pictures = {name for name in run.pictures if Path(name).name == name}
     videos = {str(Path(name).with_suffix(".mp4")) for name in pictures if name.endswith(".gif")}
-    for name in {*_RECORDS, *_PICTURES, *pictures, *videos}:
-        (path / name).unlink(missing_ok=True)
-    for name in ("log", "tensorboard"):
-        shutil.rmtree(path / name, ignore_errors=True)
-    for name in ("checkpoints", "worker"):
-        folder = path / name
-        for pattern in _IN_CHECKPOINTS:
-            for entry in folder.glob(pattern):
-                if entry.is_dir() and not entry.is_symlink():
-                    shutil.rmtree(entry, ignore_errors=True)
-                else:
-                    entry.unlink(missing_ok=True)
+    for name in {*_RECORDS, *_PICTURES, *pictures, *videos, "log", "tensorboard"}:
+        remove(path / name)
+    for folder, pattern in product(("checkpoints", "worker"), _IN_CHECKPOINTS):
+        for entry in (path / folder).glob(pattern):
+            remove(entry)
 
 
 def resume_command(out: str | Path) -> str:

@@ -6,26 +6,34 @@ import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
+from optuna.distributions import BaseDistribution, CategoricalDistribution
+from optuna.distributions import FloatDistribution as Float
+from optuna.distributions import IntDistribution as Int
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError
 from sqlalchemy.pool import NullPool  # Optuna depends on it
 
-from torchrl_hmcts.trainers.experiments.registry import Experiment
-from torchrl_hmcts.trainers.runs.config import home
+from torchrl_hmcts.trainers.runs.config import (
+    RunConfig,
+    home,
+    key_kinds,
+    parse_overrides,
+    read_value,
+)
 from torchrl_hmcts.trainers.runs.journal import CheckedJournal
 from torchrl_hmcts.trainers.runs.loggers import observed
 from torchrl_hmcts.trainers.runs.run import next_free, open_run, run_files
-from torchrl_hmcts.trainers.runs.sweep_space import Choice, Dimension
-from torchrl_hmcts.trainers.saving.run_folder import flat, read_run
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
+Space = dict[str, BaseDistribution]
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 _SPACE = "space"  # attribute of a study
 _NOT_FIXED = ("out", "resume", "overwrite", "logger")  # may differ from one call to the next
@@ -37,33 +45,99 @@ class Pruned(optuna.TrialPruned):
     run_status = "given up"  # in its run.json
 
 
+def parse_space(config_class: type, words: Sequence[str]) -> tuple[Space, list[str]]:
+    """Take the keys that are varied out of the words of a sweep.
+
+    Args:
+        config_class: of the experiment.
+        words: ``key=[a,b]``, ``key=low..high``, ``key=low..high:log``, ``key=low..high:step``, or
+            ``key=value``, which is the same in all trials.
+
+    Returns:
+        What is varied, as Optuna's distributions, and the words of the rest.
+
+    Raises:
+        ValueError: if a key is given twice, or its values are not of its type.
+
+    Example:
+        >>> space, fixed = parse_space(RunConfig, ["seed=[3,4]", "out=x"])
+        >>> space["seed"].choices, fixed
+        ((3, 4), ['out=x'])
+    """
+    types = key_kinds(config_class)
+    space: Space = {}
+    fixed = []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key in ("resume", "overwrite"):
+            raise ValueError(f"{key} is for hmcts train; the same command continues a sweep.")
+        if key in space:
+            raise ValueError(f"{key} is given twice.")
+        if key in types and value.startswith("[") and value.endswith("]"):
+            items = [item.strip() for item in value[1:-1].split(",") if item.strip()]
+            if len(items) < 2:
+                raise ValueError(f"{word} leaves nothing to choose; give two values or more.")
+            configs = [parse_overrides(config_class, [f"{key}={item}"]) for item in items]
+            space[key] = CategoricalDistribution([getattr(config, key) for config in configs])
+        elif ".." in value and types.get(key) in ("int", "float"):
+            space[key] = _range(key, value, types[key])
+        else:
+            fixed.append(word)
+    return space, fixed
+
+
+def _range(key: str, value: str, kind: str) -> Int | Float:
+    ends, _, how = value.partition(":")
+    try:
+        low, high = (read_value(key, end, kind) for end in ends.split(".."))
+        step = read_value(key, how, kind) if how not in ("", "log") else None
+    except ValueError:
+        kinds = "whole numbers" if kind == "int" else "numbers"
+        raise ValueError(
+            f"{key}={value} is no range of {kinds}, e.g. {key}=1..10, {key}=1..10:log or "
+            f"{key}=1..10:2 (in steps of 2)."
+        ) from None
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError(f"{key}={value} needs two finite ends.")
+    if not low < high:
+        raise ValueError(f"{key}={value} is an empty range.")
+    if how == "log" and not low > 0:
+        raise ValueError(f"{key}={value} needs a lower end above 0.")
+    if step is not None and not 0 < step <= high - low:
+        raise ValueError(f"{key}={value} cannot be walked in steps of {step}.")
+    if key == "seed":
+        RunConfig(seed=low), RunConfig(seed=high)  # raise
+    if kind == "int":
+        return Int(low, high, log=how == "log", step=step or 1)
+    return Float(low, high, log=how == "log", step=step)
+
+
 @dataclass(frozen=True)
 class Sweep:
     """A sweep: which experiment, what varies, what is improved, where it is kept.
 
     Args:
-        experiment: to run.
+        name: of the experiment.
+        run: runs it with a configuration, and returns its figures.
         config: values of the keys that do not vary; ``out`` is the folder of the sweep.
         space: what varies.
         objective: figure of ``metrics.json``, nested names joined by dots; with a minus before
             it, less is better.
+        progress: logged value by which trials are given up. Default: none are.
         storage: URL of an Optuna storage that several machines may share. Default: a journal file
             in the folder.
-        prune: give up trials whose logged value ``experiment.progress`` lies below the median of
-            the others at the same step.
-        seed: of the sampler.
 
     Raises:
         ValueError: if nothing varies.
     """
 
-    experiment: Experiment
+    name: str
+    run: Callable[[Any], Mapping[str, Any]]
     config: Any
-    space: Sequence[Dimension]
+    space: Space
     objective: str
+    progress: str = ""
     storage: str | None = None
-    prune: bool = True
-    seed: int = 0
 
     def __post_init__(self) -> None:
         if not self.space:
@@ -73,34 +147,16 @@ class Sweep:
 
     @property
     def folder(self) -> Path:
-        """Where the trials and what is said about them go."""
+        """Where the trials and what is noted of them go."""
         return Path(self.config.out)
 
     def study(self) -> optuna.Study:
         """Return the study, with the trials so far.
 
         Raises:
-            ValueError: if the storage has a sweep of another space or objective under this name.
+            ValueError: if the storage has a sweep of another space or objective under this name, or
+                the folder holds something else.
         """
-        self._check_folder()
-        self.folder.mkdir(parents=True, exist_ok=True)
-        study = self._open()
-        described = json.loads(json.dumps(self._description()))
-        before = study.user_attrs.get(_SPACE)
-        if before is not None:
-            known = {key: value for key, value in described.items() if key in before}
-            if before != known:
-                differing = [key for key in before if before[key] != known.get(key)]
-                raise ValueError(
-                    f"{self.folder} has a sweep of something else: "
-                    f"{', '.join(f'{key} {before[key]}' for key in differing)}. Give this one a "
-                    "folder of its own with out=DIR."
-                )
-        study.set_user_attr(_SPACE, {**described, **(before or {})})
-        return study
-
-    def _check_folder(self) -> None:
-        """Refuse a folder that holds something else than a sweep."""
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"out={self.folder} is a file; name a folder.")
         there = run_files(self.folder)
@@ -109,20 +165,33 @@ class Sweep:
                 f"{self.folder} holds what is no sweep ({', '.join(there[:4])}). Choose another "
                 f"folder, e.g. out={next_free(str(self.folder))}."
             )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        study = self._open()
+        described = json.loads(json.dumps(self._description()))
+        before = study.user_attrs.get(_SPACE, {})
+        if not isinstance(before.get(_SPACE, {}), dict):  # of an older version: another form
+            before = {key: value for key, value in before.items() if key != _SPACE}
+        differing = [key for key in before if before[key] != described.get(key)]
+        if differing:
+            raise ValueError(
+                f"{self.folder} has a sweep of something else: "
+                f"{', '.join(f'{key} {before[key]}' for key in differing)}. Give this one a folder "
+                "of its own with out=DIR."
+            )
+        study.set_user_attr(_SPACE, {**described, **before})
+        return study
 
     def _open(self) -> optuna.Study:
         """The study, of the name under which the folder knows it, wherever the folder is now."""
+        pruner = optuna.pruners.MedianPruner(n_startup_trials=4)
         try:
             storage = self._storage()
-            name = self._study_name(storage)
             return optuna.create_study(
                 storage=storage,
-                study_name=name,
+                study_name=self._study_name(storage),
                 direction="minimize" if self.objective.startswith("-") else "maximize",
                 load_if_exists=True,
-                pruner=optuna.pruners.MedianPruner(n_startup_trials=4)
-                if self.prune
-                else optuna.pruners.NopPruner(),
+                pruner=pruner if self.progress else optuna.pruners.NopPruner(),
             )
         except (ArgumentError, OperationalError, NoSuchModuleError) as error:
             raise ValueError(
@@ -146,12 +215,11 @@ class Sweep:
         if self.storage is None and names:
             return names[0]  # a journal holds one
         noted = ""
-        if (self.folder / "sweep.json").is_file():
-            with contextlib.suppress(ValueError, OSError):
-                noted = json.loads((self.folder / "sweep.json").read_text()).get("study", "")
-        return noted if noted in names else f"{self.experiment.name}-{self.folder.name}"
+        with contextlib.suppress(ValueError, OSError):
+            noted = json.loads((self.folder / "sweep.json").read_text()).get("study", "")
+        return noted if noted in names else f"{self.name}-{self.folder.name}"
 
-    def run(self, trials: int) -> optuna.Study:
+    def start(self, trials: int) -> optuna.Study:
         """Run trials until so many are finished, those of earlier calls included.
 
         A trial that was stopped, or whose process died, is continued first.
@@ -162,7 +230,7 @@ class Sweep:
         study = self.study()
         self._take_up(study)
         while sum(t.state in _FINISHED for t in study.get_trials(deepcopy=False)) < trials:
-            study.optimize(self.trial, n_trials=1)
+            study.optimize(self._trial, n_trials=1)
         return study
 
     def _take_up(self, study: optuna.Study) -> None:
@@ -173,94 +241,67 @@ class Sweep:
                 if key in trial.user_attrs:
                     latest[trial.user_attrs[key]] = trial
         for folder, trial in latest.items():
+            status = ""
+            with contextlib.suppress(ValueError):  # where it is on another machine
+                status = read_run(self.folder / folder).status
             if trial.state not in (TrialState.RUNNING, TrialState.FAIL):
                 continue
-            path = self.folder / folder
-            try:
-                status = read_run(path).status
-            except ValueError:  # on another machine
-                continue
-            if status not in ("stopped", "interrupted"):
-                continue
-            if trial.state is TrialState.RUNNING:
-                study.tell(trial.number, state=TrialState.FAIL)
-            study.enqueue_trial(trial.params, user_attrs={"continues": folder})
+            if status in ("stopped", "interrupted"):
+                if trial.state is TrialState.RUNNING:
+                    study.tell(trial.number, state=TrialState.FAIL)
+                study.enqueue_trial(trial.params, user_attrs={"continues": folder})
 
-    def trial(self, trial: optuna.Trial) -> float:
-        """Run one trial; return its figure.
-
-        Args:
-            trial: of Optuna.
-
-        Raises:
-            optuna.TrialPruned: if it was given up.
-            ValueError: if the run has no such figure.
-        """
+    def _trial(self, trial: optuna.Trial) -> float:
         # By the trial's number: neither a sweep that is continued nor another process on the same
         # storage draws the same values again.
-        words = [self.seed, trial.number]
-        seed = int(np.random.SeedSequence(words).generate_state(1)[0])
+        seeds = np.random.SeedSequence([self.config.seed, trial.number])
+        seed = int(seeds.generate_state(1)[0])
         trial.study.sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=5)
-        values = {dimension.key: suggest(trial, dimension) for dimension in self.space}
+        values = {key: _suggest(trial, key, space) for key, space in self.space.items()}
         before = trial.user_attrs.get("continues", "")
-        resume = bool(before) and hasattr(self.config, "resume")
-        out = str(self.folder / (before if resume else f"trial_{trial.number:04d}"))
+        out = str(self.folder / (before or f"trial_{trial.number:04d}"))
         try:
-            config = dataclasses.replace(self.config, **values, out=out)
+            config = dataclasses.replace(self.config, **values, out=out, resume=bool(before))
         except ValueError as error:  # this combination makes no sense
             trial.set_user_attr("refused", str(error))
             raise optuna.TrialPruned(str(error)) from None
-        if resume:
-            config = dataclasses.replace(config, resume=True)
-        command = ["hmcts", "train", f"experiment={self.experiment.name}"]
+        command = ["hmcts", "train", f"experiment={self.name}"]
         command += [f"{key}={value}" for key, value in {**values, "out": out}.items()]
-        opened = open_run(
-            config, experiment=self.experiment.name, command=command, fresh=not resume
-        )
+        opened = open_run(config, experiment=self.name, command=command, fresh=not before)
         with opened as run:
             trial.set_user_attr("folder", run.path.name)
             with observed(lambda name, value, step: self._watch(trial, name, value, step)):
-                metrics = self.experiment(run.config)
-        return figure_of(metrics, self.objective)
+                return figure_of(self.run(run.config), self.objective)
 
     def _watch(self, trial: optuna.Trial, name: str, value: float, step: int) -> None:
-        if name != self.experiment.progress:
+        if name != self.progress:
             return
         trial.report(-value if self.objective.startswith("-") else value, step)
         if trial.should_prune():
             raise Pruned(f"{name}={value:.4g} at {step} is below the others' median.")
 
     def _description(self) -> dict[str, Any]:
+        default = type(self.config)()
+        varied = (*_NOT_FIXED, *self.space)
         return {
-            "experiment": self.experiment.name,
+            "experiment": self.name,
             "objective": self.objective,
-            "space": [dataclasses.asdict(dimension) for dimension in self.space],
+            _SPACE: {key: repr(space) for key, space in self.space.items()},
             "fixed": {
-                field.name: getattr(self.config, field.name)
-                for field in dataclasses.fields(self.config)
-                if field.name not in (*_NOT_FIXED, *(dimension.key for dimension in self.space))
-                and getattr(self.config, field.name) != field.default
+                key: value
+                for key, value in dataclasses.asdict(self.config).items()
+                if key not in varied and value != getattr(default, key)
             },
         }
 
 
-def suggest(trial: optuna.Trial, dimension: Dimension) -> Any:
-    """Let Optuna choose a value.
-
-    Args:
-        trial: of Optuna.
-        dimension: what to choose from.
-    """
-    if isinstance(dimension, Choice):
-        return trial.suggest_categorical(dimension.key, list(dimension.values))
-    if dimension.integer:
-        step = 1 if dimension.step is None else int(dimension.step)
-        return trial.suggest_int(
-            dimension.key, int(dimension.low), int(dimension.high), step=step, log=dimension.log
-        )
-    return trial.suggest_float(
-        dimension.key, dimension.low, dimension.high, step=dimension.step, log=dimension.log
-    )
+def _suggest(trial: optuna.Trial, key: str, space: BaseDistribution) -> Any:
+    if isinstance(space, CategoricalDistribution):
+        return trial.suggest_categorical(key, space.choices)
+    if isinstance(space, Int):
+        return trial.suggest_int(key, space.low, space.high, step=space.step, log=space.log)
+    assert isinstance(space, Float)
+    return trial.suggest_float(key, space.low, space.high, step=space.step, log=space.log)
 
 
 def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
@@ -277,14 +318,24 @@ def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
         >>> figure_of({"test": {"frames": {"mean": 261.0}}}, "-test.frames.mean")
         261.0
     """
-    value: Any = metrics
-    for part in objective.removeprefix("-").split("."):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        numbers = sorted(name for name, number in flat(metrics) if isinstance(number, int | float))
-        raise ValueError(f"The run has no figure {objective!r}. It has: {', '.join(numbers)}.")
+    numbers = dict(_numbers(metrics))
+    value = numbers.get(objective.removeprefix("-"))
+    if value is None:
+        raise ValueError(
+            f"The run has no figure {objective!r}. It has: {', '.join(sorted(numbers))}."
+        )
     worst = math.inf if objective.startswith("-") else -math.inf
-    return float(value) if math.isfinite(value) else worst
+    return value if math.isfinite(value) else worst
+
+
+def _numbers(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, float]]:
+    rows: list[tuple[str, float]] = []
+    for name, value in metrics.items():
+        if isinstance(value, Mapping):
+            rows += _numbers(value, f"{prefix}{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            rows.append((prefix + name, float(value)))
+    return rows
 
 
 def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
@@ -294,27 +345,23 @@ def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
         study: of a sweep.
     """
     sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
-
-    def known(trial: FrozenTrial) -> bool:  # a figure that was not finite came as the worst
-        return trial.value is not None and math.isfinite(trial.value)
-
-    def rank(trial: FrozenTrial) -> tuple[bool, float, int]:
-        done = trial.state is TrialState.COMPLETE and known(trial)
-        return (not done, sign * float(trial.value or 0.0) if done else 0.0, trial.number)
-
     states = {TrialState.PRUNED: "given up", TrialState.RUNNING: "running or interrupted"}
-    return [
-        {
-            "trial": trial.number,
-            "state": states.get(trial.state, trial.state.name.lower()),
-            "value": trial.value if trial.state is TrialState.COMPLETE and known(trial) else None,
-            "params": dict(trial.params),
-            "folder": trial.user_attrs.get("folder", ""),
-            "seconds": None if trial.duration is None else round(trial.duration.total_seconds(), 1),
-            "refused": trial.user_attrs.get("refused", ""),
-        }
-        for trial in sorted(study.get_trials(deepcopy=False), key=rank)
-    ]
+    rows = []
+    for trial in study.get_trials(deepcopy=False):
+        done = trial.state is TrialState.COMPLETE and math.isfinite(trial.value or 0.0)
+        duration = trial.duration
+        rows.append(
+            {
+                "trial": trial.number,
+                "state": states.get(trial.state, trial.state.name.lower()),
+                "value": trial.value if done else None,  # one that was not finite came as the worst
+                "params": dict(trial.params),
+                "folder": trial.user_attrs.get("folder", ""),
+                "seconds": None if duration is None else round(duration.total_seconds(), 1),
+                "refused": trial.user_attrs.get("refused", ""),
+            }
+        )
+    return sorted(rows, key=lambda row: (row["value"] is None, sign * (row["value"] or 0.0)))
 
 
 def importances(study: optuna.Study) -> dict[str, float]:

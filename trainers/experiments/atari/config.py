@@ -5,26 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields
 
-from torchrl_hmcts.checks import real_number, whole_number
-from torchrl_hmcts.trainers.experiments.registry import ExperimentError
-from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
-
-_CHOICES = {
-    "protocol": ("deterministic", "sticky"),
-    "source": (
-        "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
-        "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable",
-        "diayn_retrained",
-    ),
-    "tune_with": ("grid", "optuna"),
-    "tree_policy": ("puct", "uct"),
-    "guide": ("none", "prior", "prior_value"),
-}  # fmt: skip
-_AT_LEAST_ONE = (
-    "frames", "max_episode_frames", "tune_trials", "num_skills", "skill_base_steps",
-    "leaves_per_wave", "waves_in_flight", "trial_steps", "replant_every",
-)  # fmt: skip
-_LEAST = {"option_steps": 0, "rollout_options": 0, "num_processes": -1}
+from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
 
 @dataclass
@@ -104,8 +85,36 @@ class AtariConfig(RunConfig):
     toy: bool = False
     """A run of seconds, to see that everything works."""
 
+    EXPERIMENT = "atari"
     FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
     PATHS = ("out", "options_from")
+    CHOICES = {
+        "protocol": ("deterministic", "sticky"),
+        "source": (
+            "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
+            "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable",
+            "diayn_retrained",
+        ),
+        "tune_with": ("grid", "optuna"),
+        "tree_policy": ("puct", "uct"),
+        "guide": ("none", "prior", "prior_value"),
+    }  # fmt: skip
+    LEAST = {
+        **dict.fromkeys(("frames", "max_episode_frames", "tune_trials", "num_skills"), 1),
+        **dict.fromkeys(("skill_base_steps", "leaves_per_wave", "waves_in_flight"), 1),
+        **dict.fromkeys(("trial_steps", "replant_every"), 1),
+        **dict.fromkeys(("option_steps", "rollout_options"), 0),
+        "num_processes": -1,
+    }
+    ABOVE_ZERO = ("ratio", "c", "trial_ratio")
+    TOY = {
+        "frames": 20_000,
+        "max_episode_frames": 2_000,
+        "source": "repeat",
+        "option_steps": 10,
+        "ratio": 5.0,
+        "skill_base_steps": 512,
+    }
 
     @property
     def KEPT(self) -> tuple[str, ...]:  # type: ignore[override]  # noqa: N802
@@ -134,15 +143,3 @@ class AtariConfig(RunConfig):
                 f"options_from={self.options_from} is no run of this experiment: it has no folder "
                 "checkpoints. Name a folder that hmcts train experiment=atari wrote."
             )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, choices in _CHOICES.items():
-            value = getattr(self, name)
-            if value not in choices:
-                raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
-        for name, least in (dict.fromkeys(_AT_LEAST_ONE, 1) | _LEAST).items():
-            whole_number("AtariConfig", name, getattr(self, name), least=least)
-        for name in ("ratio", "c", "trial_ratio"):
-            real_number("AtariConfig", name, getattr(self, name), above=0.0)
-        real_number("AtariConfig", "gamma", self.gamma, above=0.0, most=1.0)

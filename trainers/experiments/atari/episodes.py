@@ -22,7 +22,7 @@ from torchrl_hmcts.trainers.experiments.atari.memory import TrialMemory
 from torchrl_hmcts.trainers.experiments.atari.options import Options
 from torchrl_hmcts.trainers.experiments.atari.sources import make_source
 from torchrl_hmcts.trainers.experiments.atari.trials import Tuned, tune_search
-from torchrl_hmcts.trainers.experiments.registry import ExperimentError
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, read_state
 
 _FRAMES_PER_POINT = 1_000 * FRAMES_PER_STEP  # of the curves: the dissertation's 1,000 samples

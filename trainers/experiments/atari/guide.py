@@ -44,7 +44,8 @@ class SearchGuide:
     decision the nodes of the tree with ``min_visits`` become examples: visits as the policy's
     target, the backed-up value in units of the greatest reward of an option so far as the value's;
     every ``learn_every`` decisions ``updates`` steps of Adam follow. It begins as a uniform prior
-    and values of 0, with which the agent plans as without it.
+    and values of 0, with which the agent plans as without it. A planner's ``leaf_evaluator``, it is
+    called with states that have ``"ram"``, uint8 ``[K, 128]``.
 
     Args:
         num_options (int): Z.
@@ -120,10 +121,11 @@ class SearchGuide:
 
     @torch.no_grad()
     def __call__(self, td: TensorDictBase) -> Evaluation:
-        """Return priors ``[K, Z]`` of states with ``"ram"``, and their values in units of the
-        reward if leaves are valued: for a planner's ``leaf_evaluator``."""
+        """Return priors ``[K, Z]``, and values ``[K, 1]`` of the reward if leaves are valued."""
         priors, values = self._evaluator(td)
-        return Evaluation(priors, values * self.scale if self.values else None)
+        if values is None or not self.values:
+            return Evaluation(priors)
+        return Evaluation(priors, values * self.scale)
 
     def learn(self, search: Search, scale: float) -> None:
         """Take examples from a search of one root, and train if it is time.

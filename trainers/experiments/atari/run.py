@@ -21,15 +21,6 @@ from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_che
 from torchrl_hmcts.trainers.saving.files import left_out, write_csv
 from torchrl_hmcts.trainers.saving.run_folder import versions
 
-_TOY: dict[str, Any] = {
-    "frames": 20_000,
-    "max_episode_frames": 2_000,
-    "source": "repeat",
-    "option_steps": 10,
-    "ratio": 5.0,
-    "skill_base_steps": 512,
-}
-
 
 def run_atari(config: AtariConfig) -> dict[str, Any]:
     """Run ``hmcts train experiment=atari`` and return its figures, as in ``metrics.json``.
@@ -50,8 +41,9 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 5.
     """
+    torch.set_num_threads(1)
     with open_run(config) as folder:
-        run = AtariRun(_sized(folder.config))
+        run = AtariRun(folder.config.sized())
         begin = time.perf_counter()
         _play(run, folder)
         metrics = {
@@ -61,7 +53,8 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
             "versions": versions(),
         }
         with left_out("curves.csv"):
-            write_csv(folder.path / "curves.csv", ("step", "name", "value"), run.curves())
+            rows = ((name, step, value) for step, name, value in run.curves())
+            write_csv(folder.path / "curves.csv", ("name", "base_steps", "value"), rows)
         title = f"{config.game} by planning over options, {config.protocol}"
         with folder.finish(metrics, title=title) as pictures:
             draw(run, pictures)
@@ -70,11 +63,6 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
         f"{metrics['score_final']:g}, {run.num_frames:,} frames."
     )
     return metrics
-
-
-def _sized(config: AtariConfig) -> AtariConfig:
-    torch.set_num_threads(1)
-    return dataclasses.replace(config, **_TOY) if config.toy else config
 
 
 def _play(run: AtariRun, folder: Run) -> None:
@@ -121,7 +109,8 @@ def evaluate_atari(config: AtariConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 5.
     """
-    run = AtariRun(dataclasses.replace(_sized(config), options_from="", frames=1))
+    torch.set_num_threads(1)
+    run = AtariRun(dataclasses.replace(config.sized(), options_from="", frames=1))
     checkpoint = run.take_over(Path(config.out), "out")
     before = run.num_frames
     try:

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv
 from torchrl_hmcts.planners import (
     GoalPlanner,
@@ -37,7 +37,7 @@ def make_tile_planner(env: WaterworldMazeEnv, **planner_kwargs: Any) -> GoalPlan
 
     A tile is searched once, and again when a shorter way to it is found (:class:`RadiusNovelty`
     with ``shorter_paths``), until nothing is left to find: the plan is then a shortest path in
-    tiles, whatever the order of the search.
+    tiles, in any order of the search.
 
     Args:
         env: Waterworld, or another env with such a state and ``mazes``.
@@ -76,7 +76,6 @@ def make_tile_planner(env: WaterworldMazeEnv, **planner_kwargs: Any) -> GoalPlan
     return GoalPlanner(MCTSPlanner(macro_env, **settings), to_macro, in_keys=_IN_KEYS)
 
 
-@name_arguments
 class TilePlanner:
     r"""The manager of :func:`make_tile_planner` without tensordicts: a tenth of the time per plan.
 
@@ -109,7 +108,8 @@ class TilePlanner:
     in_keys = list(_IN_KEYS)
 
     def __init__(self, env: WaterworldMazeEnv, *, leaves_per_wave: int = 16) -> None:
-        self.leaves_per_wave = leaves_per_wave
+        leaves = whole_number("TilePlanner", "leaves_per_wave", leaves_per_wave, least=1)
+        self.leaves_per_wave = leaves
         self.width = env.width
         self.moves = tile_moves(env.mazes.cpu())  # [M, T, A]
         tiles = np.arange(env.height * env.width)

@@ -12,10 +12,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import real_number
 
 
-@name_arguments
 class ScriptedExpert(TensorDictModuleBase):
     r"""Thrusts along the axis on which the velocity is furthest from what the goals ask for.
 
@@ -66,8 +65,10 @@ class ScriptedExpert(TensorDictModuleBase):
         action_key: NestedKey = "action",
     ) -> None:
         super().__init__()
-        self.weights: Sequence[float] = (1.0, next_goal, second_goal)
-        self.damping = damping
+        numbers = {"next_goal": next_goal, "second_goal": second_goal, "damping": damping}
+        weights = [real_number("ScriptedExpert", name, value) for name, value in numbers.items()]
+        self.weights: Sequence[float] = (1.0, *weights[:2])
+        self.damping = weights[2]
         self.relative = relative
         self.goals_key, self.velocity_key, self.position_key, self.action_key = map(
             unravel_key, (goals_key, velocity_key, position_key, action_key)

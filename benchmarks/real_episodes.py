@@ -20,7 +20,7 @@ from torchrl.envs.utils import step_mdp
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.modules import OptionMemory
 from torchrl_hmcts.trainers.evaluation import spread
-from torchrl_hmcts.trainers.experiments.demo import make_starts
+from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
 
 
 class EpisodesInEachMaze(WaterworldMazeEnv):

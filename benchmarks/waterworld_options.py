@@ -14,6 +14,7 @@ from operator import index
 from typing import Any
 
 import torch
+from maze_window import MazeWindow
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -24,7 +25,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import OptionModel, OptionModelEnv
 from torchrl_hmcts.objectives import OptionModelLoss
-from torchrl_hmcts.trainers.experiments.waterworld.maze_window import MazeWindow
 from torchrl_hmcts.transforms import OptionTransform
 
 _ROOT_KEYS = ["observation", "position", "velocity", "target", "option", "maze_index", "step_count"]

@@ -17,15 +17,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_hmcts.arguments import name_arguments
-
 _FAR = 99.0  # tiles, farther than any tile can be
 _NEIGHBOURS = tuple((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx)
 _TARGET_STEPS_PER_TILE = 256  # targets are told apart to that fraction of a tile
 _CACHE_SIZE = 4096
 
 
-@name_arguments
 class MazeNetwork(TensorDictModuleBase):
     r"""Prior and value for Waterworld mazes: learned step costs, shortest paths, a small head.
 
@@ -66,7 +63,6 @@ class MazeNetwork(TensorDictModuleBase):
     Example:
         >>> import torch
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv
-        >>> from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
         >>> env = WaterworldMazeEnv(batch_size=[3])
         >>> td = MazeNetwork(env.mazes)(env.reset())
         >>> td["logits"].shape, td["state_value"].shape

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from torchrl.checkpoint import CheckpointError
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts.trainers.saving.checkpoints import (
@@ -68,3 +69,28 @@ def find_worker(run: str | Path) -> Path:
         if whole:
             return max(whole)
     return newest_checkpoint(run / "checkpoints")
+
+
+def load_networks(loss_module: LossModule, run: str | Path) -> Path:
+    """Give a loss's networks the weights of a run's worker, and nothing else of it.
+
+    Args:
+        loss_module: built as in the run; changed in place.
+        run: the run's folder.
+
+    Returns:
+        The file they are from.
+
+    Raises:
+        FileNotFoundError: if the run has written none yet.
+        ValueError: if the networks are other ones.
+    """
+    path = find_worker(run)
+    try:
+        plain_checkpoint(loss_module=loss_module).load(path)
+    except CheckpointError as error:
+        raise ValueError(
+            f"The networks of {path} are not those of this configuration. Leave the keys that "
+            f"shape them (num_skills, hidden, ...) as they were. {error}"
+        ) from None
+    return path

@@ -17,7 +17,7 @@ _SIDES = np.array([(0, 1), (0, -1), (-1, 0), (1, 0)])  # row, column: east, west
 
 
 class ShortestPathScript:
-    """Walks from cell to cell along a shortest path: turns to the next one's centre and goes on.
+    """Walks from cell to cell along a shortest path: turns to the next centre and walks there.
 
     It knows the maze and needs no learning: a reference for how long an episode takes, not a bound
     (it does not cut corners, nor does it brake before them).

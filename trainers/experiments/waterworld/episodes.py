@@ -1,20 +1,111 @@
-"""Episodes of the goal-based agent from given starts: what they cost, and what they looked like.
+"""Episodes in Waterworld from given starts: what they cost, and what they looked like.
 
-Letters: M episodes, L base steps of one, G goals of a plan.
+Letters: S and M starts, an episode each, L base steps of one, G goals of a plan.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from operator import index
 from typing import Any
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_hmcts.trainers.evaluation import spread
-from torchrl_hmcts.trainers.experiments.waterworld.agents import play_mazes
+
+
+@dataclass
+class MazeTest:
+    """What an agent did in test mazes, one episode each."""
+
+    solved: Tensor  # bool [S], reached the target in time
+    base_steps: Tensor  # int64 [S], length of the episode
+    last: TensorDictBase  # [S] last state of each episode, with the counters that it has
+
+    def summary(self) -> dict[str, float | None]:
+        """Return how many were solved, and the base steps of these episodes and of all.
+
+        Example:
+            >>> from tensordict import TensorDict
+            >>> solved, steps = torch.tensor([True, False]), torch.tensor([30, 100])
+            >>> summary = MazeTest(solved, steps, TensorDict(batch_size=[2])).summary()
+            >>> summary["solved_share"], summary["base_steps_mean"], summary["base_steps_mean_all"]
+            (0.5, 30.0, 65.0)
+        """
+        steps = self.base_steps[self.solved].double()
+        some = len(steps) > 0
+        return {
+            "mazes": len(self.solved),
+            "solved": len(steps),
+            "solved_share": round(len(steps) / len(self.solved), 4),
+            "base_steps_mean": round(float(steps.mean()), 1) if some else None,
+            "base_steps_median": float(steps.median()) if some else None,
+            "base_steps_max": int(steps.max()) if some else None,
+            "base_steps_mean_all": round(float(self.base_steps.double().mean()), 1),
+        }
+
+
+@torch.no_grad()
+def play_mazes(
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    env: EnvBase,
+    starts: TensorDictBase,
+    *,
+    deterministic: bool = False,
+    seed: int = 0,
+    watch: Callable[[TensorDictBase], Any] | None = None,
+) -> MazeTest:
+    """Play one episode from each start, all side by side, until it ends by itself or is cut off.
+
+    Args:
+        policy: writes ``"action"``.
+        env: stateless; may be transformed. It is set to the starts.
+        starts: states ``[S]``, as ``make_starts`` gives them.
+        deterministic: take the most probable actions. Default: sample.
+        seed: of the sampling.
+        watch: called after every step with the transitions of the running episodes, which have the
+            entry ``"start"`` (int64, from which of the starts).
+
+    Returns:
+        What came of it.
+
+    Example:
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> env = WaterworldMazeEnv(torch.zeros(1, 1, 3, dtype=torch.bool))
+        >>> def to_the_right(td):
+        ...     return td.set("action", torch.full(td.batch_size, 3))
+        >>> play_mazes(to_the_right, env, env.make_state(0, [[0.5, 0.5]], (2.5, 0.5))).base_steps
+        tensor([24])
+    """
+    mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    state = env.reset(starts.clone(), set_state=True)
+    count = len(starts)
+    state.set("start", torch.arange(count))
+    solved = torch.zeros(count, dtype=torch.bool)
+    steps = torch.zeros(count, dtype=torch.int64)
+    last: list[TensorDictBase] = []
+    with torch.random.fork_rng(devices=[]), set_exploration_type(mode):
+        torch.manual_seed(index(seed))
+        while len(state):
+            transition = env.step(policy(state))
+            if watch is not None:
+                watch(transition)
+            start = transition["start"]
+            state = transition["next"].set("start", start)
+            steps[start] += 1
+            done = state["done"].squeeze(-1)
+            solved[start] = state["terminated"].squeeze(-1)
+            if done.any():
+                last.append(state[done])
+                state = state[~done]
+    ended: TensorDictBase = torch.cat(last)  # type: ignore[arg-type, assignment]
+    return MazeTest(solved, steps, ended[ended["start"].argsort()])
 
 
 @dataclass
@@ -116,7 +207,7 @@ def run_goal_episodes(
     deterministic: bool = True,
     seed: int = 0,
 ) -> GoalEpisodes:
-    """Carry a worker's policy out from every start to the end of its episode, all side by side.
+    """Execute a worker's policy from every start to the end of its episode, all side by side.
 
     Args:
         env: a worker's env, as :func:`~torchrl_hmcts.trainers.make_goal_env` makes it, of no batch
@@ -132,7 +223,7 @@ def run_goal_episodes(
         The episodes, in the order of the starts.
 
     Example:
-        >>> from torchrl_hmcts.trainers.experiments.demo import make_starts
+        >>> from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
         >>> from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
         >>> from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
         >>> env = make_goal_env(seed=0)

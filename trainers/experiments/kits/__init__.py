@@ -1,0 +1,346 @@
+"""Kits: each is all that an experiment must know of an environment.
+
+A kit has an env to learn skills in, base envs to act in by split, a simulator to plan in, starts,
+the keys of what is read of a state, the planner at its defaults, and what its pages show. The
+recipe :mod:`~torchrl_hmcts.trainers.experiments.skills` does the rest with any kit; a kit of your
+own is a subclass of :class:`Kit` with the first four methods.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.objectives import LossModule
+
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import MCTSPlanner
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
+from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
+from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.parts import build, merged
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords
+from torchrl_hmcts.transforms import OptionTransform
+
+KITS = {"waterworld": "waterworld.WaterworldKit", "labmaze": "lab.LabMazeKit"}
+"""Class of each kit by its name on the command line, in this package."""
+
+
+OBJECTIVE = {"_component_": "torchrl_hmcts.objectives.SkillDiscriminatorLoss"}
+"""DIAYN's objective, the default of every kit."""
+
+Curve = tuple[Sequence[float], Sequence[float]]  # steps and values
+
+
+@dataclass
+class LearnedSkills:
+    """A worker and how it became what it is.
+
+    Attributes:
+        worker (TensorDictModule): with its most probable actions.
+        loss (LossModule, optional): with its networks; None where nothing was learned.
+        history (mapping): all logged curves.
+        tests (RoundRecords): what it achieved while it learned.
+        steps (int): base steps of training, simulated ones included.
+        worker_step (int): those that the networks have seen that are kept.
+        rounds (int): of Algorithm 3.
+        seconds (float): of the processor, tests included.
+    """
+
+    worker: TensorDictModuleBase
+    loss: LossModule | None
+    history: Mapping[str, list[float]]
+    tests: RoundRecords
+    steps: int
+    worker_step: int
+    rounds: int
+    seconds: float
+
+
+@dataclass
+class Trial:
+    """One episode from each start: a plan, executed in another instance of the env.
+
+    Attributes:
+        starts (TensorDict): states ``[M]``.
+        planner (MCTSPlanner): with which the plans were made.
+        results (Results): what they led to.
+        second_searches (int): starts that were searched twice.
+        compile_seconds (float): until the first plan of all was made.
+        cpu_seconds (float): of all searches and episodes.
+    """
+
+    starts: TensorDictBase
+    planner: MCTSPlanner
+    results: Results
+    second_searches: int
+    compile_seconds: float
+    cpu_seconds: float
+
+
+class Kit:
+    """What an experiment must know of an environment.
+
+    A split is ``"train"``, ``"curve"`` (tried while it learns) or ``"test"``.
+
+    Args:
+        config: keys of the experiment.
+
+    Attributes:
+        place_key (NestedKey): where the agent is: what the displacement and a place's novelty are
+            about.
+        worker_keys (sequence of NestedKey): what the worker sees besides its skill.
+        state_keys (sequence of NestedKey): what pictures need of a state.
+        captions (mapping): of the pictures.
+        unit (str): of the times that are reported.
+        curve_steps (str): column of the steps in ``curves.csv``, named for their unit.
+        title (str): of the page.
+        group (int): starts that are planned side by side.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+        >>> kit = make_kit(DemoConfig(mazes=3))
+        >>> kit.place_key, len(kit.starts("test", 3))
+        ('position', 3)
+    """
+
+    place_key: NestedKey = "position"
+    worker_keys: Sequence[NestedKey] = ("observation",)
+    state_keys: Sequence[NestedKey] = ("position",)
+    captions: Mapping[str, str] = {
+        "episode.gif": "A test maze as it was solved: the plan (pale; colours are skills) and the "
+        "worker's way.",
+        "unsolved": "A test maze that was NOT solved: the plan, if one was found (pale; colours "
+        "are skills), and how far the worker came.",
+        "search.png": "The search for that plan: every place an option led to (grey: refused by "
+        "the novelty test), and the tree.",
+        "skills.png": "The skills: 10 mini-episodes for each, in an open room and in a maze.",
+        "losses.png": "Training of the worker: actor, both critics, discriminator.",
+    }
+    unit = "base steps"
+    curve_steps = "base_steps"
+    title = "Planning over learned skills"
+    group = 38
+
+    def __init__(self, config: Any) -> None:
+        self.config: SkillsConfig = config
+
+    # ------------------------------------------------------- envs: what every kit has
+
+    def make_training_env(self, num_envs: int = 32) -> EnvBase:
+        """Return the env to learn skills in: copies under a ``SkillTransform``.
+
+        Args:
+            num_envs: copies.
+        """
+        raise NotImplementedError
+
+    def make_env(self, split: str) -> EnvBase:
+        """Return a base env to act in.
+
+        Args:
+            split: of its mazes, levels or tasks.
+        """
+        raise NotImplementedError
+
+    def starts(self, split: str, num_starts: int) -> TensorDictBase:
+        """Return states to act from, ``[num_starts]``.
+
+        Args:
+            split: as of the env.
+            num_starts: how many.
+        """
+        raise NotImplementedError
+
+    def make_options(
+        self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
+    ) -> EnvBase:
+        """Return the macro env over a base env, whose actions are the options.
+
+        Args:
+            env: the base env.
+            worker: executes the options.
+            trajectory_keys: base transitions to hand out, see ``OptionTransform``.
+        """
+        config = self.config
+        options = OptionTransform(
+            worker,
+            config.num_skills,
+            config.option_steps,
+            config.gamma,
+            trajectory_keys=trajectory_keys,
+        )
+        return TransformedEnv(env, options)
+
+    def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
+        """Return the macro env to plan in.
+
+        Args:
+            worker: executes the options.
+            split: of its mazes, levels or tasks.
+        """
+        return self.make_options(self.make_env(split), worker)
+
+    # ------------------------------------------------------- the planner
+
+    def planner_part(self) -> dict[str, Any]:
+        """Return the entries of the planner at the kit's defaults, by keyword."""
+        config = self.config
+        return {
+            "_component_": "torchrl_hmcts.planners.MCTSPlanner",
+            "novelty": {
+                "_component_": "torchrl_hmcts.planners.RadiusNovelty",
+                "key": self.place_key,
+                "radius": config.novelty_radius,
+            },
+            "budget": {
+                "_component_": "torchrl_hmcts.planners.SearchBudget",
+                "expansions": config.expansions,
+            },
+            "leaves_per_wave": config.leaves_per_wave,
+        }
+
+    def parts(self) -> dict[str, dict[str, Any]]:
+        """Return the components that keys of the command line change, at the kit's defaults."""
+        trainer = {"hmcts": "HMCTSTrainer"}.get(self.config.algorithm, "DIAYNTrainer")
+        return {
+            "objective": dict(OBJECTIVE),
+            "loss": {"_component_": "torchrl_hmcts.objectives.DiscreteSkillSACLoss"},
+            "trainer": {"_component_": f"torchrl_hmcts.trainers.{trainer}"},
+            "planner": self.planner_part(),
+        }
+
+    def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
+        """Return the planner that the configuration describes.
+
+        Args:
+            simulator: the macro env to plan in.
+            **budget: changes of its :class:`~torchrl_hmcts.planners.SearchBudget`.
+        """
+        part = merged(self.planner_part(), self.config.planner)
+        part["budget"] = {**part["budget"], **budget}
+        planner: MCTSPlanner = build(**part, env=simulator)
+        return planner
+
+    def second_try(self) -> Kit | None:
+        """Return the kit with which starts are searched again that have no plan; None for none."""
+        return None
+
+    # ------------------------------------------------------- figures and pages
+
+    def path_lengths(self, starts: TensorDictBase) -> np.ndarray:
+        """Return a measure of how far each start is from its goal, for the choice of pictures."""
+        return np.zeros(len(starts))
+
+    def figures(self, trial: Trial) -> dict[str, Any]:
+        """Return the figures of a trial; what counts as solved is a terminal state."""
+        return trial.results.summary()
+
+    def extras(self, worker: TensorDictModuleBase) -> dict[str, Any]:
+        """Return the figures of further tests, by name."""
+        return {}
+
+    def metrics(self, learned: LearnedSkills, trial: Trial) -> dict[str, Any]:
+        """Return the figures of a run."""
+        return {
+            "training_base_steps": learned.steps,
+            "training_rounds": learned.rounds,
+            "worker_base_steps": learned.worker_step,
+            "training_cpu_seconds": learned.seconds,
+            "test": self.figures(trial),
+        }
+
+    def curves(self, learned: LearnedSkills) -> dict[str, Curve]:
+        """Return the curves of a training by name."""
+        return {
+            name: (np.linspace(0, learned.steps, len(values), endpoint=False), values)
+            for name, values in learned.history.items()
+        }
+
+    def map(self, env: EnvBase) -> Any:
+        """Return what draws the states of a base env; None where there is no map.
+
+        See :class:`~torchrl_hmcts.trainers.figures.maps.MapDrawing`.
+        """
+        return None
+
+    def draw(self, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
+        """Draw the pictures of a run: an episode, its search, the skills, their training."""
+        config, captions = self.config, self.captions
+        shown, episode, search = self.replay(learned.worker, trial)
+        states, options = episode.states[0], episode.options[0].tolist()
+        plan, env = episode.plans[0], self.make_env("test")
+        drawing = self.map(env)
+        if drawing is not None:
+            words = captions["episode.gif" if episode.solved[0] else "unsolved"]
+            with pictures.one("episode.gif", words) as path:
+                from torchrl_hmcts.trainers.figures.maps import write_episode_gif
+
+                write_episode_gif(drawing, list(states.unbind(0)), options, plan, path)
+            with pictures.one("search.png", captions["search.png"]) as path:
+                from torchrl_hmcts.trainers.figures.maps import plot_search
+
+                plot_search(drawing, search, path)
+        if learned.loss is None:
+            return
+        if drawing is not None:
+            steps = learned.worker_step * config.frames_per_step
+            seen = f" The worker of all pictures is that after {steps:,} {self.unit}."
+            with pictures.one("skills.png", captions["skills.png"] + seen) as path:
+                from torchrl_hmcts.trainers.figures.maps import plot_skill_fan
+
+                generator = torch.Generator().manual_seed(config.seed)
+                sampling = SkillPolicy(learned.loss.actor_network, generator=generator)
+                maze = int(trial.starts[shown].get("maze_index", torch.zeros(())))
+                rooms = drawing.rooms(10 * config.num_skills, maze)
+                steps = 100 // config.frames_per_step
+                plot_skill_fan(sampling, rooms, path, num_skills=config.num_skills, steps=steps)
+        with pictures.one("losses.png", captions["losses.png"]) as path:
+            from torchrl_hmcts.trainers.figures.curves import plot_losses
+
+            plot_losses(learned.history, learned.steps, path)
+
+    def replay(self, worker: TensorDictModuleBase, trial: Trial) -> tuple[int, Results, Any]:
+        """Play an episode again to show it: one that was solved, if any, with a rather long way.
+
+        Returns:
+            Which of the starts, the episode with its states, and its search.
+        """
+        solved = np.flatnonzero(trial.results.solved)
+        among = solved if len(solved) else np.arange(len(trial.starts))
+        by_length = among[np.argsort(self.path_lengths(trial.starts)[among], kind="stable")]
+        shown = int(by_length[int(0.85 * (len(by_length) - 1))])
+        real = self.make_options(self.make_env("test"), worker, list(self.state_keys))
+        start = trial.starts[shown : shown + 1]
+        episode = plan_and_execute(trial.planner, real, start, keys=list(self.state_keys))
+        return shown, episode, trial.planner.last_search
+
+    def table(self, metrics: Mapping[str, Any]) -> str:
+        """Return what is printed at the end of a run."""
+        test = metrics["test"]
+        return f"{test['solved']} of {test['starts']} starts solved at the first trial."
+
+
+def make_kit(config: SkillsConfig) -> Kit:
+    """Return the kit of a configuration.
+
+    Args:
+        config: its ``KIT`` names the kit.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+        >>> type(make_kit(DemoConfig())).__name__
+        'WaterworldKit'
+    """
+    path = f"{__name__}.{KITS[config.KIT]}"
+    module, _, name = path.rpartition(".")
+    kit: Kit = getattr(importlib.import_module(module), name)(config)
+    return kit

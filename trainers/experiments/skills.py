@@ -1,0 +1,457 @@
+"""The whole agent over any kit: learn skills, plan over them, execute the plans, show it all."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
+from torchrl.record.loggers import Logger
+from tqdm import tqdm
+
+from torchrl_hmcts.modules import (
+    SkillDiscriminator,
+    SkillDynamics,
+    SkillEncoder,
+    SkillPolicy,
+    SpectralLinear,
+)
+from torchrl_hmcts.objectives import SkillObjective
+from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.trainers.collectors import make_ray_collector
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
+from torchrl_hmcts.trainers.experiments.kits import (
+    OBJECTIVE,
+    Kit,
+    LearnedSkills,
+    Trial,
+    make_kit,
+)
+from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, SkillsConfig
+from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
+from torchrl_hmcts.trainers.parts import build, merged
+from torchrl_hmcts.trainers.runs.loggers import make_logger
+from torchrl_hmcts.trainers.runs.run import Run, open_run
+from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
+from torchrl_hmcts.trainers.skills.curves import Curves
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
+from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
+
+_REWARD_SCALES = {"METRAEncoderLoss": 3.0, "LSDEncoderLoss": 10.0, "SkillDynamicsLoss": 0.5}
+_CURVE_EXPANSIONS = 300  # of a search while the worker learns
+
+
+def run_skills(config: SkillsConfig) -> dict[str, Any]:
+    """Run the agent over a kit and return its figures, as they are written to ``metrics.json``.
+
+    Args:
+        config: keys of the experiment; ``KIT`` of its class names the kit.
+
+    Returns:
+        The figures. Times are in seconds, steps in base steps.
+
+    Reference:
+        Dissertation, chapter 4 (tree search over skills), on the mazes of chapters 3 and 4.
+    """
+    with open_run(config) as run:
+        return _run(run.config.sized(), run)
+
+
+def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
+    torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
+    kit = make_kit(config)
+    begin = time.perf_counter()
+    logger = make_logger(config)
+    learned = learn(
+        kit,
+        save_dir=run.checkpoints,
+        logger=logger,
+        resume=run.resumes,
+        progress=lambda total: tqdm(
+            total=total if total < 2**31 - 1000 else None, desc="train", unit="step", disable=None
+        ),
+    )
+    logger.close()
+    if learned.loss is not None:
+        save_worker(run.path, learned.loss, learned.worker_step)
+    train_seconds = time.perf_counter() - begin
+    trial = solve(kit, learned.worker, say=print)
+    metrics: dict[str, Any] = {
+        "seed": config.seed,
+        "train_seconds": round(train_seconds, 2),
+        **kit.metrics(learned, trial),
+        **kit.extras(learned.worker),
+    }
+    metrics["seconds"] = round(time.perf_counter() - begin, 2)
+    run.write_curves(kit.curves(learned), kit.curve_steps)
+    with run.finish(metrics, config, title=kit.title) as pictures:
+        print("Drawing ...", flush=True)
+        kit.draw(pictures, learned, trial)
+    print(kit.table(metrics))
+    return metrics
+
+
+def evaluate_skills(config: SkillsConfig) -> dict[str, Any]:
+    """Solve test starts with the worker of a run.
+
+    Args:
+        config: of the run, whose folder is ``out``; changed keys change the test.
+
+    Returns:
+        Figures of plans that are executed open-loop, one trial per start (``"test"``), and those of
+        the kit's further tests.
+
+    Reference:
+        Dissertation, figure 4.10.
+    """
+    torch.set_num_threads(1)
+    kit = make_kit(config.sized())
+    checkpoint, worker = "", given_worker(kit)
+    if worker is None:
+        loss = make_loss(kit)
+        checkpoint = load_networks(loss, config.out).name
+        worker = SkillPolicy(loss.actor_network, deterministic=True)
+    return {
+        "checkpoint": checkpoint,
+        "test": kit.figures(solve(kit, worker)),
+        **kit.extras(worker),
+    }
+
+
+# ---------------------------------------------------------------- learning
+
+
+def learn(
+    kit: Kit,
+    *,
+    save_dir: str | Path | None = None,
+    progress: Callable[..., Any] | None = None,
+    logger: Logger | None = None,
+    resume: bool = False,
+) -> LearnedSkills:
+    """Train a worker as the configuration of the kit says.
+
+    Args:
+        kit: whose env it learns in.
+        save_dir: folder of the checkpoints. Default: none are written.
+        progress: makes a progress bar, e.g. ``tqdm.tqdm``.
+        logger: of TorchRL; gets the training's values and, as ``test_solved`` and ``test_frames``,
+            those of the tests on the way. Default: none.
+        resume: continue from the newest checkpoint in ``save_dir``.
+
+    Reference:
+        Dissertation, algorithm 3 and figures 4.6 to 4.10.
+    """
+    config = kit.config
+    begin = time.process_time()
+    given = given_worker(kit)
+    if given is not None:
+        return LearnedSkills(given, None, {}, RoundRecords(), 0, 0, 0, 0.0)
+    frames = config.train_steps * config.frames_per_step
+    print(f"Learning {config.num_skills} skills in {frames:,} {kit.unit} ...", flush=True)
+    loss = make_loss(kit)
+    common = {"save_dir": save_dir, "progress": progress, "logger": logger, "seed": config.seed}
+    common |= {"total_frames": config.train_steps, **config.trainer}
+    trainer: ResumableTrainer
+    tests: CurveTests | None = None
+    if config.algorithm == "hmcts":
+        trainer = _make_hmcts(kit, loss, common)
+    else:
+        trainer = _make_diayn(kit, loss, common)
+        if config.curve_points:
+            tests = CurveTests(trainer, kit, _curve_interval(config))
+    kept = [key for key in config.KEPT if key != "toy"]
+    trainer.run_settings.update({name: getattr(config, name) for name in kept})
+    if resume and save_dir is not None:
+        trainer.load(save_dir)
+    trainer.train()
+    step = trainer.collected_frames
+    if tests is not None and config.keep == "best":
+        step = tests.restore_best()
+    rounds = isinstance(trainer, HMCTSTrainer)
+    records = trainer.test_records if isinstance(trainer, HMCTSTrainer) else RoundRecords()
+    return LearnedSkills(
+        SkillPolicy(loss.actor_network, deterministic=True),
+        loss,
+        Curves(trainer.history),
+        records if tests is None else tests.records,
+        trainer.collected_frames,
+        step,
+        len(trainer.records) if rounds else 0,
+        round(time.process_time() - begin, 1),
+    )
+
+
+def given_worker(kit: Kit) -> TensorDictModuleBase | None:
+    """Return the worker of options that need no learning; None where they are learned.
+
+    Args:
+        kit: with ``options="actions"`` an option repeats one action.
+    """
+    if kit.config.options == "learned":
+        return None
+    env = kit.make_env("test")
+    kit.config = dataclasses.replace(kit.config, num_skills=int(env.action_spec.space.n))
+    return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+
+
+def make_loss(kit: Kit) -> Any:
+    """Build actor, critics and objective of the worker.
+
+    The actor sees the kit's ``worker_keys``; DIAYN's discriminator the displacement since the skill
+    began, other objectives the place; DIAYN's critics the displacement too.
+
+    Args:
+        kit: gives the env, the keys, and the configuration with its seed.
+    """
+    config, env = kit.config, kit.make_training_env(1)
+    node = merged(OBJECTIVE, config.objective)
+    keywords = dict(config.loss)
+    critic_keys = list(kit.worker_keys)
+    if node != OBJECTIVE:
+        keywords["objective"] = make_objective(kit, env, node)
+    if node["_component_"] == OBJECTIVE["_component_"]:
+        critic_keys.append("displacement")
+    return DIAYNTrainer.make_loss(
+        env,
+        config.num_skills,
+        in_keys=kit.worker_keys,
+        critic_keys=critic_keys,
+        seed=config.seed,
+        **keywords,
+    )
+
+
+def make_objective(kit: Kit, env: EnvBase, node: Mapping[str, Any]) -> SkillObjective:
+    """Build a skill objective with the network that it learns.
+
+    Args:
+        kit: gives the keys.
+        env: whose specs give the sizes.
+        node: path of the class, and keywords.
+    """
+    name, number = node["_component_"].rpartition(".")[2], kit.config.num_skills
+    spec = env.full_observation_spec_unbatched
+    place = int(spec[kit.place_key].shape[-1])
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(kit.config.seed)
+        if name == "SkillDiscriminatorLoss":
+            network: Any = SkillDiscriminator(int(spec["displacement"].shape[-1]), number)
+        elif name == "SkillDynamicsLoss":
+            keys = {"in_keys": [kit.place_key], "target_key": kit.place_key}
+            network = SkillDynamics(place, place, number, **keys)
+        else:
+            linear = SpectralLinear if name == "LSDEncoderLoss" else torch.nn.Linear
+            network = SkillEncoder(place, number, in_keys=[kit.place_key], linear=linear)
+    first = {"SkillDiscriminatorLoss": "discriminator", "SkillDynamicsLoss": "dynamics"}
+    objective: SkillObjective = build(**node, **{first.get(name, "encoder"): network})
+    return objective
+
+
+def _curve_interval(config: SkillsConfig) -> int:
+    return max(BATCH_STEPS, config.train_steps // config.curve_points)
+
+
+def _make_diayn(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> DIAYNTrainer:
+    config = kit.config
+    own: dict[str, Any] = {
+        "frames_per_batch": BATCH_STEPS,
+        "updates_per_batch": config.updates_per_batch,
+        "make_collector": make_ray_collector if config.collector == "ray" else Collector,
+    }
+    if config.curve_points:
+        own["save_trainer_interval"] = _curve_interval(config)
+    scale = _REWARD_SCALES.get(type(loss.objective).__name__)
+    if scale is not None:
+        own["reward"] = SkillReward(loss.objective, intrinsic_coeff=scale)
+    path = kit.parts()["trainer"]["_component_"]
+    return build(path, env=kit.make_training_env(), loss_module=loss, **{**own, **keywords})
+
+
+def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTrainer:
+    config = kit.config
+    options = config.num_skills * config.option_steps
+    batch = config.retrain_interval * config.round_expansions * options
+    expected = max(1, (config.train_steps - config.init_options * config.option_steps) // batch)
+    own: dict[str, Any] = {
+        "rounds": 2**31,  # ended by total_frames
+        "num_init_samples": config.init_options,
+        "retrain_interval": config.retrain_interval,
+        "option_steps": config.option_steps,
+        "make_options": partial(OptionTransform, gamma=config.gamma),
+        "make_recorder": partial(OptionRecorder, position_key=kit.place_key),
+        "make_planner": partial(
+            MCTSPlanner,
+            novelty=RadiusNovelty(kit.place_key, config.novelty_radius),
+            budget=SearchBudget(expansions=config.round_expansions),
+        ),
+        "updates_per_step": config.updates_per_step,
+    }
+    if config.curve_points:
+        own |= {
+            "make_test_env": partial(kit.make_env, "curve"),
+            "make_test_planner": lambda simulator, **_: kit.make_planner(
+                simulator, **_curve_budget(config)
+            ),
+            "test_rounds": config.curve_mazes,
+            "test_interval": max(1, round(expected / config.curve_points)),
+        }
+    make_env = partial(kit.make_env, "train")
+    return HMCTSTrainer(make_env, loss, **{**own, **keywords})
+
+
+def _curve_budget(config: SkillsConfig) -> dict[str, int]:
+    return {"expansions": min(_CURVE_EXPANSIONS, config.expansions)}
+
+
+class CurveTests:
+    """Tries the worker in held-out mazes while a ``DIAYNTrainer`` trains it, for Figure 4.10.
+
+    Random numbers of the training are not touched. The networks that solved the most mazes are
+    kept, of several the latest: skills keep changing, and the last ones need not be the best. Those
+    of the test before the training are never kept: they are no learned skills.
+
+    Args:
+        trainer: whose loss has the actor.
+        kit: of the experiment.
+        interval: base steps between two tests; there is one before and one after the training.
+    """
+
+    def __init__(self, trainer: DIAYNTrainer, kit: Kit, interval: int) -> None:
+        self.trainer, self.kit, self.interval = trainer, kit, interval
+        self.records = RoundRecords()
+        self._at = -1  # base steps at the latest test
+        self._best: dict[str, Any] = {}  # "solved", how many, the "loss" that did, and its "step"
+        worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
+        self.model = kit.make_simulator(worker, "curve")
+        self.real = kit.make_options(kit.make_env("curve"), worker)
+        with torch.random.fork_rng(devices=[]):  # a new env draws its seed
+            self.starts = kit.starts("curve", kit.config.curve_mazes)
+        trainer.register_op("setup", self)
+        trainer.register_op("post_steps_log", self)
+        trainer.register_module("curve_tests", self)
+
+    def __call__(self, batch: TensorDictBase | None = None) -> None:
+        config, steps = self.kit.config, self.trainer.collected_frames
+        due = self._at < 0 or steps - self._at >= self.interval
+        if not due and not self._at < steps >= self.trainer.total_frames:
+            return
+        self._at = steps
+        with seeded(config.seed, "test", 0):
+            planner = self.kit.make_planner(self.model, **_curve_budget(config))
+            results = plan_and_execute(planner, self.real, self.starts)
+        self.records.add(results, np.arange(len(results.solved)), steps)
+        solved = int(results.solved.sum())
+        if steps > 0 and solved >= self._best.get("solved", 0):
+            state = self.trainer.loss_module.state_dict()
+            self._best = {
+                "solved": solved,
+                "step": steps,
+                "loss": {name: value.clone() for name, value in state.items()},
+            }
+        logger = self.trainer.logger
+        if logger is not None:
+            frames = results.episode_steps * config.frames_per_step
+            frames = np.where(results.solved, frames, config.max_frames)
+            logger.log_scalar("test_solved", float(results.solved.mean()), step=steps)
+            logger.log_scalar("test_frames", float(frames.mean()), step=steps)
+
+    def restore_best(self) -> int:
+        """Give the loss back the networks that solved the most mazes; return their base steps.
+
+        Those of the end stay where nothing is known of others, in a run of an older version.
+        """
+        if not self._best:
+            return self.trainer.collected_frames
+        self.trainer.loss_module.load_state_dict(self._best["loss"])
+        return int(self._best["step"])
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"at": self._at, "records": self.records.state_dict(), "best": self._best}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        self._at = int(state_dict["at"])
+        self.records.load_state_dict(state_dict["records"])
+        best = dict(state_dict.get("best", {}))
+        self._best = best if "step" in best else {}  # an older version may have kept the untrained
+
+
+# ---------------------------------------------------------------- planning and acting
+
+
+def solve(
+    kit: Kit, worker: TensorDictModuleBase, *, say: Callable[..., Any] = lambda *_, **__: None
+) -> Trial:
+    """Plan in the simulator and execute the plan in another instance: one trial per test start.
+
+    Args:
+        kit: of the experiment.
+        worker: executes the options.
+        say: told what is done, e.g. ``print``. Default: nobody is.
+    """
+    config = kit.config
+    starts = kit.starts("test", config.mazes)
+    planner = kit.make_planner(kit.make_simulator(worker))
+    say("Compiling the search (a moment; about half a minute the first time) ...", flush=True)
+    begin = time.perf_counter()
+    kit.make_planner(kit.make_simulator(worker)).plan(starts[:1])
+    compile_seconds = time.perf_counter() - begin
+    say(f"Solving {config.mazes} test mazes that the worker has never seen ...", flush=True)
+    cpu = time.process_time()
+    quiet = None if say is print else True
+    results = _solve(kit, worker, planner, starts, quiet)
+    again, other = np.flatnonzero(~results.found), kit.second_try()
+    if other is None:
+        again = again[:0]
+    elif len(again):  # nothing has been executed there yet
+        second_planner = other.make_planner(other.make_simulator(worker))
+        some = starts[torch.from_numpy(again)]
+        second = _solve(other, worker, second_planner, some, quiet)
+        results = with_second_search(results, again, second)
+    seconds = time.process_time() - cpu
+    return Trial(starts, planner, results, len(again), compile_seconds, seconds)
+
+
+def _solve(
+    kit: Kit,
+    worker: TensorDictModuleBase,
+    planner: MCTSPlanner,
+    starts: TensorDictBase,
+    quiet: bool | None,
+) -> Results:
+    """Plan and act from a group of starts after the other."""
+    real = kit.make_options(kit.make_env("test"), worker)
+    parts: list[Results] = []
+    bar = tqdm(starts.split(kit.group), desc="plan and act", unit="group", disable=quiet)
+    for some in bar:
+        parts.append(plan_and_execute(planner, real, some, group=kit.group))
+        bar.set_postfix(solved=int(sum(part.solved.sum() for part in parts)))
+    return Results.concatenate(parts)
+
+
+def with_second_search(first: Results, again: np.ndarray, second: Results) -> Results:
+    """Return results where some starts have what a second search gave, at the cost of both.
+
+    Args:
+        first: of all starts.
+        again: indices of those that were searched again.
+        second: what came of these.
+    """
+    columns = {k: v.copy() for k, v in vars(first).items()}
+    for name in ("simulated_steps", "expansions", "simulations"):
+        columns[name][again] += getattr(second, name)
+    for name in ("found", "solved", "plan_options", "episode_steps"):
+        columns[name][again] = getattr(second, name)
+    return Results(**columns)
