@@ -243,7 +243,6 @@ GOOD: dict[str, Good] = {
         AtariSearch={},
         RuleSource={},
         DemoConfig={},
-        TerminationConfig={},
         StateCoverage={},
         ScriptedExpert={},
         SharedRMSprop={"params": lambda: [nn.Parameter(torch.zeros(2))]},
