@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from torchrl_hmcts.arguments import name_all_arguments
 from torchrl_hmcts.envs.atari.goals import (
     ByteGoal,
     FollowGoals,
@@ -11,8 +10,11 @@ from torchrl_hmcts.envs.atari.goals import (
 )
 from torchrl_hmcts.envs.atari.pool import AtariOptionPool
 from torchrl_hmcts.envs.atari.ram import AtariRAMEnv
-from torchrl_hmcts.envs.atari.workers import OptionWorker, RepeatActions, SharedMLP
+from torchrl_hmcts.envs.atari.workers import RepeatActions, SharedMLP
+from torchrl_hmcts.envs.gym.option_pool import OptionPool
+from torchrl_hmcts.envs.gym.option_run import OptionWorker
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv
+from torchrl_hmcts.envs.gym.skill_worker import SkillWorker
 from torchrl_hmcts.envs.gym.snapshots import (
     AttributeSnapshot,
     ReplaySnapshot,
@@ -54,11 +56,13 @@ __all__ = [
     "LAB_ACTIONS",
     "LabMazeEnv",
     "OccasionalAction",
+    "OptionPool",
     "OptionWorker",
     "RepeatActions",
     "ReplaySnapshot",
     "SettableGymEnv",
     "SharedMLP",
+    "SkillWorker",
     "Snapshot",
     "SnapshotError",
     "StatelessSimulator",
@@ -80,5 +84,4 @@ __all__ = [
     "wall_centers",
 ]
 
-name_all_arguments(globals(), __all__)
 register_envs()

@@ -105,6 +105,7 @@ class AtariEmulator:
         self.states = EmulatorStates(raw, self.game)
         """Turns states into rows of bytes and back."""
         self.screen_is_stale = False
+        self._drawing: AtariEmulator | None = None
         self._sent = self._held = _NO_OP
         self._twister: Any = np.random.MT19937(0)  # ALE's own generator, followed draw by draw
         self._follow(EmulatorStates.rng_of(self._serialize(include_rng=True)))
@@ -292,6 +293,18 @@ class AtariEmulator:
         """Return the picture on the screen, uint8 ``[210, 160, 3]``."""
         picture: np.ndarray = self.ale.getScreenRGB()
         return picture
+
+    def draw(self, row: np.ndarray) -> np.ndarray:
+        """Return the picture of a state, uint8 ``[210, 160, 3]``, drawn by another emulator.
+
+        A state has no picture: it is that of one frame later, in which nothing is done.
+        """
+        if self._drawing is None:
+            config: Any = {**self._config, "frame_skip": 1, "repeat_action_probability": 0.0}
+            self._drawing = AtariEmulator(**config)
+        self._drawing.set_state(row)
+        self._drawing.act(0)
+        return self._drawing.screen()
 
 
 # Games for two, of which ALE ends the whole process when they are loaded for one player.

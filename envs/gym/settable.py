@@ -18,11 +18,16 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.envs import GymWrapper
 
-from torchrl_hmcts.envs.gym.snapshots import DEFAULT_CAP, Snapshot, SnapshotError, snapshot_of
+from torchrl_hmcts.envs.gym.snapshots import (
+    DEFAULT_CAP,
+    SNAPSHOT_KEY,
+    Snapshot,
+    SnapshotError,
+    snapshot_of,
+)
 
 # Packages that register their envs when they are imported, and the extra that installs them.
 _PACKAGES = ("gymnasium_robotics", "minigrid", "ogbench", "ale_py")
-_KEY = "snapshot"
 
 
 class PrivateRandom(gymnasium.Wrapper):
@@ -37,14 +42,19 @@ class PrivateRandom(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
-        self._states = _seeded_states(0)
+        self.seed(0)
+
+    def seed(self, seed: int) -> None:
+        """Seed its own states of the global generators."""
+        state = np.random.RandomState(seed % 2**32).get_state()
+        self._states: tuple[Any, Any] = state, random.Random(seed).getstate()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the env; a seed also seeds its own states of the global generators."""
         if seed is not None:
-            self._states = _seeded_states(seed)
+            self.seed(seed)
         return self._inside(lambda: self.env.reset(seed=seed, options=options))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -156,10 +166,6 @@ def _set_global_states(states: tuple[Any, Any]) -> None:
     random.setstate(states[1])
 
 
-def _seeded_states(seed: int) -> tuple[Any, Any]:
-    return np.random.RandomState(seed % 2**32).get_state(), random.Random(seed).getstate()
-
-
 class SettableGymEnv(GymWrapper):
     """A Gymnasium env that a planner can set to any state, right to the bit.
 
@@ -217,7 +223,7 @@ class SettableGymEnv(GymWrapper):
         self.__dict__["_snapshot"] = stored
         super().__init__(made, categorical_action_encoding=True, device=device, **theirs)
         row = Unbounded((stored.width,), dtype=torch.uint8, device=device)
-        self.observation_spec[_KEY] = row
+        self.observation_spec[SNAPSHOT_KEY] = row
         self.state_spec = self.observation_spec.clone()
         self._discrete = type(made.action_space) is spaces.Discrete and made.action_space.start == 0
         self._single = None if isinstance(made.observation_space, spaces.Dict) else "observation"
@@ -253,7 +259,7 @@ class SettableGymEnv(GymWrapper):
                 "reset(td, set_state=True) needs the entries that the env wrote: "
                 f"{sorted(map(str, keys))}; missing: {given or 'all'}."
             )
-        self.snapshot.restore(tensordict.get(_KEY).cpu().numpy())
+        self.snapshot.restore(tensordict.get(SNAPSHOT_KEY).cpu().numpy())
         return tensordict.select(*keys)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -275,7 +281,7 @@ class SettableGymEnv(GymWrapper):
 
     def _with_row(self, td: TensorDictBase) -> TensorDictBase:
         row = torch.from_numpy(self.snapshot.read())
-        return td.set(_KEY, row if self.device is None else row.to(self.device))
+        return td.set(SNAPSHOT_KEY, row if self.device is None else row.to(self.device))
 
     def __repr__(self) -> str:
         spec = self._env.spec

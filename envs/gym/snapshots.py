@@ -13,6 +13,8 @@ import gymnasium
 import numpy as np
 from gymnasium.wrappers import TimeLimit
 
+SNAPSHOT_KEY = "snapshot"
+"""Entry of a tensordict that holds the row of a state."""
 DEFAULT_CAP = 1 << 16
 """Bytes of a row that a general snapshot may fill, unless told otherwise."""
 _GENERATOR_BYTES = 41  # a flag, PCG64's state and increment, its spare 32 bits
@@ -611,11 +613,13 @@ def _kinds() -> tuple[Any, ...]:
     """The kinds of snapshots, special ones first."""
     from torchrl_hmcts.envs.gym.atari import ALESnapshot
     from torchrl_hmcts.envs.gym.box2d import Box2DSnapshot
+    from torchrl_hmcts.envs.gym.classic import ClassicSnapshot
     from torchrl_hmcts.envs.gym.minigrid import MiniGridSnapshot
     from torchrl_hmcts.envs.gym.mujoco import MujocoSnapshot
     from torchrl_hmcts.envs.gym.tables import ToyTextSnapshot
 
     return (
+        ClassicSnapshot,
         MujocoSnapshot,
         MiniGridSnapshot,
         ALESnapshot,

@@ -1,4 +1,4 @@
-"""What the server imports that starts a pool's processes, so that each of them starts at once."""
+"""Imports for the server that starts a pool's processes, so that each of them starts at once."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import contextlib
 
 import numpy as np
 
-from torchrl_hmcts.envs import atari_process  # noqa: F401
-from torchrl_hmcts.envs.atari.workers import SharedMLP
+from torchrl_hmcts.envs import SharedMLP
+from torchrl_hmcts.envs.gym import processes  # noqa: F401
 
 with contextlib.suppress(ImportError):
     import ale_py  # noqa: F401
