@@ -317,7 +317,10 @@ EXCLUDED = {  # public names that are not fuzzed here, and why
     **dict.fromkeys(["GoalEpisodes", "GoalTrack", "TerminationResult"], "a record of results"),
     **dict.fromkeys(["NoveltyTest", "PlansGoals", "OptionWorker"], "a protocol"),
     **dict.fromkeys(["SkillObjective", "SkillPrior"], "a base class"),
-    **dict.fromkeys(["AtariOptionPool", "AtariRAMEnv", "DeepMindLabEnv"], "starts processes"),
+    **dict.fromkeys(
+        ["AtariOptionPool", "AtariRAMEnv", "DeepMindLabEnv", "OptionPool"], "starts processes"
+    ),
+    "SkillWorker": "takes an actor: test_option_pool.py",
     "StatelessSimulator": "takes an env, and has its own tests",
     **dict.fromkeys(
         ["AttributeSnapshot", "ReplaySnapshot", "SettableGymEnv", "Snapshot", "SnapshotError"],

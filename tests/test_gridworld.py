@@ -274,7 +274,7 @@ class TestBadInput:
             GridworldMazeEnv(torch.tensor([[[False, True, False]]]))
 
     def test_time_limit_below_one_is_refused(self):
-        with pytest.raises(ValueError, match="max_steps must be at least 1, got 0"):
+        with pytest.raises(ValueError, match="max_steps >= 1; got 0"):
             GridworldMazeEnv(max_steps=0)
 
     @pytest.mark.parametrize(
@@ -286,8 +286,8 @@ class TestBadInput:
             ("player_tile", 2, r'"player_tile" = 2, \(row, col\) = \(0, 2\), is a wall of maze 0'),
             ("target_tile", 4, '"target_tile" = 4.* is a wall'),
             ("step_count", [-3], '"step_count" = -3'),
-            ("step_count", 3, r'"step_count" must be int64 \[1\].*got torch.int64 \[\]'),
-            ("player_tile", 0.0, '"player_tile" must be int64.*float32'),
+            ("step_count", 3, r'"step_count" must be torch.int64 \[1\].*got torch.int64 \[\]'),
+            ("player_tile", 0.0, '"player_tile" must be torch.int64.*float32'),
             ("position", [float("nan"), 0.5], '"position" = .*nan.* contradicts "player_tile"'),
             ("target", [0.5, 0.5], '"target" = .* contradicts "target_tile"'),
         ],

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchrl_hmcts.envs import lab_maze, replay_recording
-from torchrl_hmcts.envs.lab.mazes import _distances
+from torchrl_hmcts.envs import lab_maze, replay_recording, shortest_path_lengths
 from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
 
 DATA = Path(__file__).parent / "data" / "lab_recordings.json.gz"
@@ -130,7 +129,7 @@ def test_mazes_have_the_statistics_of_the_level(
         maze = letters(lab_maze(seed, size, size))
         counts.append([(maze == letter).sum() for letter in "*PAG"])
         goal = tuple(np.argwhere(maze == "G")[0])
-        distance = np.array(_distances((maze != "*").tolist(), goal))
+        distance = shortest_path_lengths(torch.from_numpy(maze == "*"), goal).numpy()
         assert ((maze == "P") == (distance > 5)).all()
         assert ((maze == "A") == ((distance > 0) & (distance < 5))).all()
         assert goal[0] % 2 == goal[1] % 2 == 1

@@ -27,6 +27,7 @@ class ClassicSnapshot(Snapshot):
     def __init__(self, env: gymnasium.Env) -> None:
         env.reset(seed=0)
         self._own: Any = env.unwrapped
+        self._counts = hasattr(self._own, "steps_beyond_terminated")
         clocks = [vars(layer) for layer in env_layers(env) if type(layer) is TimeLimit]
         self._clock: dict[str, Any] = clocks[0] if clocks else {}
 
@@ -64,5 +65,6 @@ class ClassicSnapshot(Snapshot):
         *numbers, kind, length, steps, beyond = _ROW.unpack(row)
         values = tuple(numbers[:length])
         self._own.state = values if kind == 0 else np.array(values, _TYPES[kind])
-        self._own.steps_beyond_terminated = None if beyond < 0 else beyond
+        if self._counts:
+            self._own.steps_beyond_terminated = None if beyond < 0 else beyond
         self._clock["_elapsed_steps"] = steps

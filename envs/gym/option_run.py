@@ -15,14 +15,10 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 from torchrl.data.utils import CloudpickleWrapper
 
+from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
+from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
-from torchrl_hmcts.envs.gym.snapshots import (
-    SNAPSHOT_KEY,
-    AttributeSnapshot,
-    Snapshot,
-    env_layers,
-    snapshot_of,
-)
+from torchrl_hmcts.envs.gym.snapshots import SNAPSHOT_KEY, Snapshot, env_layers
 
 Shape = tuple[tuple[int, ...], Any]
 """Shape and dtype of an entry."""

@@ -18,12 +18,12 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.envs import GymWrapper
 
+from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.snapshots import (
     DEFAULT_CAP,
     SNAPSHOT_KEY,
     Snapshot,
     SnapshotError,
-    snapshot_of,
 )
 
 # Packages that register their envs when they are imported, and the extra that installs them.
@@ -176,7 +176,7 @@ class SettableGymEnv(GymWrapper):
         env (str, gymnasium.Env or callable): an id, an env, or a function that makes one. It is
             reset.
         snapshot (type, tuple of two functions, or callable, optional): how its state is stored,
-            see :func:`~torchrl_hmcts.envs.gym.snapshots.snapshot_of`. Default: found by itself, and
+            see :func:`~torchrl_hmcts.envs.gym.families.snapshot_of`. Default: found by itself, and
             named in the ``repr``.
         cap (int): bytes of the attributes in a row at most. Default 65,536.
         seed (int, optional): of the starts of its episodes. Default: drawn from torch's global
@@ -195,7 +195,7 @@ class SettableGymEnv(GymWrapper):
         >>> first = env.step(env.rand_action(start.clone()))["next", "observation"]
         >>> _ = env.reset(start, set_state=True)
         >>> env
-        SettableGymEnv(CartPole-v1, snapshot=AttributeSnapshot, ... bytes)
+        SettableGymEnv(CartPole-v1, snapshot=ClassicSnapshot, 80 bytes)
 
     Reference:
         Towers et al., "Gymnasium: A Standard Interface for Reinforcement Learning Environments",

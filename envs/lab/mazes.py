@@ -5,11 +5,12 @@ Letters: R rows, C columns of the text map, border included; M mazes.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
 from operator import index
 
+import torch
+
 from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
+from torchrl_hmcts.envs.mazes.layouts import shortest_path_lengths
 
 WALL, OPEN, APPLE, SPAWN, GOAL = "*", " ", "A", "P", "G"
 OPENING_PROBABILITY = 0.15
@@ -70,7 +71,7 @@ def lab_maze(seed: int, rows: int = 9, columns: int = 9, *, mixer_seed: int = 0)
             if random.uniform_real() < OPENING_PROBABILITY:
                 is_open[row][column] = True
     goal = _even_cell(random, rows, columns)
-    distance = _distances(is_open, goal)
+    distance = shortest_path_lengths(~torch.tensor(is_open), goal).tolist()
     return tuple(
         "".join(
             _letter(is_open[row][column], distance[row][column], (row, column) == goal)
@@ -115,26 +116,3 @@ def _carve(random: MersenneTwister64, rows: int, columns: int) -> list[list[bool
         is_open[(row + r) // 2][(column + c) // 2] = is_open[r][c] = True
         path.append((r, c))
     return is_open
-
-
-def _distances(is_open: Sequence[Sequence[bool]], start: tuple[int, int]) -> list[list[int]]:
-    """Steps between neighbouring open cells from a cell, -1 where there is no way."""
-    distance = [[-1] * len(row) for row in is_open]
-    distance[start[0]][start[1]] = 0
-    queue = deque([start])
-    while queue:
-        row, column = queue.popleft()
-        for r, c in _neighbours(row, column):
-            if (
-                0 <= r < len(is_open)
-                and 0 <= c < len(is_open[0])
-                and is_open[r][c]
-                and distance[r][c] < 0
-            ):
-                distance[r][c] = distance[row][column] + 1
-                queue.append((r, c))
-    return distance
-
-
-def _neighbours(row: int, column: int) -> Iterator[tuple[int, int]]:
-    yield from ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1))
