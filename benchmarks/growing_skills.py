@@ -37,7 +37,7 @@ from torchrl_hmcts.modules import (
 from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
+from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
 from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
@@ -156,7 +156,7 @@ def measure(worker_name: str, seed: int, base_steps: int, num_mazes: int) -> dic
         leaves_per_wave=config.leaves_per_wave,
         seed=0,
     )
-    solved = plan_and_carry_out(planner, real, starts)
+    solved = plan_and_execute(planner, real, starts)
     wide = coverage_planner(env)
     coverage = torch.cat(
         [search_coverage(wide.search(group), env.base_env) for group in starts.split(38)]

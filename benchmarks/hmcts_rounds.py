@@ -25,7 +25,7 @@ from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
+from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env, make_training_env
 from torchrl_hmcts.trainers.figures.solving_curves import plot_solving_curves
@@ -79,7 +79,7 @@ def learn(args: argparse.Namespace, seed: int, dataset: TensorDictBase | None) -
     )
     planner = plan_by(simulator, budget=SearchBudget(expansions=1000))
     starts = make_starts(real.base_env, args.mazes, seed)
-    final = plan_and_carry_out(planner, real, starts).summary()
+    final = plan_and_execute(planner, real, starts).summary()
     return {
         "seed": seed,
         "dataset_base_steps": 0 if dataset is None else len(dataset),

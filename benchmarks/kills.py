@@ -43,7 +43,8 @@ import random, sys, torch
 import numpy
 for seed in (random.seed, numpy.random.seed, torch.manual_seed):
     seed(0)  # saved, though nothing that counts is drawn from them
-from torchrl_hmcts.trainers import a3c, resume
+from torchrl_hmcts.trainers.a3c import trainer as a3c
+from torchrl_hmcts.trainers.saving import resume
 for module in (a3c, resume):
     module.FIRST_SAVE_SECONDS, module.SAVE_SECONDS = 0.3, 1.0
 from torchrl_hmcts.trainers.cli import main

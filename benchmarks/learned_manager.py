@@ -29,7 +29,7 @@ from torchrl.envs import EnvBase
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MaxBackup, MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
+from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
@@ -93,7 +93,7 @@ def learned_planners(env: EnvBase, network: MazeNetwork) -> dict[str, MCTSPlanne
 def measure(planner: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> dict[str, Any]:
     """Plan from all starts and carry the plans out; search alone once more, for the time."""
     planner.search(starts[:1])  # compiles the kernels
-    results = plan_and_carry_out(planner, real, starts)
+    results = plan_and_execute(planner, real, starts)
     few = starts[:: max(1, len(starts) // 40)]  # one maze after the other, as an agent meets them
     seconds = []
     for i in range(len(few)):

@@ -43,7 +43,7 @@ from torchrl_hmcts.objectives import (
 )
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
+from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env, make_training_env
 from torchrl_hmcts.transforms import SkillReward
@@ -143,7 +143,7 @@ def evaluate(loss: DiscreteSkillSACLoss, num_mazes: int, seed: int) -> dict[str,
         budget=SearchBudget(expansions=1000),
     )
     starts = make_starts(real.base_env, num_mazes, seed)
-    results = plan_and_carry_out(planner, real, starts).summary()
+    results = plan_and_execute(planner, real, starts).summary()
     moved = mean_displacements(
         worker, lambda copies: make_training_env(mazes, num_skills=NUM_SKILLS, copies=copies)
     )

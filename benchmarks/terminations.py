@@ -31,7 +31,7 @@ from torchrl.envs import TransformedEnv
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy, TerminationNetwork
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
 from torchrl_hmcts.trainers.runs.config import DemoConfig
@@ -114,7 +114,7 @@ def evaluate(
         budget=budget,
     )
     starts = make_starts(real.base_env, len(mazes), workers.seed)
-    return plan_and_carry_out(planner, real, starts)
+    return plan_and_execute(planner, real, starts)
 
 
 def tune(

@@ -20,7 +20,7 @@ import torch
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out, spread
+from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
 from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
@@ -42,7 +42,7 @@ def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     planner = MCTSPlanner(
         env, novelty=novelty, budget=budget, leaves_per_wave=config.leaves_per_wave
     )
-    solved = plan_and_carry_out(planner, real, starts)
+    solved = plan_and_execute(planner, real, starts)
     wide = MCTSPlanner(
         env,
         novelty=RadiusNovelty("position", RADIUS),

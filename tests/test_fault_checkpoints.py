@@ -24,8 +24,8 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 from torchrl.envs import Compose, TransformedEnv
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
-from torchrl_hmcts.trainers import checkpoints
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.saving import checkpoints
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     check_settings,

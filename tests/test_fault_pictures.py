@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from torchrl.record.loggers import CSVLogger, Logger
 
-from torchrl_hmcts.trainers import cli, files
+from torchrl_hmcts.trainers import cli
 from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.report import finish
 from torchrl_hmcts.trainers.runs.loggers import ScalarLoggers
+from torchrl_hmcts.trainers.saving import files
 from torchrl_hmcts.trainers.saving.files import left_out, replacing, write_text
 
 FULL = OSError(errno.ENOSPC, "No space left on device")

@@ -348,8 +348,8 @@ def test_players_of_the_lab_move_the_same(monkeypatch: pytest.MonkeyPatch) -> No
     compiled = walk(90)
     plain = in_python("torchrl_hmcts.envs.lab.kernels")
     for module, names in (
-        ("lab_maze", ("advance", "read_out")),
-        ("lab_states", ("overlaps_wall",)),
+        ("lab.maze_env", ("advance", "read_out")),
+        ("lab.states", ("overlaps_wall",)),
     ):
         for name in names:
             monkeypatch.setattr(sys.modules[f"{ENVS}.{module}"], name, getattr(plain, name))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from torchrl_hmcts.envs import lab_maze, replay_recording, shortest_path_lengths
 from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64

@@ -147,7 +147,7 @@ def test_the_worker_that_solved_the_most_mazes_is_kept_of_several_the_latest(
         two = np.full(2, 7)
         return Results(yes, yes, two, two, two, two, two)
 
-    monkeypatch.setattr(training, "plan_and_carry_out", scripted)
+    monkeypatch.setattr(training, "plan_and_execute", scripted)
     config = LabMazeConfig(
         algorithm="diayn", train_frames=600, curve_mazes=2, curve_points=2, keep="best"
     )

@@ -193,7 +193,7 @@ def test_every_third_party_import_is_declared(module: str) -> None:
         ("torchrl_hmcts.envs.mazes.layouts", "import torchrl_hmcts"),
         ("torchrl_hmcts.envs.mazes.layouts", "from torchrl_hmcts.planners import MCTSPlanner"),
         ("torchrl_hmcts.envs.mazes.layouts", "from torchrl_hmcts import planners"),
-        ("torchrl_hmcts.envs.mazes.layouts", "from .. import testing"),
+        ("torchrl_hmcts.envs.mazes.layouts", "from ... import testing"),
         (
             "torchrl_hmcts.envs.mazes.layouts",
             "import importlib\nimportlib.import_module('torchrl_hmcts.trainers')",

@@ -18,11 +18,11 @@ from torchrl_hmcts.envs import (
     maze_from_text,
     maze_pool,
     maze_to_text,
-    mazes,
     shortest_path,
     shortest_path_lengths,
     wall_centers,
 )
+from torchrl_hmcts.envs.mazes import layouts
 from torchrl_hmcts.envs.mazes.pool_cache import pool_cache_path, pool_digest, read_pool, write_pool
 from torchrl_hmcts.envs.mazes.wall_growing import draw_mazes
 
@@ -34,9 +34,9 @@ GOLDEN_SHA256 = "cba98569ef76344ee619bbfc73b69ce3f545cf2dfba06fde46cb7d988c19d63
 def fresh_pool(tmp_path, monkeypatch):
     """A cache folder of this test's own, and no pool in memory before or after."""
     monkeypatch.setenv("TORCHRL_HMCTS_CACHE", str(tmp_path / "cache"))
-    mazes._pool.cache_clear()
+    layouts._pool.cache_clear()
     yield tmp_path / "cache"
-    mazes._pool.cache_clear()
+    layouts._pool.cache_clear()
 
 
 def reachable_by_hand(maze):
@@ -157,8 +157,8 @@ class TestPool:
     def test_second_process_reads_the_cache_instead_of_generating(self, fresh_pool, monkeypatch):
         pool = maze_pool()
         assert len(list(fresh_pool.iterdir())) == 1  # no temporary file stays behind
-        mazes._pool.cache_clear()
-        monkeypatch.setattr(mazes, "generate_mazes", lambda *a, **k: pytest.fail("generated"))
+        layouts._pool.cache_clear()
+        monkeypatch.setattr(layouts, "generate_mazes", lambda *a, **k: pytest.fail("generated"))
         assert torch.equal(maze_pool(), pool)
 
     @pytest.mark.parametrize("damage", ["empty", "text", "truncated", "bit", "pickle", "shape"])
@@ -174,7 +174,7 @@ class TestPool:
             np.save(path, pool.numpy()[:7])
         else:
             path.write_bytes({"empty": b"", "text": b"hello", "truncated": good[:500]}[damage])
-        mazes._pool.cache_clear()
+        layouts._pool.cache_clear()
         assert torch.equal(maze_pool(), pool)
         assert path.read_bytes() == good
 

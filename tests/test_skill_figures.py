@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torchrl_hmcts.envs import maze_from_text
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
 from torchrl_hmcts.trainers.figures.skill_figures import (
     search_coverage,
@@ -80,7 +80,7 @@ def test_coverage_counts_the_tiles_in_front_of_the_target_only() -> None:
 def test_a_plan_is_carried_out_to_its_end_and_its_steps_are_counted() -> None:
     env = ChainEnv(length=4)
     starts = env.reset().expand(3).clone()
-    results = plan_and_carry_out(MCTSPlanner(env), ChainEnv(length=4), starts, group=2)
+    results = plan_and_execute(MCTSPlanner(env), ChainEnv(length=4), starts, group=2)
     distance = 3  # states 0 to 3, the reward is at the end
     assert results.solved.tolist() == [True] * 3
     assert results.plan_options.tolist() == results.episode_steps.tolist() == [distance] * 3
@@ -89,7 +89,7 @@ def test_a_plan_is_carried_out_to_its_end_and_its_steps_are_counted() -> None:
 
 def test_a_plan_that_fails_in_the_real_env_is_not_solved() -> None:
     env, longer = ChainEnv(length=4), ChainEnv(length=6)  # the end is farther than the model says
-    results = plan_and_carry_out(MCTSPlanner(env), longer, env.reset()[None])
+    results = plan_and_execute(MCTSPlanner(env), longer, env.reset()[None])
     assert (results.found.tolist(), results.solved.tolist()) == ([True], [False])
     assert results.summary()["solved"] == 0
     assert np.isnan(results.summary()["episode_steps"]["median"])
@@ -98,7 +98,7 @@ def test_a_plan_that_fails_in_the_real_env_is_not_solved() -> None:
 def test_a_start_without_a_plan_costs_its_search_and_no_step() -> None:
     env = ChainEnv(length=30)
     planner = MCTSPlanner(env, budget=SearchBudget(expansions=3))
-    results = plan_and_carry_out(planner, ChainEnv(length=30), env.reset()[None])
+    results = plan_and_execute(planner, ChainEnv(length=30), env.reset()[None])
     assert (results.found.tolist(), results.episode_steps.tolist()) == ([False], [0])
     assert results.expansions.tolist() == [3]
 

@@ -23,10 +23,11 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers import A3CTrainer, resume, stopping
+from torchrl_hmcts.trainers import A3CTrainer
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.runs.folder import read_run
+from torchrl_hmcts.trainers.saving import resume, stopping
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.stopping import Stopped
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform

@@ -1,28 +1,137 @@
-"""What a planner over a worker's options achieves: plans, carried out open-loop in a real env.
+"""Executing plans open-loop in a real env, and what it achieved.
 
-Letters: M starts, A options.
+Letters: M starts, L options of the longest plan, T base steps of an episode.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.planners import MCTSPlanner, extract_plans
+from torchrl_hmcts.planners import MCTSPlanner, Plan, extract_plans
+from torchrl_hmcts.planners.simulator import Simulator
+
+
+@dataclass
+class Execution:
+    """What executing plans led to, one entry per start ``[M]``.
+
+    Attributes:
+        solved (ndarray): bool, whether the episode met a terminal state.
+        base_steps (ndarray): int64, base steps that were taken.
+        rewards (ndarray): float32, sum of the rewards of the options.
+        states (list of TensorDictBase): with ``keys`` the chosen entries ``[T + 1]`` before the
+            first and after every base step; of an env without a ``"trajectory"`` after every
+            option. Empty without ``keys``.
+        options (list of Tensor): int64 ``[T]``, the option under way between two states.
+
+    Example:
+        >>> import numpy as np
+        >>> Execution(np.array([True]), np.array([3]), np.array([1.0])).base_steps.tolist()
+        [3]
+    """
+
+    solved: np.ndarray
+    base_steps: np.ndarray
+    rewards: np.ndarray
+    states: list[TensorDictBase] = field(default_factory=list)
+    options: list[Tensor] = field(default_factory=list)
+
+
+@torch.no_grad()
+def execute_plans(
+    real: EnvBase, starts: TensorDictBase, options: Tensor, *, keys: Sequence[NestedKey] = ()
+) -> Execution:
+    """Take the options of each plan one after the other, until it or the episode ends.
+
+    Args:
+        real: the macro environment to act in, which can be set to states; not the planner's.
+        starts: states ``[M]``.
+        options: int64 ``[M, L]``, negative behind a plan's end, as in
+            :class:`~torchrl_hmcts.planners.Plan`.
+        keys: entries of the states to return, e.g. ``["position"]``. To have them after every base
+            step, build the ``OptionTransform`` with ``trajectory_keys``. Default: none.
+
+    Returns:
+        What it led to, in the order of the starts.
+
+    Raises:
+        ValueError: if the env cannot be set to the starts, or has no such entry.
+
+    Example:
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env = ChainEnv(length=4)  # option 1 goes right, to the reward at the end
+        >>> right = torch.ones(1, 3, dtype=torch.int64)
+        >>> executed = execute_plans(env, env.reset().unsqueeze(0), right, keys=["state"])
+        >>> executed.solved.tolist(), executed.states[0]["state"].flatten().tolist()
+        ([True], [0, 1, 2, 3])
+    """
+    simulator = Simulator(real, mask_key=None)
+    simulator.keep(keys)
+    state = simulator.state(simulator.root(starts)).clone()
+    taken = options.cpu().numpy()
+    count = len(taken)
+    out = Execution(
+        np.zeros(count, np.bool_), np.zeros(count, np.int64), np.zeros(count, np.float32)
+    )
+    path = [([row.select(*keys)], []) for row in state.clone().split(1)] if keys else []
+    running = np.ones(count, np.bool_)
+    for i in range(taken.shape[1]):
+        running &= taken[:, i] >= 0
+        rows = np.flatnonzero(running)
+        if not len(rows):
+            break
+        index = torch.from_numpy(rows)
+        after = simulator.step(state[index], taken[rows, i])
+        out.solved[rows] = simulator.terminated(after)
+        out.base_steps[rows] += simulator.durations(after)
+        out.rewards[rows] += simulator.rewards(after)
+        running[rows] = ~simulator.done(after)
+        state[index] = simulator.state(after)
+        if keys:
+            for row, step in zip(rows, after.split(1), strict=True):
+                _follow(step, int(taken[row, i]), keys, *path[row])
+    out.states = [torch.cat(states) for states, _ in path]
+    out.options = [torch.tensor(under_way, dtype=torch.int64) for _, under_way in path]
+    return out
+
+
+def _follow(
+    after: TensorDictBase,
+    option: int,
+    keys: Sequence[NestedKey],
+    states: list[TensorDictBase],
+    options: list[int],
+) -> None:
+    """Append the states after the base steps of one option, and the option as often."""
+    inner = after.get("trajectory", None)
+    length = 1
+    if inner is not None:
+        length = int(inner["mask"].sum())
+        states.append(inner[0, 1:length].select(*keys))
+    states.append(after.select(*keys))
+    options += [option] * length
 
 
 @dataclass
 class Results:
-    """One entry per start, ``[M]``.
+    """What planning and executing the plans gave, one entry per start ``[M]``.
 
-    ``found`` a plan and ``solved`` by carrying it out (bool); ``simulated_steps`` base steps that
+    ``found`` a plan and ``solved`` by executing it (bool); ``simulated_steps`` base steps that
     the search simulated, ``expansions`` of nodes and ``simulations`` of options it took,
-    ``plan_options`` in the plan, ``episode_steps`` base steps that were carried out (int64).
+    ``plan_options`` in the plan, ``episode_steps`` base steps that were executed (int64). From
+    :func:`plan_and_execute` also the ``rewards`` of the episode (float32), ``plan_seconds`` of the
+    search (float64, a group's divided among its starts), the ``plans``, and with ``keys`` the
+    ``states`` and ``options`` of an :class:`Execution`.
 
     Example:
         >>> import numpy as np
@@ -39,6 +148,11 @@ class Results:
     simulations: np.ndarray
     plan_options: np.ndarray
     episode_steps: np.ndarray
+    rewards: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    plan_seconds: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    plans: list[Plan] = field(default_factory=list)
+    states: list[TensorDictBase] = field(default_factory=list)
+    options: list[Tensor] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
         """Return counts, and mean, median and 95th percentile of each cost.
@@ -58,10 +172,14 @@ class Results:
         return out
 
     @staticmethod
-    def concatenate(parts: list[Results]) -> Results:
+    def concatenate(parts: Sequence[Results]) -> Results:
         """Join results of several groups of starts."""
-        names = Results.__dataclass_fields__
-        return Results(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+        columns: dict[str, Any] = {}
+        for name in (column.name for column in fields(Results)):
+            values = [getattr(part, name) for part in parts]
+            lists = isinstance(values[0], list)
+            columns[name] = sum(values, []) if lists else np.concatenate(values)
+        return Results(**columns)
 
 
 def spread(values: Any) -> dict[str, float]:
@@ -81,17 +199,23 @@ def spread(values: Any) -> dict[str, float]:
     }
 
 
-def plan_and_carry_out(
-    planner: MCTSPlanner, real: EnvBase, starts: TensorDictBase, *, group: int = 38
+def plan_and_execute(
+    planner: MCTSPlanner,
+    real: EnvBase,
+    starts: TensorDictBase,
+    *,
+    group: int = 38,
+    keys: Sequence[NestedKey] = (),
 ) -> Results:
-    """Plan from every start, carry the plans out in another env, and report.
+    """Plan from every start, execute the plans in another env, and report.
 
     Trees do not depend on what is searched beside them, so the results are those of one search
-    after the other; a group of starts is only faster.
+    after the other; a group of starts is only faster. ``planner.last_search`` is that of the last
+    group.
 
     Args:
         planner: over the worker's options.
-        real: the macro environment in which plans are carried out, stateless; not the planner's.
+        real, keys: as of :func:`execute_plans`.
         starts: states ``[M]``.
         group: starts planned side by side; 38 divides the 342 test mazes.
 
@@ -103,43 +227,34 @@ def plan_and_carry_out(
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> env = ChainEnv(length=5)
         >>> starts = env.reset().expand(2).clone()
-        >>> plan_and_carry_out(MCTSPlanner(env), ChainEnv(length=5), starts).solved.tolist()
-        [True, True]
+        >>> results = plan_and_execute(MCTSPlanner(env), ChainEnv(length=5), starts)
+        >>> results.solved.tolist(), results.plans[0].options.tolist()
+        ([True, True], [1, 1, 1, 1])
     """
-    return Results.concatenate(
-        [
-            _plan_and_carry_out(planner, real, starts[begin : begin + group])
-            for begin in range(0, len(starts), group)
-        ]
-    )
+    parts = []
+    for some in starts.split(group):
+        begin = time.perf_counter()
+        search = planner.search(some)
+        plans = extract_plans(search)
+        seconds = (time.perf_counter() - begin) / len(some)
+        executed = execute_plans(real, some, plans.options, keys=keys)
+        parts.append(
+            Results(
+                found=plans.found.numpy(),
+                solved=executed.solved,
+                simulated_steps=search.num_base_steps.copy(),
+                expansions=search.num_expansions.copy(),
+                simulations=search.num_simulations.copy(),
+                plan_options=plans.lengths.numpy(),
+                episode_steps=executed.base_steps,
+                rewards=executed.rewards,
+                plan_seconds=np.full(len(some), seconds),
+                plans=list(plans.unbind(0)),
+                states=executed.states,
+                options=executed.options,
+            )
+        )
+    return Results.concatenate(parts)
 
 
-def _plan_and_carry_out(planner: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> Results:
-    search = planner.search(starts)
-    plans = extract_plans(search)
-    option_key = planner.option_key
-    state = starts.clone()
-    steps = torch.zeros(len(starts), dtype=torch.int64)
-    solved = torch.zeros(len(starts), dtype=torch.bool)
-    running = plans.lengths > 0
-    for i in range(int(plans.lengths.max())):
-        running &= plans.lengths > i
-        if not running.any():
-            break
-        before = state[running]
-        after = real.step(before.set(option_key, plans.options[running, i]))["next"]
-        duration = after.get("duration", None)
-        taken = torch.ones(len(after), dtype=torch.int64) if duration is None else duration[:, 0]
-        steps[running] += taken
-        solved[running] = after["terminated"][:, 0]
-        state[running] = after.select(*state.keys(True, True))
-        running[running.clone()] = ~after["done"][:, 0]
-    return Results(
-        found=plans.found.numpy(),
-        solved=solved.numpy(),
-        simulated_steps=search.num_base_steps.copy(),
-        expansions=search.num_expansions.copy(),
-        simulations=search.num_simulations.copy(),
-        plan_options=plans.lengths.numpy(),
-        episode_steps=steps.numpy(),
-    )
+plan_and_carry_out = plan_and_execute  # its name until every room calls it by the new one

@@ -20,7 +20,7 @@ from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MCTSPlanner, SearchBudget
 from torchrl_hmcts.trainers.diayn import Progress, make_skill_optimizer
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
+from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.skills.dataset import UnionSampler, load_dataset
 from torchrl_hmcts.trainers.skills.rounds import PlanningRounds, RoundRecords, seeded
@@ -319,7 +319,7 @@ class HMCTSTrainer(ResumableTrainer):
             return
         planner = self._planner_for_tests(self._test_env)
         with seeded(self.seed, "test", 0):
-            results = plan_and_carry_out(planner, self._test_env, self._test_starts)
+            results = plan_and_execute(planner, self._test_env, self._test_starts)
         figures = self.test_records.add(
             results, np.arange(len(results.solved)), self.collected_frames
         )

@@ -14,7 +14,7 @@ from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
+from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.lab.evaluation import (
@@ -98,7 +98,7 @@ def evaluate_demo(config: DemoConfig) -> dict[str, Any]:
     starts = make_starts(real.base_env, mazes, config.seed)
     return {
         "checkpoint": checkpoint.name,
-        "test": plan_and_carry_out(planner, real, starts).summary(),
+        "test": plan_and_execute(planner, real, starts).summary(),
     }
 
 

@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.planners import MCTSPlanner
-from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.transforms import OptionRecorder
 
 RECORDED = ("round", "training_steps", "solved", "found", "simulated_steps", "executed_steps")
@@ -180,7 +180,7 @@ class PlanningRounds:
     def _play(self, count: int, seed: int) -> None:
         planner = self.make_planner(self.simulator, seed=seed)
         starts = self._starts(count, seed)
-        results = plan_and_carry_out(planner, self.env, starts, group=count)
+        results = plan_and_execute(planner, self.env, starts, group=count)
         rounds = self.round + np.arange(count)
         self.latest = self.records.add(results, rounds, self.training_steps)
 

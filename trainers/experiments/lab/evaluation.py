@@ -22,7 +22,7 @@ from torchrl_hmcts.planners import (
     RadiusNovelty,
     SearchBudget,
 )
-from torchrl_hmcts.trainers.evaluation import Results, plan_and_carry_out, spread
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.lab.script import ShortestPathScript
 from torchrl_hmcts.trainers.experiments.lab.worker import (
     PLACE_KEY,
@@ -110,12 +110,12 @@ def solve_mazes(
     starts = make_starts(real.base_env, config.seed)
     planner = make_planner(config, model)
     begin = time.process_time()
-    results = plan_and_carry_out(planner, real, starts, group=GROUP)
+    results = plan_and_execute(planner, real, starts, group=GROUP)
     again = np.flatnonzero(~results.found) if config.stall_steps else np.zeros(0, np.int64)
     if len(again):  # nothing has been carried out there yet
         whole = dataclasses.replace(config, stall_steps=0)
         model, real = (make_maze_env(whole, worker, seeds, size) for _ in range(2))
-        second = plan_and_carry_out(
+        second = plan_and_execute(
             make_planner(whole, model), real, starts[torch.from_numpy(again)], group=GROUP
         )
         results = _with_second_search(results, again, second)
@@ -150,7 +150,7 @@ def summary(config: LabMazeConfig, results: Results, script: np.ndarray) -> dict
 
     Args:
         config: of the experiment.
-        results: of ``plan_and_carry_out``.
+        results: of ``plan_and_execute``.
         script: frames of the script, ``[M]``.
     """
     per_step, ok = config.frames_per_step, results.solved
@@ -222,7 +222,7 @@ def solve_with_wrong_model(
     real = make_maze_env(config, worker, seeds, **real_kwargs)
     starts = make_starts(real.base_env, config.seed)
     planner = make_planner(config, model)
-    blind = plan_and_carry_out(planner, real, starts, group=GROUP)
+    blind = plan_and_execute(planner, real, starts, group=GROUP)
     policy = ModelBasedControl(planner, env=real, replan_every=replan_every)
     episodes = [_act(policy, real, group) for group in starts.split(GROUP)]
     ok, gone, made = (torch.cat(column).numpy() for column in zip(*episodes, strict=True))

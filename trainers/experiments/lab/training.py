@@ -18,7 +18,7 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.objectives import DiscreteSkillSACLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer, Progress
-from torchrl_hmcts.trainers.evaluation import plan_and_carry_out
+from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.experiments.lab.config import (
     BATCH_STEPS,
     LabMazeConfig,
@@ -235,7 +235,7 @@ class CurveTests:
             planner = make_planner(
                 self.config, self.model, expansions=_curve_budget(self.config).expansions
             )
-            results = plan_and_carry_out(planner, self.real, self.starts)
+            results = plan_and_execute(planner, self.real, self.starts)
         self.records.add(results, np.arange(len(results.solved)), steps)
         solved = int(results.solved.sum())
         if steps > 0 and solved >= self._best.get("solved", 0):
