@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs.atari.states import EmulatorStates
 
 _NO_OP = 0
@@ -64,25 +65,14 @@ class AtariEmulator:
             "noop_max": noop_max,
         }
         self.game, rom = find_game(game)
-        for name, value, low in (
-            ("frame_skip", frame_skip, 1),
-            ("max_frames", max_frames, 1),
-            ("noop_max", noop_max, 0),
-        ):
-            if isinstance(value, bool) or not isinstance(value, int) or not low <= value < 2**31:
-                raise ValueError(
-                    f"{self.game}: {name} is an int >= {low} and < 2**31; got {value!r}."
-                )
-        if not 0.0 <= repeat_action_probability < 1.0:
-            raise ValueError(
-                f"{self.game}: repeat_action_probability is in [0, 1), 0.25 for sticky actions and "
-                f"0 for a deterministic emulator; got {repeat_action_probability}."
-            )
-        self.frame_skip = frame_skip
-        self.noop_max = noop_max
-        self.sticky = repeat_action_probability > 0.0
+        self.frame_skip = whole_number(self.game, "frame_skip", frame_skip, least=1)
+        self.noop_max = whole_number(self.game, "noop_max", noop_max)
+        max_frames = min(whole_number(self.game, "max_frames", max_frames, least=1), 2**31 - 1)
+        name = "repeat_action_probability"
+        sticky = real_number(self.game, name, repeat_action_probability, least=0.0, most=0.999)
+        self.sticky = sticky > 0.0
         # ALE keeps the probability in single precision, and compares it with a double.
-        self._probability = float(np.float32(repeat_action_probability))
+        self._probability = float(np.float32(sticky))
         self._state_type = ale_py.ALEState
         ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
         self.ale = ale_py.ALEInterface()
@@ -317,16 +307,15 @@ def find_game(game: str) -> tuple[str, str]:
     names = {rom.title().replace("_", ""): rom for rom in roms if rom not in _FOR_TWO}
     asked = str(game).removeprefix("ALE/").removesuffix("-v5")
     plain = {name.lower(): name for name in names}
-    found = plain.get(asked.replace("_", "").replace(" ", "").lower())
-    if found is None and asked.replace("_", "").replace(" ", "").lower() in {
-        rom.replace("_", "") for rom in _FOR_TWO
-    }:
+    word = asked.replace("_", "").replace(" ", "").lower()
+    found = plain.get(word)
+    if word in {rom.replace("_", "") for rom in _FOR_TWO}:
         raise ValueError(
             f"{game!r} is a game for two players only; ale-py plays it for two or more. Choose one "
             f"of the {len(names)} games for one player, e.g. Breakout, Pong, Seaquest."
         )
     if found is None:
-        near = difflib.get_close_matches(asked.replace("_", "").lower(), list(plain), 3, 0.4)
+        near = difflib.get_close_matches(word, list(plain), 3, 0.4)
         hint = ", ".join(plain[name] for name in near) or "e.g. Breakout, Pong, Seaquest"
         raise ValueError(f"ale-py has no game {game!r}. Nearest: {hint}; it has {len(names)}.")
     return found, names[found]

@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_hmcts.checks import real_number
 from torchrl_hmcts.envs.atari.emulator import AtariEmulator
 
 NO_OP_STARTS = 30
@@ -115,15 +116,10 @@ class AtariRAMEnv(EnvBase):
         device: torch.device | str | None = None,
     ) -> None:
         noop_max = no_op_starts(noop_max, repeat_action_probability)
-        if not 0.0 <= life_loss_penalty < float("inf"):
-            raise ValueError(
-                f"AtariRAMEnv takes life_loss_penalty >= 0 off the reward; got {life_loss_penalty}."
-            )
-        if reward_clip is not None and not reward_clip > 0.0:
-            raise ValueError(
-                f"AtariRAMEnv clips rewards to [-reward_clip, reward_clip], which is positive; got "
-                f"{reward_clip}."
-            )
+        name = "AtariRAMEnv"
+        self.life_loss_penalty = real_number(name, "life_loss_penalty", life_loss_penalty, least=0)
+        if reward_clip is not None:
+            reward_clip = real_number(name, "reward_clip", reward_clip, above=0.0)
         unknown = sorted(set(read_outs) - {"ram", "observation"})
         if unknown or isinstance(read_outs, str):
             raise ValueError(
@@ -146,7 +142,6 @@ class AtariRAMEnv(EnvBase):
         self.repeat_action_probability = float(repeat_action_probability)
         self.noop_max = noop_max
         self.terminal_on_life_loss = bool(terminal_on_life_loss)
-        self.life_loss_penalty = float(life_loss_penalty)
         self.reward_clip = reward_clip
         self.max_frames = max_frames
         self.action_names = emulator.action_names

@@ -5,6 +5,7 @@ Letters: H width of a layer, A actions, Z options.
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,9 +34,11 @@ class RepeatActions:
     """
 
     def __init__(self, actions: int | Sequence[int]) -> None:
-        self.actions = tuple(range(actions)) if isinstance(actions, int) else tuple(actions)
+        if isinstance(actions, numbers.Real):
+            actions = range(whole_number("RepeatActions", "actions", actions, least=1))
+        self.actions = tuple(actions)
         if not self.actions:
-            raise ValueError("RepeatActions needs at least one action; got none.")
+            raise ValueError("RepeatActions needs at least one action; got actions=().")
         self.num_options = len(self.actions)
 
     def act(self, ram: np.ndarray, option: int, generator: np.random.Generator) -> int:

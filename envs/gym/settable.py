@@ -18,6 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.envs import GymWrapper
 
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.snapshots import (
     DEFAULT_CAP,
@@ -228,9 +229,8 @@ class SettableGymEnv(GymWrapper):
         self._discrete = type(made.action_space) is spaces.Discrete and made.action_space.start == 0
         self._single = None if isinstance(made.observation_space, spaces.Dict) else "observation"
         self._generator = torch.Generator()
-        self._generator.manual_seed(
-            int(torch.randint(2**31, ())) if seed is None else _checked_seed(seed)
-        )
+        seed = int(torch.randint(2**31, ())) if seed is None else seed
+        self._set_seed(seed)
 
     @property
     def snapshot(self) -> Snapshot:
@@ -240,7 +240,7 @@ class SettableGymEnv(GymWrapper):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self._generator.manual_seed(_checked_seed(seed))
+            self._generator.manual_seed(whole_number("SettableGymEnv", "seed", seed))
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any
@@ -303,9 +303,3 @@ def _entries(observation: Any, name: str | None) -> dict[str, Any]:
 def _tensor(value: Any) -> torch.Tensor:
     """A copy: some envs write each observation into the same array."""
     return torch.from_numpy(np.array(value))
-
-
-def _checked_seed(seed: int) -> int:
-    if not 0 <= int(seed) < 2**63:
-        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}.")
-    return int(seed)

@@ -15,6 +15,7 @@ from tensordict.base import NO_DEFAULT
 from torch import Tensor
 from torchrl.data import Bounded, Categorical
 
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 from torchrl_hmcts.envs.lab.kernels import (
     APPLES,
@@ -161,16 +162,13 @@ class LabMazeEnv(MazeEnv):
     ) -> None:
         if mazes is None:
             mazes = [lab_maze(s, rows, columns) for s in maze_seeds]
-        for name, value, low, high in (
-            ("num_steps", num_steps, 1, 10**9),
-            ("max_frames", max_frames, 1, 2**62),
-            ("fps", fps, 15, 240),
-            ("friction", friction, 1.0, 60.0),
-            ("apple_reward", apple_reward, -1e6, 1e6),
-            ("goal_reward", goal_reward, -1e6, 1e6),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"LabMazeEnv needs {name} from {low} to {high}; got {value}.")
+        name = "LabMazeEnv"
+        self.num_steps = whole_number(name, "num_steps", num_steps, least=1)
+        self.max_frames = whole_number(name, "max_frames", max_frames, least=1)
+        self.fps = int(real_number(name, "fps", fps, least=15, most=240))
+        self.friction = real_number(name, "friction", friction, least=1.0, most=60.0)
+        self.apple_reward = real_number(name, "apple_reward", apple_reward)
+        self.goal_reward = real_number(name, "goal_reward", goal_reward)
         if clock not in ("constant", "exact"):
             raise ValueError(f'LabMazeEnv has the clocks "constant" and "exact"; got {clock!r}.')
         if clock_phase is None:
@@ -183,18 +181,13 @@ class LabMazeEnv(MazeEnv):
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         self.layout = LabLayout(mazes)
         self.num_mazes = len(self.layout)
-        self.num_steps = int(num_steps)
         self.actions = None if actions is None else {k: tuple(v) for k, v in actions.items()}
         self._table = action_table(LAB_ACTIONS if self.actions is None else self.actions)
         self.terminate_on_goal = bool(terminate_on_goal)
-        self.max_frames = int(max_frames)
-        self.fps = int(fps)
         self.frame_msec = int(960 / fps + 0.5)
         """Nominal milliseconds of a frame, in the engine's time."""
         self.exact_clock = clock == "exact"
         self.clock_phase = tuple(int(x) for x in clock_phase)
-        self.friction = float(friction)
-        self.apple_reward, self.goal_reward = float(apple_reward), float(goal_reward)
         self._read = LabReadOuts(self.layout, read_outs)
         if self.actions is not None:
             action: Any = Categorical(len(self.actions), shape=(), device=self.device)
