@@ -154,8 +154,8 @@ def test_mazes_differ_from_seed_to_seed_and_by_the_mixer_seed() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"rows": 8}, "odd number of rows, at least 5; got 8"),
-        ({"columns": 3}, "odd number of columns, at least 5; got 3"),
+        ({"rows": 8}, "odd numbers of rows and columns; got 8, 9"),
+        ({"columns": 3}, "columns >= 5; got 3"),
         ({"seed": -1}, "seed from 0 to .*; got -1"),
         ({"mixer_seed": 2**32}, "mixer_seed from 0"),
     ],

@@ -45,9 +45,8 @@ def state_keys(env: EnvBase) -> list[str]:
 
 
 def actions(env: EnvBase, *batch: int) -> torch.Tensor:
-    return torch.stack([env.action_spec.rand() for _ in range(torch.Size(batch).numel())]).reshape(
-        *batch, *env.action_spec.shape
-    )
+    drawn = [env.action_spec.rand() for _ in range(torch.Size(batch).numel())]
+    return torch.stack(drawn).reshape((*batch, *env.action_spec.shape))
 
 
 def play(env: Any, td: Any, taken: Any) -> list[Any]:

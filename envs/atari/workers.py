@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.envs.gym.shared_network import SharedNetwork, choose
 
 
@@ -36,6 +36,7 @@ class RepeatActions:
     def __init__(self, actions: int | Sequence[int]) -> None:
         if isinstance(actions, numbers.Real):
             actions = range(whole_number("RepeatActions", "actions", actions, least=1))
+        instance("RepeatActions", "actions", actions, Sequence)
         self.actions = tuple(actions)
         if not self.actions:
             raise ValueError("RepeatActions needs at least one action; got actions=().")
@@ -70,6 +71,7 @@ class SharedMLP(SharedNetwork):
 
     Example:
         >>> import numpy as np
+        >>> import torch
         >>> from torchrl_hmcts.envs import SharedMLP
         >>> from torchrl_hmcts.modules import SkillMLP
         >>> network = SkillMLP(128, out_features=4, num_skills=3, hidden=(128, 128, 128))
@@ -93,7 +95,14 @@ class SharedMLP(SharedNetwork):
         name = "SharedMLP"
         self.num_options = whole_number(name, "num_options", num_options, least=1)
         self.num_actions = whole_number(name, "num_actions", num_actions, least=1)
+        if self.num_options * self.num_actions > 2**24:
+            raise ValueError(
+                f"{name} has room for 2**24 outputs; got num_options={num_options} and "
+                f"num_actions={num_actions}."
+            )
+        instance(name, "hidden", hidden, tuple, list)
         widths = [whole_number(name, "every hidden width", width, least=1) for width in hidden]
+        instance(name, "deterministic", deterministic, bool)
         self.deterministic = deterministic
         super().__init__(128, self.num_actions, self.num_options, widths)
 

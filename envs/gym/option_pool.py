@@ -65,6 +65,7 @@ class OptionPool(ProcessPool):
         **keywords: of ``gymnasium.make``.
 
     Raises:
+        TypeError: if ``env`` is an env, which cannot be sent to processes.
         ImportError: if a package is missing; the extra that has it is named.
         ValueError: if an argument is out of range, or the state cannot be stored; when stepping, if
             an option is out of range.

@@ -15,7 +15,7 @@ from tensordict.base import NO_DEFAULT
 from torch import Tensor
 from torchrl.data import Bounded, Categorical
 
-from torchrl_hmcts.checks import real_number, whole_number
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 from torchrl_hmcts.envs.lab.kernels import (
     APPLES,
@@ -160,8 +160,6 @@ class LabMazeEnv(MazeEnv):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        if mazes is None:
-            mazes = [lab_maze(s, rows, columns) for s in maze_seeds]
         name = "LabMazeEnv"
         self.num_steps = whole_number(name, "num_steps", num_steps, least=1)
         self.max_frames = whole_number(name, "max_frames", max_frames, least=1)
@@ -169,20 +167,27 @@ class LabMazeEnv(MazeEnv):
         self.friction = real_number(name, "friction", friction, least=1.0, most=60.0)
         self.apple_reward = real_number(name, "apple_reward", apple_reward)
         self.goal_reward = real_number(name, "goal_reward", goal_reward)
+        instance(name, "clock", clock, str)
         if clock not in ("constant", "exact"):
             raise ValueError(f'LabMazeEnv has the clocks "constant" and "exact"; got {clock!r}.')
         if clock_phase is None:
             clock_phase = CLOCK_PHASE.get(fps, CLOCK_PHASE[60])
-        if len(clock_phase) != 2 or not 0 <= clock_phase[0] < 50 or abs(clock_phase[1]) > 100:
-            raise ValueError(
-                f"LabMazeEnv needs a clock_phase (0 to 49, -100 to 100) in milliseconds; got "
-                f"{tuple(clock_phase)}."
-            )
-        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        instance(name, "clock_phase", clock_phase, tuple, list)
+        if len(clock_phase) != 2:
+            raise ValueError(f"{name} needs two numbers for clock_phase; got {clock_phase}.")
+        real_number(name, "clock_phase[0]", clock_phase[0], least=0, most=49)
+        real_number(name, "clock_phase[1]", clock_phase[1], least=-100, most=100)
+        instance(name, "read_outs", read_outs, tuple, list)
+        instance(name, "mazes", mazes, tuple, list, type(None))
+        instance(name, "maze_seeds", maze_seeds, Sequence)
+        instance(name, "actions", actions, Mapping, type(None))
+        if mazes is None:
+            mazes = [lab_maze(s, rows, columns) for s in maze_seeds]
+        self._start(batch_size, device, terminate_on_goal=terminate_on_goal)
         self.layout = LabLayout(mazes)
         self.num_mazes = len(self.layout)
+        self._table = action_table(LAB_ACTIONS if actions is None else actions)
         self.actions = None if actions is None else {k: tuple(v) for k, v in actions.items()}
-        self._table = action_table(LAB_ACTIONS if self.actions is None else self.actions)
         self.terminate_on_goal = bool(terminate_on_goal)
         self.frame_msec = int(960 / fps + 0.5)
         """Nominal milliseconds of a frame, in the engine's time."""

@@ -5,10 +5,9 @@ Letters: R rows, C columns of the text map, border included; M mazes.
 
 from __future__ import annotations
 
-from operator import index
-
 import torch
 
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
 from torchrl_hmcts.envs.mazes.layouts import shortest_path_lengths
 
@@ -54,14 +53,20 @@ def lab_maze(seed: int, rows: int = 9, columns: int = 9, *, mixer_seed: int = 0)
         *AAAAGAA*
         *********
     """
-    for name, size in (("rows", rows), ("columns", columns)):
-        if size < 5 or size % 2 == 0:
-            raise ValueError(f"lab_maze needs an odd number of {name}, at least 5; got {size}.")
-    # Those of NumPy overflow, and are another type.
-    seed, mixer_seed, rows, columns = map(index, (seed, mixer_seed, rows, columns))
-    for name, value in (("seed", seed), ("mixer_seed", mixer_seed)):
-        if not 0 <= value < 2**32:
-            raise ValueError(f"lab_maze needs a {name} from 0 to 2**32 - 1; got {value}.")
+    rows, columns = (
+        whole_number("lab_maze", name, size, least=5)
+        for name, size in (("rows", rows), ("columns", columns))
+    )
+    if rows % 2 == 0 or columns % 2 == 0:
+        raise ValueError(f"lab_maze needs odd numbers of rows and columns; got {rows}, {columns}.")
+    seed, mixer_seed = (
+        whole_number("lab_maze", name, value)
+        for name, value in (("seed", seed), ("mixer_seed", mixer_seed))
+    )
+    if max(seed, mixer_seed) >= 2**32:
+        raise ValueError(
+            f"lab_maze needs seed and mixer_seed below 2**32; got {seed}, {mixer_seed}."
+        )
     mixer = mixer_seed << 32
     level_seed = MersenneTwister64(seed ^ mixer).uniform_int(1, 2**31 - 1)
     random = MersenneTwister64(level_seed ^ mixer)

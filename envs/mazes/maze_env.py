@@ -7,16 +7,16 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from operator import index
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.envs.mazes.layouts import check_mazes, free_tiles, maze_pool, wall_centers
 
 
@@ -27,6 +27,21 @@ class MazeEnv(EnvBase):
     _supports_set_state = True
     make_state_call = "env.make_state(...)"
     """Names the call that builds a state, in errors."""
+
+    def _start(
+        self, batch_size: Sequence[int], device: torch.device | str | None, **flags: bool
+    ) -> None:
+        """Begin the construction, after checking what all mazes are given."""
+        owner = type(self).__name__
+        for name, flag in flags.items():
+            instance(owner, name, flag, bool, np.bool_)
+        instance(owner, "batch_size", batch_size, tuple, list)
+        size = [whole_number(owner, "each of batch_size", n, least=1) for n in batch_size]
+        try:
+            torch.empty(0, device=device)
+        except (RuntimeError, TypeError) as error:
+            raise ValueError(f"{owner} cannot use device={device!r}: {error}") from error
+        EnvBase.__init__(self, device=device, batch_size=torch.Size(size))
 
     def _set_up(
         self,
@@ -48,9 +63,9 @@ class MazeEnv(EnvBase):
         self.reward_spec = reward.expand(*batch_size, 1)
         done = {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(done, device=device).expand(batch_size)
-        self.set_seed(
-            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
-        )
+        if seed is None:
+            seed = int(torch.empty((), dtype=torch.int64).random_())
+        self.set_seed(whole_number(type(self).__name__, "seed", seed))
 
     def _set_seed(self, seed: int | None) -> None:
         # On the CPU whatever the device: a seed gives the same episodes everywhere.
@@ -58,7 +73,7 @@ class MazeEnv(EnvBase):
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(index(seed))
+            self._generator.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if kwargs.get("set_state"):
@@ -171,11 +186,11 @@ class TileMazeEnv(MazeEnv):
         mazes = maze_pool("train") if mazes is None else mazes
         check_mazes(mazes)
         max_steps = whole_number(type(self).__name__, "max_steps", max_steps, least=1)
-        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        self._start(batch_size, device, observation=observation)
         self.num_mazes, self.height, self.width = mazes.shape
         self.num_walls = int(mazes[0].sum())
         self.max_steps = max_steps
-        self._writes_observation = bool(observation)
+        self._writes_observation = observation
         # Plain attributes, not buffers: EnvBase makes the lookup of a buffer slower than the step.
         self.mazes = mazes.to(self.device).clone()  # [M, H, W]
         self._wall_centers = wall_centers(self.mazes).flatten(1)  # [M, 2K]
