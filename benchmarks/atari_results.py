@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.figures.atari_results import (
+from torchrl_hmcts.trainers.figures.atari_scores import (
     RUNNING,
     TABLE_5_1,
     aggregate,
@@ -27,7 +27,7 @@ from torchrl_hmcts.trainers.figures.atari_results import (
     best_source,
     human_normalised,
 )
-from torchrl_hmcts.trainers.runs.folder import read_curves
+from torchrl_hmcts.trainers.saving.run_folder import read_curves
 
 UCT_SOURCE = "primitive actions, UCT"
 BEST = "the best of each game"
@@ -95,6 +95,16 @@ def add_known(rows: list[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
     return sorted(every, key=lambda row: tuple(map(str, key_of(row))))
 
 
+def print_game(protocol: str, source: str, game: str, runs: list[dict[str, Any]]) -> None:
+    """A row of the table: the runs of a game with one protocol and one source."""
+    best, last = ("/".join(f"{r[k]:g}" for r in runs) for k in ("score_max", "score_final"))
+    frames = "/".join(f"{r['frames'] / 1e6:.2f}M" for r in runs)
+    theirs = f"{TABLE_5_1[game].score} | {best_baseline(game)[1]:g}"
+    print(
+        f"| {protocol} | {source} | {game} | {len(runs)} | {best} | {last} | {frames} | {theirs} |"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="*")
@@ -113,44 +123,26 @@ def main() -> None:
         groups[row["protocol"], row["source"]].append(row)
     for protocol in sorted({row["protocol"] for row in rows}):
         for game in TABLE_5_1:
-            found = best_source(
-                [row for row in ours if row["game"] == game and row["protocol"] == protocol]
-            )
-            groups[protocol, BEST].extend(found)
-    summary = []
+            of = [row for row in ours if (row["game"], row["protocol"]) == (game, protocol)]
+            groups[protocol, BEST] += best_source(of)
     print(
         "| protocol | options | game | seeds | best episode | last episode | frames, all kinds | "
         "Table 5.1 | best of Table A.1 |\n|---|---|---|---|---|---|---|---|---|"
     )
+    summary = []
     for (protocol, source), members in sorted(groups.items()):
         for game in TABLE_5_1:
-            runs = [row for row in members if row["game"] == game]
-            if not runs:
-                continue
-            best = "/".join(f"{r['score_max']:g}" for r in runs)
-            last = "/".join(f"{r['score_final']:g}" for r in runs)
-            frames = "/".join(f"{r['frames'] / 1e6:.2f}M" for r in runs)
-            print(
-                f"| {protocol} | {source} | {game} | {len(runs)} | {best} | {last} | {frames} | "
-                f"{TABLE_5_1[game].score} | {best_baseline(game)[1]:g} |"
-            )
+            if runs := [row for row in members if row["game"] == game]:
+                print_game(protocol, source, game, runs)
+        games = sorted({row["game"] for row in members})
         for key in ("score_max", "score_final"):
-            games = sorted({row["game"] for row in members})
             scores = [[human_normalised(r, key) for r in members if r["game"] == g] for g in games]
-            middle, low, high = aggregate(scores)
-            summary.append(
-                {
-                    "protocol": protocol,
-                    "source": source,
-                    "of": key,
-                    "games": games,
-                    "interquartile_mean_human_normalised": round(middle, 3),
-                    # One run of a game says nothing about others of it.
-                    "interval_95": [round(low, 3), round(high, 3)]
-                    if min(map(len, scores)) > 1
-                    else None,
-                }
-            )
+            middle, *interval = (round(value, 3) for value in aggregate(scores))
+            row = {"protocol": protocol, "source": source, "of": key, "games": games}
+            row["interquartile_mean_human_normalised"] = middle
+            # One run of a game tells nothing about others of it.
+            row["interval_95"] = interval if min(map(len, scores)) > 1 else None
+            summary.append(row)
     for line in summary:
         print(json.dumps(line))
     if args.out is not None:

@@ -4,7 +4,7 @@
 
 A row is a game, a source and a protocol: the score of one episode of at most ``--real-steps`` base
 steps (4 frames each), the frames spent on finding the options and on the episode. Goals are found
-once per game and shared by the sources that go on from them. Rows that the file has already are not
+once per game and shared by the sources that begin with them. Rows that the file has already are not
 run again, so that it can be stopped.
 """
 
@@ -13,159 +13,113 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from torchrl_hmcts.envs import AtariOptionPool
 from torchrl_hmcts.trainers import (
-    ActionSetSource,
     AtariAgent,
+    AtariKit,
     AtariSearch,
-    DIAYNSource,
-    DistilledSource,
-    FineTunedSource,
-    GoalSearch,
-    GoalSource,
     Options,
-    RepeatSource,
-    RetrainedSource,
+    RuleSource,
     SearchGuide,
-    WorkerSource,
-    load_options,
+    TrainedSource,
 )
 from torchrl_hmcts.trainers.saving.files import write_json
 
-SMALL = GoalSearch(trial_steps=300, trial_ratio=5.0)
+SETTINGS = ("seed", "real_steps", "ratio", "option_steps", "base_steps")
+GUIDES = ("prior", "prior_value")
+PROTOCOLS = ("deterministic", "sticky")
 
 
-@dataclass(frozen=True)
-class Known:
-    """A source that gives what another has found, anew each time: weights are not shared."""
+@dataclass
+class Once:
+    """A source that is asked once, and gives copies of what it found: weights are not shared."""
 
-    options: Options
+    source: Any
+    found: Options | None = None
+    seconds: float = 0.0
 
-    def find(self, game: str, make_pool: Any, *, seed: int, log: Any) -> Options:
-        known = self.options
-        worker = load_options(known.saved)
-        return Options(
-            worker, known.names, known.num_frames, dict(known.report), known.saved, known.training
-        )
+    def find(self, kit: AtariKit) -> Options:
+        if self.found is None:
+            begin = time.process_time()
+            self.found = self.source.find(kit)
+            self.seconds = time.process_time() - begin
+        copy = Options.from_plain(self.found.plain())
+        return replace(copy, teacher=self.found.teacher, training=self.found.training)
 
 
-def sources(goals: Options, network: Options, steps: int, seed: int) -> dict[str, WorkerSource]:
-    """All sources by name; those of goals go on from what was found."""
+def seconds_spent(source: Any) -> float:
+    """What was spent before on a source and those that it begins with."""
+    if source is None:
+        return 0.0
+    return getattr(source, "seconds", 0.0) + seconds_spent(getattr(source, "source", None))
+
+
+def make_sources(steps: int) -> dict[str, Any]:
+    """All sources by name; those of goals share what was found."""
+    goals = Once(RuleSource("goals", trial_steps=300, trial_ratio=5.0))
+    network = Once(TrainedSource("distilled", goals))
+    skills = {"num_skills": 3, "base_steps": steps}
+    diayn = TrainedSource("diayn", **skills)
     return {
-        "repeat": RepeatSource(),
-        "action_sets": ActionSetSource(SMALL),
-        "goals": Known(goals),
-        "goals_network": Known(network),
-        "goals_fine_tuned": FineTunedSource(Known(network), steps),
-        "goals_retrained": RetrainedSource(Known(network)),
-        "diayn": DIAYNSource(3, steps),
-        "diayn_displacement": DIAYNSource(3, steps, discriminator="displacement"),
-        "diayn_controllable": DIAYNSource(3, steps, discriminator="controllable"),
-        "diayn_retrained": RetrainedSource(DIAYNSource(3, steps), intrinsic_weight=0.1),
+        "repeat": RuleSource("repeat"),
+        "action_sets": RuleSource("action_sets", trial_steps=300, trial_ratio=5.0),
+        "goals": goals,
+        "goals_network": network,
+        "goals_fine_tuned": TrainedSource("fine_tuned", network, base_steps=steps),
+        "goals_retrained": TrainedSource("retrained", network),
+        "diayn": diayn,
+        "diayn_displacement": TrainedSource("diayn", discriminator="displacement", **skills),
+        "diayn_controllable": TrainedSource("diayn", discriminator="controllable", **skills),
+        "diayn_retrained": TrainedSource("retrained", diayn, intrinsic_weight=0.1),
+        **{f"goals, guide={kind}": goals for kind in GUIDES},
     }
 
 
-def run_game(game: str, arguments: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
-    seed = arguments.seed
-
-    def make_pool(worker: Any, max_steps: int, **kwargs: Any) -> AtariOptionPool:
-        return AtariOptionPool(
-            game, worker, max_steps=max_steps, num_processes=0, seed=seed, **kwargs
-        )
-
-    def play(options: Options, sticky: bool, guide: SearchGuide | None) -> dict[str, Any]:
-        pool = make_pool(options.worker, arguments.option_steps)
-        real = None
-        if sticky:
-            real = AtariOptionPool(
-                game,
-                options.worker,
-                max_steps=arguments.option_steps,
-                num_processes=0,
-                repeat_action_probability=0.25,
-                seed=seed + 7_654_321,
-            )
-        search = AtariSearch(ratio=arguments.ratio)
-        agent = AtariAgent(pool, search, play_in=real, guide=guide, seed=seed)
-        progress = agent.play(max_steps=arguments.real_steps)
-        return {
-            "score": progress.score,
-            "real_steps": progress.real_steps,
-            "ended": progress.done,
-            "frames": agent.num_frames,
-            "options_taken": progress.options,
-        }
-
-    def missing(name: str) -> list[str]:
-        done = {(r["game"], r["source"], r["protocol"]) for r in rows}
-        return [p for p in ("deterministic", "sticky") if (game, name, p) not in done]
-
-    def record(name: str, options: Options, seconds: float, kind: str = "none") -> None:
-        for protocol in missing(name):
-            begin = time.process_time()
-            values = kind == "prior_value"
-            guide = None
-            if kind != "none":
-                guide = SearchGuide(options.worker.num_options, values=values, seed=seed)
-            row = {
-                "game": game,
-                "source": name,
-                "protocol": protocol,
-                "seed": seed,
-                **play(options, protocol == "sticky", guide),
-                "options": options.names,
-                "frames_finding_options": options.num_frames,
-                "cpu_seconds_finding": round(seconds, 1),
-                "cpu_seconds": round(time.process_time() - begin, 1),
-            }
-            rows.append(row)
-            print(row, flush=True)
-            save(arguments, rows)
-
-    names = list(sources_of_nothing(arguments))
-    if not any(missing(name) for name in names):
-        return
+def play(
+    kit: AtariKit, name: str, options: Options, protocol: str, args: argparse.Namespace
+) -> dict[str, Any]:
+    kind = name.partition("guide=")[2]
+    guide = None
+    if kind:
+        values = kind == "prior_value"
+        guide = SearchGuide(options.worker.num_options, values=values, seed=kit.seed)
     begin = time.process_time()
-    quiet = {"seed": seed, "log": print}
-    goals = GoalSource(SMALL).find(game, make_pool, **quiet)
-    found = time.process_time() - begin
-    network = DistilledSource(Known(goals)).find(game, make_pool, **quiet)
-    distilled = time.process_time() - begin
-    spent = {"goals": found}
-    for name, source in sources(goals, network, arguments.base_steps, seed).items():
-        if not missing(name):
-            continue
-        begin = time.process_time()
-        options = source.find(game, make_pool, **quiet)
-        before = spent.get(name, distilled if name.startswith("goals_") else 0.0)
-        record(name, options, before + time.process_time() - begin)
-    for kind in ("prior", "prior_value"):
-        record(f"goals, guide={kind}", goals, found, kind)
+    steps, sticky = args.option_steps, protocol == "sticky"
+    agent = AtariAgent(
+        kit.make_pool(options.worker, steps),
+        AtariSearch(ratio=args.ratio),
+        play_in=kit.make_pool(options.worker, steps, sticky=True) if sticky else None,
+        guide=guide,
+        seed=kit.seed,
+    ).play(max_steps=args.real_steps)
+    return {
+        "game": kit.game,
+        "source": name,
+        "protocol": protocol,
+        "seed": kit.seed,
+        "score": agent.score,
+        "real_steps": agent.real_steps,
+        "ended": agent.done,
+        "frames": agent.num_frames,
+        "options_taken": agent.options_taken,
+        "options": options.names,
+        "frames_finding_options": options.num_frames,
+        "cpu_seconds": round(time.process_time() - begin, 1),
+    }
 
 
-def sources_of_nothing(arguments: argparse.Namespace) -> list[str]:
-    nothing = Options(None, [], 0)  # type: ignore[arg-type]
-    names = list(sources(nothing, nothing, arguments.base_steps, arguments.seed))
-    return [*names, "goals, guide=prior", "goals, guide=prior_value"]
-
-
-def save(arguments: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
-    if arguments.out is not None:
-        settings = {
-            key: getattr(arguments, key)
-            for key in ("seed", "real_steps", "ratio", "option_steps", "base_steps")
-        }
-        words = " ".join(f"--{k.replace('_', '-')} {v}" for k, v in settings.items())
-        games = " ".join(sorted({row["game"] for row in rows}))
-        command = f"python benchmarks/atari_sources.py --games {games} {words}"
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(arguments.out, {"command": command, **settings, "rows": rows})
+def save(args: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
+    settings = {key: getattr(args, key) for key in SETTINGS}
+    words = " ".join(f"--{k.replace('_', '-')} {v}" for k, v in settings.items())
+    games = " ".join(sorted({row["game"] for row in rows}))
+    command = f"python benchmarks/atari_sources.py --games {games} {words}"
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(args.out, {"command": command, **settings, "rows": rows})
 
 
 def main() -> None:
@@ -177,13 +131,27 @@ def main() -> None:
     parser.add_argument("--option-steps", type=int, default=10)
     parser.add_argument("--base-steps", type=int, default=20_000, help="of a worker's training")
     parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
+    args = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
-    if arguments.out is not None and arguments.out.is_file():
-        rows = json.loads(arguments.out.read_text())["rows"]
-    for game in arguments.games:
-        run_game(game, arguments, rows)
+    if args.out is not None and args.out.is_file():
+        rows = json.loads(args.out.read_text())["rows"]
+    for game in args.games:
+        kit = AtariKit(game, num_processes=0, seed=args.seed)
+        for name, source in make_sources(args.base_steps).items():
+            done = {(row["game"], row["source"], row["protocol"]) for row in rows}
+            missing = [p for p in PROTOCOLS if (game, name, p) not in done]
+            if not missing:
+                continue
+            before, begin = seconds_spent(source), time.process_time()
+            options = source.find(kit)
+            seconds = before + time.process_time() - begin
+            for protocol in missing:
+                row = play(kit, name, options, protocol, args)
+                rows.append({**row, "cpu_seconds_finding": round(seconds, 1)})
+                print(rows[-1], flush=True)
+                if args.out is not None:
+                    save(args, rows)
 
 
 if __name__ == "__main__":

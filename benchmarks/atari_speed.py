@@ -114,7 +114,7 @@ class Agent:
         pool = self.pool
         began, worked, before = time.perf_counter(), cpu_seconds(pool.pids), pool.num_frames
         while pool.num_frames - before < self.frames:
-            if self.agent.progress.done:
+            if self.agent.done:
                 self.agent.begin()
             self.agent.play(1)
         seconds, cpu = time.perf_counter() - began, cpu_seconds(pool.pids) - worked

@@ -15,30 +15,28 @@ from typing import Any
 
 import torch
 
-from torchrl_hmcts.envs import AtariOptionPool, RepeatActions
-from torchrl_hmcts.envs.atari.emulator import AtariEmulator
-from torchrl_hmcts.trainers import AtariAgent, AtariSearch
+from torchrl_hmcts.envs import RepeatActions
+from torchrl_hmcts.trainers import AtariAgent, AtariKit, AtariSearch
 
 SETTINGS = ((1, 1), (4, 1), (4, 2), (8, 2))  # leaves per wave, waves in flight
 
 
 def play(game: str, leaves: int, waves: int, seed: int, args: argparse.Namespace) -> dict[str, Any]:
-    worker = RepeatActions(AtariEmulator(game).num_actions)
-    pool = AtariOptionPool(game, worker, max_steps=args.steps, num_processes=0, seed=seed)
+    kit = AtariKit(game, num_processes=0, seed=seed)
+    pool = kit.make_pool(RepeatActions(len(kit.action_names)), args.steps)
     search = AtariSearch(ratio=args.ratio, leaves_per_wave=leaves, waves_in_flight=waves)
     agent = AtariAgent(pool, search, seed=seed)
     agent.begin()
     before = pool.num_frames
-    played = agent.play(max_steps=args.real_steps)
-    frames = pool.num_frames - before
+    agent.play(max_steps=args.real_steps)
     return {
         "game": game,
         "leaves_per_wave": leaves,
         "waves_in_flight": waves,
         "seed": seed,
-        "score": played.score,
-        "real_steps": played.real_steps,
-        "simulated_per_real_step": frames / 4 / played.real_steps - 1,
+        "score": agent.score,
+        "real_steps": agent.real_steps,
+        "simulated_per_real_step": (pool.num_frames - before) / 4 / agent.real_steps - 1,
     }
 
 

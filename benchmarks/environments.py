@@ -28,6 +28,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sessions import living
+
 ROOT = Path(__file__).resolve().parents[1]
 HMCTS = Path(sys.executable).with_name("hmcts")
 SECONDS = 120  # for an action, imports and compilation included
@@ -186,19 +188,6 @@ SITUATIONS = [
 ]
 
 
-def children_of(group: int) -> list[int]:
-    """Processes that are left of a session."""
-    left = []
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            if os.getsid(int(path.name)) == group:
-                state = (path / "stat").read_text().rpartition(")")[2].split()[0]
-                left += [int(path.name)] if state != "Z" else []
-        except (OSError, ValueError):
-            continue
-    return left
-
-
 def attempt(situation: Situation, action: str) -> dict[str, Any]:
     """Try one thing in one situation; return what happened."""
     with tempfile.TemporaryDirectory(dir="/tmp") as folder:
@@ -246,7 +235,7 @@ def attempt(situation: Situation, action: str) -> dict[str, Any]:
             return {"result": "hangs", "says": _last(said), "seconds": SECONDS}
         seconds = time.monotonic() - begin
         time.sleep(1.0)
-        left = children_of(process.pid)
+        left = living(process.pid)
         for pid in left:
             os.kill(pid, signal.SIGKILL)
         result = "works" if process.returncode == 0 else f"status {process.returncode}"

@@ -25,7 +25,7 @@ from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.waterworld.agents import play_mazes
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
 from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
-from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
+from torchrl_hmcts.trainers.figures.curves import learning_panels, plot_training
 from torchrl_hmcts.trainers.runs.config import parse_overrides
 
 NAMES = {"waterworld_goals": "goal-based agent", "waterworld_a3c": "A3C without goals"}
@@ -109,11 +109,11 @@ def main() -> None:
             for agent, runs in results["agents"].items()
             if "curve" in runs[0]
         }
-        plot_learning_curves(
+        plot_training(
             curves,
+            learning_panels(1_000),
             arguments.out.with_suffix(".png"),
             title=f"Random mazes with and without goals, {len(arguments.seeds)} seeds",
-            max_steps=1_000,
         )
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from skill_figures import search_coverage
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 
@@ -30,17 +31,16 @@ from torchrl_hmcts.modules import (
     GrowingSkillPrior,
     SkillActor,
     SkillCritic,
-    SkillNetwork,
     SkillPolicy,
     SkillPrior,
 )
+from torchrl_hmcts.modules.skill_mlp import SkillNetwork
 from torchrl_hmcts.objectives import DIAYNLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage
 from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
 from torchrl_hmcts.transforms import (

@@ -28,7 +28,7 @@ from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.experiments.demo import make_starts
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env, make_training_env
-from torchrl_hmcts.trainers.figures.solving_curves import plot_solving_curves
+from torchrl_hmcts.trainers.figures.curves import Panel, plot_training
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 
 NUM_SKILLS, OPTION_STEPS, RADIUS = 4, 25, 0.7
@@ -144,8 +144,15 @@ def main() -> None:
     arguments = {k: str(v) if isinstance(v, Path) else v for k, v in vars(args).items()}
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps({"arguments": arguments, "runs": runs}, indent=2) + "\n")
-    plot_solving_curves(
+    steps = Panel(
+        "base_steps",
+        "base steps to solve a maze, mean",
+        log=True,
+        dotted=("executed_steps", "executed only"),
+    )
+    plot_training(
         {name: [run["test_curve"] for run in seeds] for name, seeds in runs.items()},
+        [steps, Panel("solved", "mazes solved", share=True)],
         args.out.with_suffix(".png"),
         title=f"Algorithm 3 in Waterworld: {args.test_rounds} held-out mazes, "
         + (f"{len(args.seeds)} seeds (mean, range)" if len(args.seeds) > 1 else "one seed"),

@@ -37,6 +37,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sessions import living
+
 ROOT = Path(__file__).resolve().parents[1]
 HMCTS = """
 import random, sys, torch
@@ -50,9 +52,10 @@ for module in (a3c, resume):
 from torchrl_hmcts.trainers.cli import main
 sys.exit(main(sys.argv[1:]))
 """
-_EMULATED = ("frames", "base_steps", "frames_per_decision")
 SECONDS = 240  # in which a life ends, or hangs
 _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.\w+")
+# How many frames were emulated, not how many an episode had.
+_EMULATED = re.compile(r"^(frames|base_steps|frames_per_decision)$")
 _OF_A_CLOCK = re.compile(r"second|time|date|speed|commands|per_s|machine|versions|config|cpu")
 
 
@@ -117,16 +120,7 @@ class Life:
 
     def children(self) -> list[int]:
         """Processes of the session that live, without its first."""
-        found = []
-        for path in Path("/proc").glob("[0-9]*"):
-            try:
-                pid = int(path.name)
-                state = (path / "stat").read_text().rpartition(")")[2].split()[0]
-                mine = pid != self.process.pid and os.getsid(pid) == self.process.pid
-            except (OSError, ValueError):
-                continue
-            found += [pid] if mine and state != "Z" else []
-        return found
+        return [pid for pid in living(self.process.pid) if pid != self.process.pid]
 
     def wait(self) -> int:
         """Wait for its end, and some seconds for that of its processes."""
@@ -164,9 +158,8 @@ def compared(folder: Path, run: Run) -> dict[str, Any]:
     if not run.continued:
         trials = [path.parent for path in folder.glob("trial_*/metrics.json")]
         return {"number of trials": len(trials), **dict(_trial(path) for path in trials)}
-    found: dict[str, Any] = {
-        "metrics": _timeless(json.loads((folder / "metrics.json").read_text()))
-    }
+    metrics = json.loads((folder / "metrics.json").read_text())
+    found: dict[str, Any] = {"metrics": without(_OF_A_CLOCK, metrics)}
     with contextlib.suppress(FileNotFoundError), (folder / "curves.csv").open() as file:
         found["curves"] = [row for row in csv.reader(file) if not _OF_A_CLOCK.search(row[0])]
     for kind in ("worker/worker-*", "checkpoints/checkpoint-*"):
@@ -183,20 +176,14 @@ def compared(folder: Path, run: Run) -> dict[str, Any]:
 def _trial(folder: Path) -> tuple[str, Any]:
     """The varied value of a trial, and its figures."""
     metrics = json.loads((folder / "metrics.json").read_text())
-    return str(metrics["config"]["num_skills"]), _timeless(metrics)
+    return str(metrics["config"]["num_skills"]), without(_OF_A_CLOCK, metrics)
 
 
-def _timeless(value: Any) -> Any:
+def without(pattern: re.Pattern[str], value: Any) -> Any:
+    """Leave out the entries whose names a pattern finds."""
     if isinstance(value, dict):
-        return {k: _timeless(v) for k, v in value.items() if not _OF_A_CLOCK.search(k)}
-    return [_timeless(item) for item in value] if isinstance(value, list) else value
-
-
-def _without_frames(value: Any) -> Any:
-    """Leave out how many frames were emulated, not how many an episode had."""
-    if isinstance(value, dict):
-        return {k: _without_frames(v) for k, v in value.items() if k not in _EMULATED}
-    return [_without_frames(item) for item in value] if isinstance(value, list) else value
+        return {k: without(pattern, v) for k, v in value.items() if not pattern.search(k)}
+    return [without(pattern, item) for item in value] if isinstance(value, list) else value
 
 
 def curve_is_whole(folder: Path) -> bool:
@@ -253,7 +240,7 @@ class Victim:
             names = whole.keys() & mine.keys()
         if self.result["by_child"]:  # what a killed emulator had emulated is counted, and repeated
             names -= {"curves", "name of checkpoints/checkpoint-*"}
-            whole, mine = _without_frames(whole), _without_frames(mine)
+            whole, mine = without(_EMULATED, whole), without(_EMULATED, mine)
         differs = sorted(name for name in names if whole.get(name) != mine.get(name))
         self.result["differs"] = sorted({*self.result["differs"], *differs})
 

@@ -36,7 +36,7 @@ from torchrl_hmcts.trainers.experiments.lab.evaluation import (
 )
 from torchrl_hmcts.trainers.experiments.lab.training import curve_script_frames, train_worker
 from torchrl_hmcts.trainers.experiments.lab.worker import make_worker_loss
-from torchrl_hmcts.trainers.figures.lab_figures import plot_frames_curves
+from torchrl_hmcts.trainers.figures.curves import plot_training, solving_panels
 
 ERROR = 0.05
 
@@ -185,12 +185,14 @@ def main() -> None:
         compare(longer, args, parts, f"diayn-160k {config.seed}")
     for kind, title in (("diayn", "DIAYN"), ("hmcts", "Algorithm 3")):
         curves = [parts.results[f"{kind} {c.seed} training"]["curve"] for c in configs]
-        plot_frames_curves(
-            curves,
+        script = float(np.mean([curve_script_frames(config) for config in configs]))
+        plot_training(
+            {title: curves},
+            solving_panels(script),
             args.out.with_name(f"{args.out.stem}_{kind}.png"),
             title=f"{title}: {configs[0].curve_mazes} held-out mazes of 9 x 9, "
             + (f"{len(curves)} seeds (mean, range)" if len(curves) > 1 else "one seed"),
-            script=float(np.mean([curve_script_frames(config) for config in configs])),
+            x_label="frames of training",
         )
     print(table(parts.results))
 

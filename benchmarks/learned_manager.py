@@ -28,7 +28,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.planners import UCT, MaxBackup, MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.experiments.waterworld.networks import MazeNetwork
@@ -61,7 +61,7 @@ def fixed_planners(env: EnvBase) -> dict[str, MCTSPlanner]:
             env,
             tree_policy=UCT(c=0.1),
             leaf_evaluator=Closeness(),
-            backup=MaxBackup(),
+            backup="max",
             novelty=RadiusNovelty("position", RADIUS),
             expand=expand,
             budget=SearchBudget(expansions=expansions),

@@ -38,37 +38,40 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 SKIPPED = {"__init__.py", "drawing.py", "export.py"}  # pictures, not search
 FAST = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-COMPILED = {"kernels.py", "novelty_kernels.py", "tree.py"}  # numba keeps what it made of them
+KERNELS = {f"{name}kernels.py" for name in ("", "variant_", "batch_", "subtree_")}
+COMPILED = {*KERNELS, "novelty_kernels.py", "tree.py"}  # numba keeps what it made of them
 # First, as `make coverage` does, what is fast without compiling.
-PLAIN = {"kernels.py": "planner_golden", "tree.py": "planner_golden"}
+PLAIN = dict.fromkeys([*KERNELS, "tree.py"], "planner_golden")
 PLAIN_WORDS = ["-k", "not approaches"]
+_SEARCH = "planner_golden array_search planner subtree_reuse transpositions"
 TESTS = {  # of a file; others have the general ones of their folder
-    "kernels.py": "planner_golden array_search planner tree_policies stochastic_search "
-    "subtree_reuse transpositions planner_reference kernels_in_python",
-    "search.py": "planner_golden array_search planner subtree_reuse transpositions novelty",
-    "mcts.py": "planner_golden planner subtree_reuse evaluators transpositions planner_reference",
-    "tree.py": "planner_golden subtree_reuse array_search planner_reference tree_drawing planner",
+    **dict.fromkeys(
+        KERNELS,
+        f"{_SEARCH} tree_policies stochastic_search planner_reference kernels_in_python",
+    ),
+    "search.py": f"{_SEARCH} novelty",
+    "search_loop.py": f"{_SEARCH} waves_in_flight tree_rollout",
+    "subtree.py": f"{_SEARCH} novelty tree_rollout",
+    "settings.py": "search_numbers planner tree_policies",
+    "mcts.py": f"{_SEARCH} evaluators planner_reference",
+    "tree.py": f"{_SEARCH} planner_reference tree_drawing",
+    "tree_view.py": "tree_drawing planner",
     "novelty.py": "novelty planner",
     "novelty_kernels.py": "novelty kernels_in_python",
     "transpositions.py": "transpositions",
-    "chance.py": "stochastic_search",
-    "choices.py": "planner_golden planner tree_policies",
-    "noise.py": "planner",
-    "budget.py": "planner",
-    "backups.py": "planner_golden",
+    "root_options.py": "planner_golden planner tree_policies",
+    "budget.py": "planner stochastic_search tree_rollout",
+    "reference.py": "planner_reference",
     "tree_policies.py": "tree_policies",
-    "torchrl_scores.py": "tree_policies",
-    "evaluators.py": "evaluators",
-    "policy_value.py": "expert_iteration",
+    "evaluation.py": "evaluators expert_iteration",
+    "evaluators.py": "evaluators expert_iteration",
     "plan.py": "planner_golden planner hierarchical_policy",
-    "control.py": "hierarchical_policy model_control",
-    "model_control.py": "model_control",
-    "goals.py": "goal_planning subgoal_transform",
+    "control.py": "hierarchical_policy model_control goal_planning subgoal_transform",
     "simulator.py": "planner foreign_envs hierarchical_policy",
+    "simulator_checks.py": "planning_envs planner",
     "array_search.py": "array_search",
     "search_data.py": "search_data",
-    "scored_descent.py": "tree_policies",
-    "tree_rollout.py": "tree_rollout evaluators",
+    "scored_descent.py": "tree_policies planner_reference",
     "a3c.py": "a3c_loss",
     "option_critic.py": "termination",
     "option_model.py": "option_model",
@@ -89,13 +92,13 @@ EQUIVALENT: dict[tuple[str, str, str, int], str] = {
         0,
     ): "how much room a hash table begins with; it holds the same values",
     (
-        "torchrl_hmcts/planners/kernels.py",
+        "torchrl_hmcts/planners/variant_kernels.py",
         'if child >= 0 and nodes[child]["twin"] >= 0:',
         "0 -> 1",
         0,
     ): "node 0 is the root, which no option leads to",
     (
-        "torchrl_hmcts/planners/kernels.py",
+        "torchrl_hmcts/planners/variant_kernels.py",
         'if child >= 0 and nodes[child]["twin"] >= 0:',
         "GtE -> Gt",
         0,
@@ -106,12 +109,6 @@ EQUIVALENT: dict[tuple[str, str, str, int], str] = {
         "Lt -> LtE",
         0,
     ): "of two equal numbers either is the lower",
-    (
-        "torchrl_hmcts/planners/tree.py",
-        "if TYPE_CHECKING:",
-        "condition turned round",
-        0,
-    ): "what it imports is named in annotations only",
     (
         "torchrl_hmcts/planners/novelty.py",
         "while size < 4 * num_features or size <= self._owners.shape[1]:",

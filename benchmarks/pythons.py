@@ -27,45 +27,17 @@ PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "numba", "gymnasium", "py
 
 # One file at least of each part: planners, transforms, losses, modules, envs, trainers, command
 # line. Those that read the checkout (pages, wheel, layering) or take minutes are left out.
-TESTS = (
-    "test_planner.py",
-    "test_planner_golden.py",
-    "test_array_search.py",
-    "test_tree_policies.py",
-    "test_evaluators.py",
-    "test_novelty.py",
-    "test_search_data.py",
-    "test_option_transform.py",
-    "test_skill_transforms.py",
-    "test_subgoal_transform.py",
-    "test_contract_transforms.py",
-    "test_contract_losses.py",
-    "test_contract_envs.py",
-    "test_a3c_loss.py",
-    "test_diayn_loss.py",
-    "test_skill_objectives.py",
-    "test_smdp_estimators.py",
-    "test_modules.py",
-    "test_termination.py",
-    "test_option_model.py",
-    "test_waterworld.py",
-    "test_gridworld.py",
-    "test_mazes.py",
-    "test_gym_envs.py",
-    "test_lab_recordings.py",
-    "test_atari_ram.py",
-    "test_atari_pool.py",
-    "test_docstrings.py",
-    "test_testing_checks.py",
-    "test_configs.py",
-    "test_cli.py",
-    "test_sweep.py",
-    "test_demo.py",
-    "test_trainer_resume.py",
-    "test_fault_checkpoints.py",
-    "test_hierarchical_policy.py",
-    "test_animation.py",
-)
+TESTS = [
+    f"test_{name}.py"
+    for name in """
+    planner planner_golden array_search tree_policies evaluators novelty search_data
+    option_transform skill_transforms subgoal_transform contract_transforms contract_losses
+    contract_envs a3c_loss diayn_loss skill_objectives smdp_estimators modules termination
+    option_model waterworld gridworld mazes gym_envs lab_recordings atari_ram atari_pool docstrings
+    testing_checks configs cli sweep demo trainer_resume fault_checkpoints hierarchical_policy
+    animation
+    """.split()
+]
 
 PROBE = """
 import importlib.metadata, json, platform, torchrl_hmcts, torchrl_hmcts.envs, torchrl_hmcts.trainers
@@ -84,10 +56,8 @@ def build_wheel(folder: Path) -> Path:
     for old in (source, dist):
         shutil.rmtree(old, ignore_errors=True)
     source.mkdir(parents=True)
-    archive = subprocess.run(
-        ["git", "archive", "HEAD"], cwd=ROOT, check=True, stdout=subprocess.PIPE
-    )
-    subprocess.run(["tar", "-x"], cwd=source, input=archive.stdout, check=True)
+    archive = subprocess.check_output(["git", "archive", "HEAD"], cwd=ROOT)
+    subprocess.run(["tar", "-x"], cwd=source, input=archive, check=True)
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(dist)]
     subprocess.run([*command, "."], cwd=source, check=True, stdout=subprocess.DEVNULL)
     (wheel,) = dist.glob("*.whl")
@@ -95,7 +65,7 @@ def build_wheel(folder: Path) -> Path:
 
 
 def install(interpreter: str, wheel: Path, environment: Path) -> None:
-    """Install the wheel with its extras in a fresh environment, or anew in one that is there."""
+    """Install the wheel with its extras in a fresh environment, or again in one that is there."""
     pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "--quiet"]
     if environment.exists():
         subprocess.run([*pip, "--force-reinstall", "--no-deps", str(wheel)], check=True)
@@ -108,14 +78,14 @@ def run_tests(environment: Path, source: Path, folder: Path, tests: list[str]) -
     """Run tests against the installed wheel, outside the checkout; return counts and versions."""
     python = str(environment / "bin" / "python")
     shutil.rmtree(folder, ignore_errors=True)
-    ignore = shutil.ignore_patterns("__pycache__", "benchmarks")
+    ignore = shutil.ignore_patterns("__pycache__")
     shutil.copytree(source / "tests", folder / "tests", ignore=ignore)
     shutil.copy(source / "pyproject.toml", folder)
     settings = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     settings["PYTHONNOUSERSITE"] = "1"
     probe = [python, "-c", PROBE % (PACKAGES,)]
-    printed = subprocess.run(probe, cwd=folder, env=settings, check=True, stdout=subprocess.PIPE)
-    found = json.loads(printed.stdout.splitlines()[-1])
+    printed = subprocess.check_output(probe, cwd=folder, env=settings)
+    found = json.loads(printed.splitlines()[-1])
     for name in found.pop("files"):
         if environment.resolve() not in Path(name).resolve().parents:
             raise RuntimeError(f"{name} would be tested instead of the wheel in {environment}.")
@@ -123,14 +93,9 @@ def run_tests(environment: Path, source: Path, folder: Path, tests: list[str]) -
     report, log = folder / "report.xml", folder / "pytest.log"
     command = [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={report}"]
     before = os.times()
+    command += [f"tests/{name}" for name in tests]
     with log.open("w") as file:
-        subprocess.run(
-            [*command, *(f"tests/{name}" for name in tests)],
-            cwd=folder,
-            env=settings,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-        )
+        subprocess.run(command, cwd=folder, env=settings, stdout=file, stderr=subprocess.STDOUT)
     after = os.times()
     printed_text = log.read_text()
     print("\n".join(printed_text.splitlines()[-15:]), flush=True)
@@ -153,7 +118,7 @@ def run_tests(environment: Path, source: Path, folder: Path, tests: list[str]) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("interpreters", nargs="+", help="Pythons to test with, by name or path")
-    parser.add_argument("--tests", nargs="+", default=list(TESTS), help="files of tests/")
+    parser.add_argument("--tests", nargs="+", default=TESTS, help="files of tests/")
     parser.add_argument(
         "--folder",
         type=Path,

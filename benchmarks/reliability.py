@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,11 @@ GROUPS = {  # what is counted, and the tests that show it
 }
 CONTRACTS = ["transforms", "losses", "envs"]
 EVERY = "slow or not slow"
+KILLS, DAMAGE = "benchmarks/kills.py", "tests/test_fault_damage.py"
+LEAKS, RAY = (
+    "tests/test_fault_leaks.py",
+    ("tests/test_fault_collectors.py", "tests/test_sweep_ray.py"),
+)
 
 
 def run_pytest(*words: str, **environment: str) -> dict[str, Any]:
@@ -96,16 +102,10 @@ def run_pytest(*words: str, **environment: str) -> dict[str, Any]:
     return {**counts, "cpu_seconds": round(seconds, 1)}
 
 
-def kills(number: int) -> dict[str, Any]:
-    command = [sys.executable, "benchmarks/kills.py", "--kills", str(number)]
-    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def damage(number: int) -> dict[str, Any]:
-    command = [sys.executable, "tests/test_fault_damage.py", str(number)]
-    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
+def run_script(*words: str) -> dict[str, Any]:
+    """Run a script of this repository, whose last line are its figures."""
+    done = subprocess.check_output([sys.executable, *words], cwd=ROOT, text=True)
+    return json.loads(done.splitlines()[-1])
 
 
 def fuzz(slow: bool) -> dict[str, Any]:
@@ -122,12 +122,6 @@ def fuzz(slow: bool) -> dict[str, Any]:
         rows = [line.rsplit(" ", 1) for line in path.read_text().splitlines()]
     cases = {name: int(count) for name, count in rows}
     return {"cases": cases, "all_cases": sum(cases.values()), **result}
-
-
-def leaks() -> dict[str, Any]:
-    command = [sys.executable, "tests/test_fault_leaks.py"]
-    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 def coverage() -> dict[str, Any]:
@@ -148,56 +142,46 @@ def coverage() -> dict[str, Any]:
     return {"folders": found}
 
 
-PARTS = ["kills", "damage", "fuzz", "tests", "contracts", "leaks", "ray", "coverage"]
 SEPARATE = ["ray", "coverage"]  # what needs more than the extra dev, or a run before
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument(
-        "parts", nargs="*", help=f"of {', '.join(PARTS)}; default: all but {SEPARATE}"
-    )
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--damaged", type=int, default=1_000, help="files of each kind")
     parser.add_argument("--slow", action="store_true", help="fuzz 100,000 cases")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "reliability")
+    parser.add_argument("parts", nargs="*", help=f"default: all but {', '.join(SEPARATE)}")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    command = "python benchmarks/reliability.py"
-    for part in arguments.parts or [part for part in PARTS if part not in SEPARATE]:
-        begin, words, name = time.time(), part, part
-        if part == "kills":
-            words = f"kills --kills {arguments.kills}"
-            figures = kills(arguments.kills)
-        elif part == "damage":
-            words = f"damage --damaged {arguments.damaged}"
-            figures = damage(arguments.damaged)
-        elif part == "fuzz":
-            words, name = ("fuzz --slow", "fuzz_slow") if arguments.slow else ("fuzz", "fuzz")
-            figures = fuzz(arguments.slow)
-        elif part == "tests":
-            figures = {group: run_pytest(*tests) for group, tests in GROUPS.items()}
-        elif part == "contracts":
-            figures = {
+    kills, damaged, slow = arguments.kills, arguments.damaged, arguments.slow
+    parts: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
+        "kills": (f"kills --kills {kills}", lambda: run_script(KILLS, "--kills", str(kills))),
+        "damage": (f"damage --damaged {damaged}", lambda: run_script(DAMAGE, str(damaged))),
+        "fuzz": ("fuzz --slow" if slow else "fuzz", lambda: fuzz(slow)),
+        "tests": ("tests", lambda: {name: run_pytest(*tests) for name, tests in GROUPS.items()}),
+        "contracts": (
+            "contracts",
+            lambda: {
                 kind: run_pytest(f"tests/test_contract_{kind}.py", "-m", EVERY)
                 for kind in CONTRACTS
-            }
-        elif part == "ray":
-            figures = run_pytest(
-                "tests/test_fault_collectors.py", "tests/test_sweep_ray.py", "-m", "slow"
-            )
-        elif part == "leaks":
-            figures = leaks()
-        elif part == "coverage":
-            figures = coverage()
-        else:
-            parser.error(f"{part!r} is none of {', '.join(PARTS)}")
+            },
+        ),
+        "leaks": ("leaks", lambda: run_script(LEAKS)),
+        "ray": ("ray", lambda: run_pytest(*RAY, "-m", "slow")),
+        "coverage": ("coverage", coverage),
+    }
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for part in arguments.parts or [part for part in parts if part not in SEPARATE]:
+        if part not in parts:
+            parser.error(f"{part!r} is none of {', '.join(parts)}")
+        begin, (words, measure) = time.time(), parts[part]
         record = {
-            "command": f"{command} {words}",
+            "command": f"python benchmarks/reliability.py {words}",
             "python": platform.python_version(),
-            "wall_seconds": round(time.time() - begin, 1),
-            **figures,
+            **measure(),
         }
+        record["wall_seconds"] = round(time.time() - begin, 1)
+        name = words.replace(" --slow", "_slow") if part == "fuzz" else part
         (arguments.out / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n")
         print(json.dumps(record, indent=1), flush=True)
 

@@ -26,7 +26,6 @@ from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import (
     UCT,
-    MaxBackup,
     MCTSPlanner,
     RadiusNovelty,
     SearchBudget,
@@ -101,7 +100,7 @@ def main() -> None:
         env,
         tree_policy=UCT(c=0.1),
         leaf_evaluator=Closeness(),
-        backup=MaxBackup(),
+        backup="max",
         novelty=RadiusNovelty("position", RADIUS),
         budget=SearchBudget(expansions=3_000),
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from skill_figures import search_coverage, skill_figures
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
@@ -23,7 +24,6 @@ from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.demo import make_starts, train_worker
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.figures.skill_figures import search_coverage, skill_figures
 from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
 
 RADIUS = 0.7  # of the novelty test, tiles, in all benchmarks of skills

@@ -1,4 +1,4 @@
-"""A3CLoss against Algorithm 2 written out, finite differences, and TorchRL's own A2C.
+"""A3CLoss against Algorithm 2 written out, and TorchRL's own A2C.
 
 Letters: B environments, T steps of a segment, S states, A actions.
 """
@@ -19,7 +19,8 @@ from torchrl.objectives import A2CLoss, ValueEstimators
 from torchrl.objectives.value import TD1Estimator
 from torchrl.trainers.algorithms.a2c import A2CTrainer
 
-from torchrl_hmcts.objectives import A3CLoss, NStepReturn, n_step_returns
+from torchrl_hmcts.objectives import A3CLoss, NStepReturn
+from torchrl_hmcts.objectives.a3c import n_step_returns
 from torchrl_hmcts.testing import ChainEnv
 
 GAMMA, S, A = 0.9, 5, 3
@@ -28,9 +29,9 @@ GAMMA, S, A = 0.9, 5, 3
 class Table(nn.Module):
     """A row per state, as a network whose output is known; counts the states it is asked for."""
 
-    def __init__(self, columns: int, rows: int = S) -> None:
+    def __init__(self, columns: int) -> None:
         super().__init__()
-        self.entries = nn.Parameter(torch.randn(rows, columns))
+        self.entries = nn.Parameter(torch.randn(S, columns))
         self.asked = 0
 
     def forward(self, state: Tensor) -> Tensor:
@@ -38,16 +39,13 @@ class Table(nn.Module):
         return self.entries[state]
 
 
-def make_networks(
-    state: Any = "state", action: Any = "action", actions: int = A, rows: int = S
-) -> tuple[ProbabilisticActor, ValueOperator]:
+def make_networks(actions: int = A) -> tuple[ProbabilisticActor, ValueOperator]:
     actor = ProbabilisticActor(
-        TensorDictModule(Table(actions, rows), [state], ["logits"]),
+        TensorDictModule(Table(actions), ["state"], ["logits"]),
         in_keys=["logits"],
-        out_keys=[action],
         distribution_class=torch.distributions.Categorical,
     )
-    return actor, ValueOperator(Table(1, rows), in_keys=[state])
+    return actor, ValueOperator(Table(1), in_keys=["state"])
 
 
 def make_segment(
@@ -81,33 +79,6 @@ def algorithm_2(segment: TensorDict, values: list[float]) -> list[float]:
         following = float(after["reward"][i]) + GAMMA**k * following
         returns[i] = following
     return returns
-
-
-def objective(segment: TensorDict, logits: Tensor, values: Tensor, given: Any) -> list[float]:
-    """Means of the three losses of segments [B, T]; returns and advantages are given."""
-    policy = critic = entropy = 0.0
-    for b in range(len(segment)):
-        for i in range(segment.shape[1]):
-            s, a = int(segment["state"][b, i]), int(segment["action"][b, i])
-            row = logits[s].tolist()
-            norm = math.log(sum(math.exp(x) for x in row))
-            probability = [math.exp(x - norm) for x in row]
-            target, advantage = given[b][i]
-            policy -= (row[a] - norm) * advantage
-            critic += 0.5 * (target - float(values[s])) ** 2
-            entropy += 0.01 * sum(p * math.log(p) for p in probability)
-    return [x / segment.numel() for x in (policy, critic, entropy)]
-
-
-def returns_and_advantages(segment: TensorDict, values: Tensor) -> Any:
-    table = values.flatten().tolist()
-    return [
-        [
-            (target, target - table[int(s)])
-            for target, s in zip(algorithm_2(row, table), row["state"], strict=True)
-        ]
-        for row in segment
-    ]
 
 
 def test_returns_of_an_unbroken_segment_end_in_the_value_of_its_last_state() -> None:
@@ -144,37 +115,23 @@ def test_targets_are_those_of_algorithm_2_in_plain_python(
 
 
 @pytest.mark.parametrize("duration", [True, False])
-def test_losses_are_those_of_plain_python(duration: bool) -> None:
+def test_losses_are_those_of_plain_torch(duration: bool) -> None:
     segment, (actor, critic) = make_segment(duration=duration), make_networks()
-    loss = A3CLoss(actor, critic, gamma=GAMMA)
-    logits, values = actor.module[0].module.entries.detach(), critic.module.entries.detach()
-    out = loss(segment)
-    expected = objective(segment, logits, values, returns_and_advantages(segment, values))
-    for name, value in zip(("objective", "critic", "entropy"), expected, strict=True):
-        torch.testing.assert_close(out[f"loss_{name}"].item(), value, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(out["entropy"].item(), -expected[2] / 0.01, atol=1e-5, rtol=1e-5)
-
-
-def test_gradients_are_finite_differences_with_returns_and_advantages_held() -> None:
-    actor, critic = (network.double() for network in make_networks())
-    segment = make_segment((3,), 6)
-    segment["next", "reward"] = segment["next", "reward"].double()
-    loss = A3CLoss(actor, critic, gamma=GAMMA)
-    out = loss(segment)
-    sum(out[key] for key in out.keys() if key.startswith("loss")).backward()
-    logits, values = actor.module[0].module.entries, critic.module.entries
-    given = returns_and_advantages(segment, values.detach())
-    small = 1e-6
-    for table in (logits, values):
-        for index in range(table.numel()):
-            sides = []
-            for sign in (1, -1):
-                moved = table.detach().clone()
-                moved.view(-1)[index] += sign * small
-                parts = (moved, values.detach()) if table is logits else (logits.detach(), moved)
-                sides.append(sum(objective(segment, *parts, given)))
-            slope = (sides[0] - sides[1]) / (2 * small)
-            assert table.grad.view(-1)[index].item() == pytest.approx(slope, abs=1e-7)
+    out = A3CLoss(actor, critic, gamma=GAMMA)(segment)
+    values = critic.module.entries.detach().flatten()
+    target = torch.tensor([algorithm_2(row, values.tolist()) for row in segment])
+    advantage = target - values[segment["state"]]
+    log_pi = actor.module[0].module.entries.detach()[segment["state"]].log_softmax(-1)
+    chosen = log_pi.gather(-1, segment["action"].unsqueeze(-1)).squeeze(-1)
+    entropy = -(log_pi.exp() * log_pi).sum(-1).mean()
+    expected = {
+        "loss_objective": -(chosen * advantage).mean(),
+        "loss_critic": 0.5 * advantage.square().mean(),
+        "loss_entropy": -0.01 * entropy,
+        "entropy": entropy,
+    }
+    for key, value in expected.items():
+        torch.testing.assert_close(out[key].detach().squeeze(), value, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("duration", [True, False])
@@ -228,35 +185,6 @@ def test_a_value_that_is_not_finite_does_no_harm_where_it_is_not_used() -> None:
     assert no.sum() == 0
 
 
-def test_all_keys_can_be_renamed_and_nested() -> None:
-    plain = make_segment()
-    names = {"reward": ("agent", "r"), "done": ("agent", "d"), "terminated": ("agent", "t")}
-    nested = TensorDict(batch_size=plain.batch_size)
-    nested["in", "state"], nested["agent", "act"] = plain["state"], plain["action"]
-    nested["next", "in", "state"] = plain["next", "state"]
-    for old, new in {**names, "duration": ("agent", "k")}.items():
-        nested[("next", *new)] = plain["next", old]
-    torch.manual_seed(1)
-    expected = A3CLoss(*make_networks(), gamma=GAMMA)(plain)
-    torch.manual_seed(1)
-    loss = A3CLoss(*make_networks(("in", "state"), ("agent", "act")), gamma=GAMMA)
-    loss.set_keys(action=("agent", "act"), duration=("next", "agent", "k"), **names)
-    actual = loss(nested)
-    for key in expected.keys():
-        torch.testing.assert_close(actual[key], expected[key])
-
-
-def test_reductions_agree() -> None:
-    segment, networks = make_segment(), make_networks()
-    each = A3CLoss(*networks, reduction="none")(segment)
-    for key in ("loss_objective", "loss_critic", "loss_entropy"):
-        assert each[key].shape == segment.shape
-        mean = A3CLoss(*networks)(segment)[key]
-        total = A3CLoss(*networks, reduction="sum")(segment)[key]
-        torch.testing.assert_close(each[key].mean(), mean)
-        torch.testing.assert_close(each[key].sum(), total)
-
-
 def test_an_advantage_that_is_there_already_is_used() -> None:
     segment, networks = make_segment(), make_networks()
     segment["advantage"] = torch.zeros(*segment.shape, 1)
@@ -264,14 +192,6 @@ def test_an_advantage_that_is_there_already_is_used() -> None:
     out = A3CLoss(*networks)(segment)
     assert out["loss_objective"].item() == 0.0
     assert out["loss_critic"].item() == pytest.approx(0.5 * 4.0)
-
-
-def test_the_first_call_adds_nothing_to_the_state_dict() -> None:
-    loss = A3CLoss(*make_networks())
-    before = list(loss.state_dict())
-    loss(make_segment())
-    assert list(loss.state_dict()) == before
-    assert "_value_estimator.gamma" in before
 
 
 def test_another_value_estimator_can_be_asked_for() -> None:
@@ -309,14 +229,6 @@ def test_networks_can_keep_their_own_parameters() -> None:
     }
 
 
-def test_it_can_be_called_with_tensors() -> None:
-    loss, segment = A3CLoss(*make_networks()), make_segment(duration=False)
-    after = {f"next_{key}": value for key, value in segment["next"].items()}
-    parts = loss(state=segment["state"], action=segment["action"], **after)
-    expected = loss(segment)
-    assert [part.item() for part in parts] == [expected[key].item() for key in loss.out_keys]
-
-
 @pytest.mark.filterwarnings("ignore:A2CTrainer is an experimental:UserWarning")
 @pytest.mark.filterwarnings("ignore:The '.*' hook stage will be replaced:FutureWarning")
 def test_it_solves_a_chain_in_torchrls_a2c_trainer() -> None:
@@ -352,7 +264,7 @@ def test_it_solves_a_chain_in_torchrls_a2c_trainer() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"gamma": 1.5}, r"gamma in \(0, 1\].*1.5"),
+        ({"gamma": 1.5}, "gamma.*1.5"),
         ({"entropy_coeff": -1.0}, "entropy_coeff >= 0.*-1.0"),
         ({"critic_coeff": 0.0}, "critic_coeff > 0.*0.0"),
         ({"reduction": "median"}, "median"),

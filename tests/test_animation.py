@@ -31,22 +31,20 @@ def durations(path: Path) -> list[float]:
     ],
 )
 def test_pictures_in_a_row_that_are_the_same_are_shown_longer(
-    greys: list[int], last: float | None, shown: list[float], tmp_path: Path
+    greys: list[int], last: float | None, shown: list[float], tmp_path
 ) -> None:
     write_gif([picture(g) for g in greys], tmp_path / "a.gif", milliseconds=40.0, last=last)
     assert durations(tmp_path / "a.gif") == shown
 
 
 @pytest.mark.parametrize("number", [1, 3])
-def test_an_episode_in_which_nothing_happens_is_one_picture(number: int, tmp_path: Path) -> None:
+def test_an_episode_in_which_nothing_happens_is_one_picture(number: int, tmp_path) -> None:
     write_gif([picture(90)] * number, tmp_path / "a.gif", milliseconds=40.0)
     assert iio.imread(tmp_path / "a.gif").shape[-3:] == (8, 12, 3)
 
 
 @pytest.mark.parametrize(("height", "width"), [(16, 24), (15, 23)])
-def test_a_video_of_the_same_length_lies_beside_the_gif(
-    height: int, width: int, tmp_path: Path
-) -> None:
+def test_a_video_of_the_same_length_lies_beside_the_gif(height: int, width: int, tmp_path) -> None:
     greys = [0, 90, 90, 200]
     frames = [np.full((height, width, 3), grey, np.uint8) for grey in greys]
     write_gif(frames, tmp_path / "a.gif", milliseconds=40.0, last=120.0)

@@ -15,9 +15,7 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     NodeStatistics,
     Root,
     Search,
@@ -25,7 +23,6 @@ from torchrl_hmcts.planners import (
     Transition,
     tree_search,
 )
-from torchrl_hmcts.planners.tree import PENDING
 from torchrl_hmcts.testing import TableEnv
 
 F32 = np.float32
@@ -94,14 +91,6 @@ def test_the_visits_of_a_bandit_follow_puct_by_hand() -> None:
         assert search.roots["revisits"][0] == simulations - sum(n > 0 for n in expected)
 
 
-def test_skipping_the_exhausted_tries_every_option_of_a_bandit_once() -> None:
-    root, transition = bandit([1.0, 0.0, 2.0], [0.5, 0.25, 0.25])
-    search = tree_search(root, transition, 30, exhausted="skip")
-    assert visits(search) == [1, 1, 1]
-    assert search.num_simulations.tolist() == [3]
-    assert search.exhausted(np.array([0])).all()
-
-
 def test_the_value_of_a_loop_is_its_geometric_series() -> None:
     # One option that pays 1 for ever, D = 1/2: with max backup after n steps 2 - 2^(1 - n).
     def transition(state: np.ndarray, option: np.ndarray) -> Transition:
@@ -110,7 +99,7 @@ def test_the_value_of_a_loop_is_its_geometric_series() -> None:
 
     root = Root(np.ones((1, 1), F32), np.zeros(1, F32), np.zeros(1, np.int64))
     for n in (1, 2, 5, 20):
-        search = tree_search(root, transition, n, backup=MaxBackup())
+        search = tree_search(root, transition, n, backup="max")
         assert search.tree.nodes["value"][0, 0] == pytest.approx(2 - 2 ** (1 - n), rel=1e-6)
         assert search.tree.nodes["depth"][0, n] == n
         assert search.tree.nodes["base_steps"][0, n] == n
@@ -176,7 +165,7 @@ POLICIES = [UCT(0.7), PUCT(1.0), PUCT.mctx(), PUCT(normalize="tree"), Gumbel(max
 
 
 @pytest.mark.parametrize("policy", POLICIES, ids=str)
-@pytest.mark.parametrize("backup", [MeanBackup(), MaxBackup()])
+@pytest.mark.parametrize("backup", ["mean", "max"])
 def test_the_tree_is_that_of_the_planner_on_the_same_mdp(policy: Any, backup: Any) -> None:
     table, states = Table(seed=1), [0, 3, 7]
     engine = tree_search(table.root(states), table, 60, tree_policy=policy, backup=backup, seed=5)
@@ -192,25 +181,6 @@ def test_the_tree_is_that_of_the_planner_on_the_same_mdp(policy: Any, backup: An
     search = planner.search(td, seed=5)
     assert engine.num_simulations.tolist() == [60] * 3
     assert trees(engine) == trees(search)
-
-
-@pytest.mark.parametrize("exhausted", ["skip", "revisit"])
-@pytest.mark.parametrize("leaves", [2, 5])
-def test_several_leaves_per_wave_are_those_of_the_planner_too(leaves: int, exhausted: Any) -> None:
-    table, states = Table(seed=2), [0, 3, 7]
-    kwargs: dict[str, Any] = {"leaves_per_wave": leaves, "exhausted": exhausted}
-    engine = tree_search(table.root(states), table, 61, tree_policy=UCT(0.7), **kwargs)
-    assert max(table.calls) <= 3 * leaves
-    assert max(table.calls) > 3
-    budget = SearchBudget(simulations=61, until_plan=False)
-    planner = table.planner(tree_policy=UCT(0.7), budget=budget, **kwargs)
-    td = planner.simulator.env.reset(
-        TensorDict({"state": torch.tensor(states)}, [3]), set_state=True
-    )
-    assert trees(engine) == trees(planner.search(td))
-    assert engine.num_simulations.tolist() == [61] * 3
-    assert not engine.tree.edges["in_flight"].any()
-    assert not (engine.tree.nodes["flags"] & PENDING).any()
 
 
 def test_a_root_has_the_same_tree_whatever_is_searched_beside_it() -> None:
@@ -442,9 +412,3 @@ def test_a_tree_policy_that_returns_nonsense_is_named() -> None:
         tree_search(root, table, 10, tree_policy=nan)
     with pytest.raises(ValueError, match=r"returned \[2\]; .*\[2, 3\]"):
         tree_search(root, table, 10, tree_policy=lambda statistics: statistics.node_values)
-
-
-def test_halving_with_several_leaves_per_wave_is_refused() -> None:
-    root = Root(np.full((1, 2), 0.5, np.float32), np.zeros(1, np.float32), np.zeros(1))
-    with pytest.raises(ValueError, match="leaves_per_wave=4"):
-        tree_search(root, lambda *_: None, 8, tree_policy=Gumbel(), leaves_per_wave=4)

@@ -29,7 +29,6 @@ from torchrl_hmcts.modules import SkillMLP  # noqa: E402
 from torchrl_hmcts.planners import (  # noqa: E402
     PUCT,
     HierarchicalPolicy,
-    MaxBackup,
     MCTSPlanner,
     MostVisited,
     SearchBudget,
@@ -165,7 +164,7 @@ def test_killed_processes_do_not_change_a_search(pool, worker, waves):
     planner = MCTSPlanner(
         pool,
         tree_policy=PUCT(),
-        backup=MaxBackup(),
+        backup="max",
         expand="one",
         leaves_per_wave=6,
         waves_in_flight=waves,

@@ -229,7 +229,7 @@ def test_the_planner_searches_it_under_an_option_transform():
     planner = MCTSPlanner(env, budget=SearchBudget(expansions=3, until_plan=False), seed=0)
     td = env.reset()
     search = planner.search(td.clone())
-    node = search.outcomes_of(0, 1)[0]
+    node = search.tree.outcomes(0, 1)[0]
     predicted = search.tree.states["emulator_state"][0, node]
     env.reset(td, set_state=True)
     real = env.step(td.set("option", torch.tensor(1)))["next", "emulator_state"]

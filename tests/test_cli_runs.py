@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.runs.folder import read_run
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 TRAIN = ["train", "experiment=waterworld_a3c", "toy=true", "seed=3"]
 

@@ -20,7 +20,7 @@ import torchrl_hmcts.envs
 import torchrl_hmcts.objectives
 import torchrl_hmcts.planners
 import torchrl_hmcts.transforms
-from torchrl_hmcts.planners import PUCT, UCT, Gumbel, MaxBackup, RadiusNovelty
+from torchrl_hmcts.planners import PUCT, UCT, Gumbel, RadiusNovelty
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.configs import COMPONENTS, argument_docs, config_of, named, to_yaml
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS
@@ -38,9 +38,16 @@ def hydra() -> Iterator[None]:
 
 
 def keywords(component: type) -> dict[str, inspect.Parameter]:
-    parameters = inspect.signature(component.__init__).parameters
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return {n: p for n, p in parameters.items() if n != "self" and p.kind not in variable}
+    found: dict[str, inspect.Parameter] = {}
+    for cls in component.__mro__:  # **kwargs stand for the arguments of the class above
+        if cls is component or cls.__module__.startswith("torchrl_hmcts"):
+            given = inspect.signature(cls.__init__).parameters if "__init__" in vars(cls) else {}
+            found = {**given, **found}
+            if given and "VAR_KEYWORD" not in {p.kind.name for p in given.values()}:
+                break
+        else:
+            break
+    return {n: p for n, p in found.items() if n != "self" and "VAR" not in p.kind.name}
 
 
 def as_written(value: Any) -> Any:
@@ -82,7 +89,7 @@ def test_the_yaml_explains_every_key_in_the_words_of_the_docstring(
 NOT_CONFIGURED = {
     "torchrl_hmcts.planners": {
         "NodeStatistics", "NoveltyTest", "Plan", "Root", "Search", "SearchProgress", "SearchTree",
-        "Transition", "TreeView",
+        "Transition", "TreeView", "Evaluation", "ReferenceSearch", "SearchSettings",
     },
     "torchrl_hmcts.objectives": {"NStepReturn", "SkillObjective"},
     "torchrl_hmcts.transforms": {"PlansGoals"},
@@ -132,19 +139,19 @@ def test_a_planner_is_composed_of_parts_with_other_values() -> None:
             "+planner=mcts",
             "+tree_policy=puct",
             "+novelty=radius",
-            "+backup=max",
             "+budget=search",
             "planner.tree_policy.c=2.5",
             "planner.novelty.key=state",
             "planner.novelty.radius=0.5",
             "planner.budget.simulations=7",
             "planner.gamma=0.9",
+            "planner.backup=max",
         ]
     )
     planner = instantiate(config.planner, _partial_=True)(env=ChainEnv(length=5))
     assert planner.tree_policy == PUCT(c=2.5)
     assert isinstance(planner.novelty, RadiusNovelty)
-    assert planner.backup == MaxBackup()
+    assert planner.backup == "max"
     assert planner.budget.simulations == 7
     assert planner.gamma == 0.9
 

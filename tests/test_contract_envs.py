@@ -86,7 +86,7 @@ def under_options(make_env: Callable[[], EnvBase], key: str) -> TransformedEnv:
 
 @pytest.mark.parametrize("name", MACRO_ENVS)
 def test_an_env_keeps_the_contract_of_a_macro_env(name: str) -> None:
-    """Specs, episodes that go on, seeds, partial resets and steps, states, batches."""
+    """Specs, episodes that continue, seeds, partial resets and steps, states, batches."""
     check_macro_env(MACRO_ENVS[name](), num_steps=10)
 
 

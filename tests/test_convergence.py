@@ -16,8 +16,6 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     Gumbel,
-    HighestValue,
-    MaxBackup,
     MCTSPlanner,
     MostVisited,
     Root,
@@ -26,6 +24,7 @@ from torchrl_hmcts.planners import (
     Transition,
     tree_search,
 )
+from torchrl_hmcts.planners.root_options import gumbel_choice
 from torchrl_hmcts.testing import TableEnv
 
 NUM_SMDPS, NUM_STATES, NUM_OPTIONS, GAMMA = 20, 5, 3, 0.7
@@ -105,7 +104,7 @@ def test_the_mean_backup_of_uct_converges_as_simulations_grow(
 def test_the_max_backup_converges_under_every_tree_policy(
     smdps: SMDPs, policy: Any, exhausted: Any
 ) -> None:
-    search = smdps.search(5000, tree_policy=policy, backup=MaxBackup(), exhausted=exhausted)
+    search = smdps.search(5000, tree_policy=policy, backup="max", exhausted=exhausted)
     assert smdps.errors(search).max() < 0.05, smdps.errors(search)
 
 
@@ -125,7 +124,7 @@ def test_gumbel_chooses_the_optimal_option_with_few_simulations_and_a_poor_criti
 ) -> None:
     # The critic is the value of choosing at random; 48 simulations look three options ahead.
     search = smdps.search(48, tree_policy=Gumbel(scale=scale), critic=True)
-    regrets = smdps.regrets(search.gumbel_choice())
+    regrets = smdps.regrets(gumbel_choice(search))
     at_random = (smdps.q[smdps.starts].max(-1) - smdps.q[smdps.starts].mean(-1)).mean()
     assert regrets.mean() < 0.1 * at_random, regrets
     assert (regrets < 0.03).mean() >= 0.8, regrets
@@ -134,49 +133,6 @@ def test_gumbel_chooses_the_optimal_option_with_few_simulations_and_a_poor_criti
 # ---------------------------------------------------------------------- finite trees
 
 Table = dict[tuple[int, int], tuple[int, float, int]]
-
-
-def layered_smdp(seed: int) -> Table:
-    """Six states of which every option leads to a later one, so that the tree is finite."""
-    rng = random.Random(seed)
-    table: Table = {
-        (s, a): (rng.randint(s + 1, 5), rng.uniform(-1.0, 1.0), rng.randint(1, 3))
-        for s in range(5)
-        for a in range(rng.randint(1, 3))
-    }
-    return table
-
-
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize(("leaves_per_wave", "waves_in_flight"), [(1, 1), (7, 1), (1, 4), (3, 2)])
-def test_max_backup_is_exact_once_nothing_is_left(
-    seed: int, leaves_per_wave: int, waves_in_flight: int
-) -> None:
-    table = layered_smdp(seed)
-    best = [0.0] * 6  # from the last state to the first
-    for s in range(4, -1, -1):
-        best[s] = max(
-            r + (0.0 if after == 5 else GAMMA**k * best[after])
-            for (s1, _), (after, r, k) in table.items()
-            if s1 == s
-        )
-    env = TableEnv(table, terminal=[5])
-    planner = MCTSPlanner(
-        env,
-        gamma=GAMMA,
-        backup=MaxBackup(),
-        leaves_per_wave=leaves_per_wave,
-        waves_in_flight=waves_in_flight,
-        final_choice=HighestValue(),
-        budget=SearchBudget(simulations=100_000, until_plan=False),
-    )
-    td = planner(env.reset())
-    assert planner.last_search is not None
-    assert planner.last_search.exhausted(np.array([0])).all()
-    assert td["root_value"].item() == pytest.approx(best[0], abs=1e-5)
-    after, reward, duration = table[0, td["action"].item()]
-    chosen = reward + (0.0 if after == 5 else GAMMA**duration * best[after])
-    assert chosen == pytest.approx(best[0])
 
 
 @pytest.mark.parametrize("in_flight", [(2, 1), (8, 1), (1, 2), (1, 8), (2, 4)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.figures.run_page import write_page
 from torchrl_hmcts.trainers.runs.config import DemoConfig, parse_overrides
 
 TIMES = ("seconds", "config", "versions")

@@ -124,7 +124,7 @@ needs_atari = pytest.mark.skipif(not HAS_ATARI, reason="the games come with ale-
 def make_atari_run(frames: int, **settings: Any) -> Any:
     """Skills learned on the RAM, and a search over them; without processes of its own."""
     from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
-    from torchrl_hmcts.trainers.experiments.atari.run import AtariRun
+    from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun
 
     tiny = {"source": "diayn", "num_skills": 2, "skill_base_steps": 320, "option_steps": 10}
     tiny.update(ratio=3.0, max_episode_frames=600, replant_every=5, num_processes=0, seed=4)

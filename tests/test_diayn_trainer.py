@@ -32,7 +32,6 @@ from torchrl_hmcts.testing import PointMassEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
 from torchrl_hmcts.transforms import (
-    DIAYNReward,
     DisplacementTransform,
     SkillReward,
     SkillTransform,
@@ -310,7 +309,7 @@ def test_the_loss_runs_in_torchrls_own_sac_trainer() -> None:
         auto_register_policy_transforms=False,
     )
     buffer = ReplayBuffer(
-        storage=LazyTensorStorage(1000), transform=DIAYNReward(loss.discriminator, 4), batch_size=32
+        storage=LazyTensorStorage(1000), transform=SkillReward(loss.objective), batch_size=32
     )
     before = [p.detach().clone() for p in loss.parameters()]
     SACTrainer(

@@ -65,9 +65,7 @@ def test_every_page_is_in_one_toctree_and_every_entry_is_a_page() -> None:
     generated = {entry for entry in listed if entry.split("/")[0] in GENERATED}
     assert written == set(listed) - generated
     assert generated == {
-        "auto_tutorials/index",
-        "auto_results/index",
-        "auto_reference/command_line",
+        f"auto_{x}" for x in ("tutorials/index", "results/index", "reference/command_line")
     }
 
 
@@ -91,62 +89,51 @@ def test_short_names_in_docstrings_are_looked_up_in_every_package_of_the_referen
     assert sorted(looked_up) == sorted(PACKAGES)
 
 
-class TestTutorials:
-    def test_there_are_six_at_least(self) -> None:
-        assert len(TUTORIALS) >= 6
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_a_tutorial_has_a_title_and_a_picture_and_names_only_what_is_public(path: Path) -> None:
+    source = path.read_text()
+    tree = ast.parse(source)
+    title, rule = (ast.get_docstring(tree) or "").splitlines()[:2]
+    assert set(rule) == {"="}
+    assert len(rule) >= len(title)
+    assert "plt.show()" in source
+    for target in re.findall(r":doc:`(?:[^<`]*<)?([^>`]+)>?`", source):
+        place = DOCS / target[1:] if target.startswith("/") else DOCS / "tutorials" / target
+        assert any(place.with_suffix(end).exists() for end in (".md", ".rst", ".py")), target
+    packages = {f"torchrl_hmcts.{package}" for package in PACKAGES}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "") in packages:
+            exported = importlib.import_module(node.module or "").__all__
+            assert {alias.name for alias in node.names} <= set(exported)
 
-    @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
-    def test_a_tutorial_has_a_title_a_picture_and_names_only_pages_that_exist(
-        self, path: Path
-    ) -> None:
-        source = path.read_text()
-        doc = ast.get_docstring(ast.parse(source)) or ""
-        title, rule = doc.splitlines()[:2]
-        assert set(rule) == {"="}
-        assert len(rule) >= len(title)
-        assert "plt.show()" in source
-        for target in re.findall(r":doc:`(?:[^<`]*<)?([^>`]+)>?`", source):
-            if target.startswith("/"):
-                assert any((DOCS / f"{target[1:]}{end}").exists() for end in (".md", ".rst"))
-            else:
-                assert (DOCS / "tutorials" / f"{target}.py").exists(), target
 
-    @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
-    def test_a_tutorial_uses_only_public_names_of_the_components(self, path: Path) -> None:
-        packages = {f"torchrl_hmcts.{package}" for package in PACKAGES}
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "") in packages:
-                exported = importlib.import_module(node.module or "").__all__
-                assert {alias.name for alias in node.names} <= set(exported)
-
-    def test_pages_that_lead_to_a_tutorial_lead_to_one_that_exists(self) -> None:
-        stems = {path.stem for path in TUTORIALS}
-        for page, text in PAGES.items():
-            for stem in re.findall(r"auto_tutorials/(\d\w+)", text):
-                assert stem in stems, f"{page} leads to the tutorial {stem}, which does not exist"
+def test_pages_that_lead_to_a_tutorial_lead_to_one_that_exists() -> None:
+    assert len(TUTORIALS) >= 6
+    stems = {path.stem for path in TUTORIALS}
+    for page, text in PAGES.items():
+        for stem in re.findall(r"auto_tutorials/(\d\w+)", text):
+            assert stem in stems, f"{page} leads to the tutorial {stem}, which does not exist"
 
 
 RUN_HERE = sorted(p for p, text in PAGES.items() if BLOCK.search(text) and p not in RUN_ELSEWHERE)
 
 
-class TestCodeOfThePages:
-    def test_every_page_with_code_is_run_by_a_test(self) -> None:
-        assert len(RUN_HERE) >= 4  # here, all that are not named above
-        for page, test in RUN_ELSEWHERE.items():
-            assert BLOCK.search(PAGES[page])
-            assert page.rsplit("/", 1)[-1] in (Path(__file__).parent / test).read_text()
+def test_every_page_with_code_is_run_by_a_test() -> None:
+    assert len(RUN_HERE) >= 4  # here, all that are not named above
+    for page, test in RUN_ELSEWHERE.items():
+        assert BLOCK.search(PAGES[page])
+        assert page.rsplit("/", 1)[-1] in (Path(__file__).parent / test).read_text()
 
-    @pytest.mark.filterwarnings("ignore:PPOTrainer is an experimental:UserWarning")
-    @pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
-    @pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
-    @pytest.mark.parametrize("page", RUN_HERE)
-    def test_every_python_block_of_a_page_runs(
-        self, page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.chdir(tmp_path)
-        namespace: dict = {}
-        for block in BLOCK.findall(PAGES[page]):
-            exec(compile(block, page, "exec"), namespace)  # noqa: S102
+
+@pytest.mark.filterwarnings("ignore:PPOTrainer is an experimental:UserWarning")
+@pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
+@pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
+@pytest.mark.parametrize("page", RUN_HERE)
+def test_every_python_block_of_a_page_runs(page: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    namespace: dict = {}
+    for block in BLOCK.findall(PAGES[page]):
+        exec(compile(block, page, "exec"), namespace)  # noqa: S102
 
 
 def commands() -> list[tuple[str, str]]:

@@ -14,7 +14,6 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_hmcts.planners import (
     PUCT,
-    MaxBackup,
     MCTSPlanner,
     MixedEvaluator,
     ModulePrior,
@@ -199,16 +198,16 @@ def test_an_option_of_probability_zero_is_never_taken() -> None:
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        (lambda td: torch.ones(len(td), 3), r"a Tensor \[1, 3\].*\[1, 2\].*ModulePrior"),
-        (lambda td: td, r"a TensorDict \[1\].*ModulePrior"),
-        (lambda td: torch.full((len(td), 2), float("nan")), "probability of nan.*softmax"),
-        (lambda td: torch.tensor([[-0.5, 1.5]]), "probability of -0.5.*softmax"),
+        (lambda td: torch.ones(len(td), 3), r"shape \[1, 3\].*\[1, 2\]"),
+        (lambda td: td, "a tensor; got TensorDict.*ModulePrior"),
+        (lambda td: torch.full((len(td), 2), float("nan")), "policy returned nan.*softmax"),
+        (lambda td: torch.tensor([[-0.5, 1.5]]), "policy returned -0.5.*softmax"),
         (lambda td: torch.zeros(len(td), 2), "probability 0 to every option"),
     ],
 )
 def test_a_rollout_policy_that_returns_nonsense_is_named(policy: Any, message: str) -> None:
     env = ChainEnv(4)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         MCTSPlanner(env, leaf_evaluator=RolloutEvaluator(policy))(env.reset())
 
 
@@ -228,19 +227,6 @@ def test_a_rollout_evaluator_serves_planners_of_one_env_and_discount_only() -> N
     for other, gamma in ((ChainEnv(4), 0.9), (env, 0.8)):
         with pytest.raises(ValueError, match=r"another env or discount.*one of its own"):
             bound(other, rollout, gamma)
-
-
-@pytest.mark.parametrize("name", ["max_options", "num_rollouts"])
-def test_rollouts_of_nothing_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name} >= 1; got 0"):
-        RolloutEvaluator(**{name: 0})
-
-
-def test_rollouts_as_bootstrap_of_rollouts_are_longer_rollouts() -> None:
-    env = ChainEnv(5)
-    inner = RolloutEvaluator(right, max_options=2)
-    rollout = bound(env, RolloutEvaluator(right, max_options=2, bootstrap=inner))
-    assert rollout(at(env, [0])).item() == pytest.approx(0.9**3)
 
 
 # ---------------------------------------------------------------------- networks
@@ -457,12 +443,9 @@ def test_a_mixture_hands_on_what_its_parts_need() -> None:
     torch.testing.assert_close(mixed(td), expected)
 
 
-def test_a_mixture_out_of_range_or_of_misfits_is_refused() -> None:
-    for weight in (-0.1, 1.5, float("nan")):
-        with pytest.raises(ValueError, match=rf"in \[0, 1\]; got {weight}"):
-            MixedEvaluator(constant(0.0), constant(0.0), weight)
+def test_a_mixture_of_misfits_is_refused() -> None:
     mixed = MixedEvaluator(constant(0.0), lambda td: torch.zeros(len(td), 2))
-    with pytest.raises(ValueError, match=r"second evaluator returned a Tensor \[3, 2\].*\[3, 1\]"):
+    with pytest.raises(ValueError, match=r"second evaluator returned shape \[3, 2\].*\[3, 1\]"):
         mixed(TensorDict({}, [3]))
 
 
@@ -492,23 +475,6 @@ def trees(search: Search) -> list[tuple[bytes, bytes]]:
     return [(tree.nodes[b, :n].tobytes(), tree.edges[b, :n].tobytes()) for b, n in used]
 
 
-@pytest.mark.parametrize("name", ["network", "rollouts", "guided", "mixed"])
-@pytest.mark.parametrize("expand", ["one", "all"])
-def test_a_planner_finds_its_way_with_every_evaluator(name: str, expand: Any) -> None:
-    env = ChainEnv(6)
-    planner = MCTSPlanner(
-        env,
-        expand=expand,
-        leaf_evaluator=evaluators()[name],
-        budget=SearchBudget(expansions=60, until_plan=False),
-        seed=0,
-    )
-    search = planner.search(at(env, [0, 3]))
-    assert np.isfinite(search.tree.nodes["value"]).all()
-    assert planner.choose(search).tolist() == [1, 1]
-    assert search.best_return[1] == pytest.approx(planner.gamma)
-
-
 @pytest.mark.parametrize("name", ["rollouts", "guided", "mixed"])
 def test_a_root_has_the_rollouts_it_has_alone(name: str) -> None:
     env = ChainEnv(9)
@@ -527,7 +493,7 @@ def test_rollouts_show_the_value_of_a_plan_before_it_is_in_the_tree() -> None:
         planner = MCTSPlanner(
             env,
             gamma=0.9,
-            backup=MaxBackup(),
+            backup="max",
             leaf_evaluator=policy and RolloutEvaluator(policy),
             budget=SearchBudget(expansions=1),
         )

@@ -249,7 +249,7 @@ def test_a_policy_value_evaluator_grows_the_tree_of_two_separate_evaluators() ->
     env, net = ChainEnv(length=7), two_heads()
     guide = PolicyValueEvaluator(net)
     kwargs = {"tree_policy": PUCT(c=1.0), "expand": "one"}
-    joint = MCTSPlanner(env, leaf_evaluator=guide.value, option_prior=guide.prior, **kwargs)
+    joint = MCTSPlanner(env, leaf_evaluator=guide, **kwargs)
     apart = MCTSPlanner(
         env, leaf_evaluator=ValueEvaluator(net), option_prior=ModulePrior(net), **kwargs
     )
@@ -265,22 +265,9 @@ def test_a_policy_value_evaluator_calls_its_network_once_per_wave() -> None:
     env, net = ChainEnv(length=7), two_heads()
     guide = PolicyValueEvaluator(net)
     waves = []
-    planner = MCTSPlanner(
-        env, leaf_evaluator=guide.value, option_prior=guide.prior, progress=waves.append
-    )
+    planner = MCTSPlanner(env, leaf_evaluator=guide, progress=waves.append)
     planner.search(env.reset())
     assert net.module.calls == len(waves) + 1  # the root is evaluated, too
-
-
-def test_logits_are_not_kept_for_a_tensordict_that_changed() -> None:
-    net = two_heads()
-    guide = PolicyValueEvaluator(net)
-    td = TensorDict(state=torch.tensor([1]), batch_size=[1])
-    guide.value(td)
-    first = guide.prior(td)
-    td["state"] = torch.tensor([2])
-    assert not torch.equal(guide.prior(td), first)
-    torch.testing.assert_close(guide.prior(td), ModulePrior(net)(td))
 
 
 def test_the_prior_is_sharpened_and_mixed_with_the_uniform_one() -> None:
@@ -289,7 +276,7 @@ def test_the_prior_is_sharpened_and_mixed_with_the_uniform_one() -> None:
     )
     td = TensorDict(x=torch.tensor([[math.log(4.0), 0.0]]), batch_size=[1])
     # exp(ln 4 / 2) = 2: probabilities 2/3 and 1/3; mixed half and half with 1/2.
-    prior = PolicyValueEvaluator(module, temperature=2.0, uniform_share=0.5).prior(td)
+    prior = PolicyValueEvaluator(module, temperature=2.0, uniform_share=0.5)(td).priors
     torch.testing.assert_close(prior, torch.tensor([[7 / 12, 5 / 12]]))
 
 

@@ -9,7 +9,6 @@ from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_hmcts.modules import (
-    GaussianSkillActor,
     LearnedTermination,
     SkillActor,
     SkillPolicy,
@@ -25,9 +24,8 @@ def states(n: int = 200) -> TensorDict:
     return TensorDict(velocity=torch.zeros(n, 2), skill=skill, batch_size=[n])
 
 
-def actor(spec: TensorSpec) -> SkillActor | GaussianSkillActor:
-    kind = GaussianSkillActor if isinstance(spec, Bounded) else SkillActor
-    return kind(2, spec, num_skills=3, in_keys=["velocity"])
+def actor(spec: TensorSpec) -> SkillActor:
+    return SkillActor(2, spec, num_skills=3, in_keys=["velocity"])
 
 
 def kinds(action: torch.Tensor) -> int:

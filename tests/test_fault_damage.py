@@ -22,20 +22,18 @@ from typing import Any
 
 import pytest
 import torch
+from small_trainers import make_a3c, make_diayn
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.checkpoint import Checkpoint, CheckpointError
 from torchrl.checkpoint._checkpoint import _encode_state_dict_value
-from torchrl.envs import Compose, TransformedEnv
-from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
-from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer, ExpertIterationTrainer, HMCTSTrainer
+from torchrl_hmcts.trainers.experiments.registry import load_config
 from torchrl_hmcts.trainers.runs.config import DemoConfig
-from torchrl_hmcts.trainers.runs.folder import load_config, read_run, start_record
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     PlainStateAdapter,
@@ -43,24 +41,14 @@ from torchrl_hmcts.trainers.saving.checkpoints import (
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+from torchrl_hmcts.trainers.saving.run_folder import read_run, start_record
 
 REFUSED = (CheckpointError, ValueError)  # of checkpoints, and of JSON
 Kind = tuple[Path, Callable[[], Any]]  # the file, and what is loaded from it; raises what refuses
 
 
 def diayn(folder: Path) -> Kind:
-    env = TransformedEnv(
-        WaterworldMazeEnv(batch_size=[8], observation=False, max_steps=10),
-        Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()),
-    )
-    loss = DIAYNTrainer.make_loss(env, 4, hidden=(8,), seed=0)
-    return _of_trainer(
-        lambda: DIAYNTrainer(
-            env, loss, total_frames=48, frames_per_batch=16, batch_size=8, buffer_size=64, seed=0,
-            save_dir=folder,
-        )
-    )  # fmt: skip
+    return _of_trainer(lambda: make_diayn(folder))
 
 
 def hmcts(folder: Path) -> Kind:
@@ -97,18 +85,7 @@ def expert_iteration(folder: Path) -> Kind:
 
 
 def a3c(folder: Path) -> Kind:
-    actor = ProbabilisticActor(
-        TensorDictModule(nn.Embedding(5, 2), ["state"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=torch.distributions.Categorical,
-    )
-    loss = A3CLoss(actor, ValueOperator(nn.Embedding(5, 1), in_keys=["state"]), gamma=0.9)
-    return _of_trainer(
-        lambda: A3CTrainer(
-            partial(ChainEnv, 5, batch_size=[4]), loss, total_frames=100, segment_steps=5,
-            num_learners=0, save_dir=folder,
-        )
-    )  # fmt: skip
+    return _of_trainer(lambda: make_a3c(folder, total=100, length=5))
 
 
 def _of_trainer(make: Callable[[], Any]) -> Kind:
@@ -139,26 +116,9 @@ def demo(folder: Path) -> Kind:
     return newest_checkpoint(folder / "checkpoints"), load
 
 
-def labmaze(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.evaluations import load_networks
-    from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
-    from torchrl_hmcts.trainers.experiments.lab.training import train_worker
-
-    config = LabMazeConfig(
-        algorithm="diayn", train_frames=256, expansions=2, curve_mazes=1, curve_points=1
-    )
-    loss = train_worker(config, save_dir=folder / "checkpoints").loss
-
-    def load() -> Any:
-        load_networks(loss, folder)
-        return loss.state_dict()
-
-    return newest_checkpoint(folder / "checkpoints"), load
-
-
 def _atari_run(folder: Path) -> Any:
     from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
-    from torchrl_hmcts.trainers.experiments.atari.run import AtariRun
+    from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun
 
     pytest.importorskip("ale_py")
     config = AtariConfig(
@@ -194,7 +154,7 @@ def checkpoint_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_run(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.run import load_run
+    from torchrl_hmcts.trainers.experiments.atari.episodes import load_run
 
     rotation = DurableRotation(folder / "checkpoints")
     state = _atari_run(folder)
@@ -203,7 +163,7 @@ def atari_run(folder: Path) -> Kind:
 
 
 def atari_run_of_older_versions(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.run import load_run
+    from torchrl_hmcts.trainers.experiments.atari.episodes import load_run
 
     path = folder / "checkpoints" / "run.pt"
     path.parent.mkdir(parents=True)
@@ -212,11 +172,11 @@ def atari_run_of_older_versions(folder: Path) -> Kind:
 
 
 def atari_trials(folder: Path) -> Kind:
-    from torchrl_hmcts.trainers.experiments.atari.trials import RememberedTrials, Trial
+    from torchrl_hmcts.trainers.experiments.atari.memory import Trial, TrialMemory
 
     folder.mkdir(parents=True)
     path = folder / "trials.json"
-    make = partial(RememberedTrials, None, path, {"game": "Pong", "seed": 0})
+    make = partial(TrialMemory, path, {"game": "Pong", "seed": 0})
     for i in range(20):
         make().remember(f"key {i}", Trial(float(i), 300 + i, 7_000))
 
@@ -260,7 +220,7 @@ def sweep_journal(folder: Path) -> Kind:
 
 
 KINDS = [
-    diayn, hmcts, a3c, expert_iteration, demo, labmaze, checkpoint_of_older_versions, atari_run,
+    diayn, hmcts, a3c, expert_iteration, demo, checkpoint_of_older_versions, atari_run,
     atari_run_of_older_versions, atari_trials, run_record, sweep_journal,
 ]  # fmt: skip
 
@@ -302,15 +262,9 @@ def damage(kind: Callable[[Path], Kind], folder: Path, count: int, seed: int = 0
     return counts
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param(kind, id=kind.__name__, marks=[pytest.mark.slow] if kind is labmaze else [])
-        for kind in KINDS
-    ],
-)
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_a_damaged_file_is_refused_or_read_as_it_was_saved(
-    kind: Callable[[Path], Kind], tmp_path: Path
+    kind: Callable[[Path], Kind], tmp_path
 ) -> None:
     counts = damage(kind, tmp_path / "run", 60)
     assert sum(counts.values()) == 60
@@ -319,17 +273,14 @@ def test_a_damaged_file_is_refused_or_read_as_it_was_saved(
 
 
 def main() -> None:
-    count = int(sys.argv[1])
-    figures: dict[str, Any] = {}
+    count, figures = int(sys.argv[1]), {}
     torch.set_num_threads(1)
     for kind in KINDS:
         begin = time.process_time()
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
-            counts = damage(kind, Path(folder) / "run", count)
-        figures[kind.__name__] = {
-            **dict(sorted(counts.items())),
-            "cpu_seconds": round(time.process_time() - begin, 1),
-        }
+            counts = dict(sorted(damage(kind, Path(folder) / "run", count).items()))
+        seconds = round(time.process_time() - begin, 1)
+        figures[kind.__name__] = {**counts, "cpu_seconds": seconds}
     print(json.dumps({"cases_of_each_kind": count, "kinds": figures}))
 
 

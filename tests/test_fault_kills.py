@@ -21,42 +21,19 @@ import pytest
 BATCH, TOTAL = 16, 16 * 400  # base steps; a checkpoint after every batch
 
 
-def make_hmcts(folder: Path) -> Any:
-    from test_hmcts_trainer import make_trainer as make_walk_trainer
-
-    return make_walk_trainer(rounds=10_000, retrain_interval=1, save_dir=folder)
-
-
 def make_trainer(folder: Path, kind: str = "DIAYN") -> Any:
-    import torch
-    from torchrl.envs import Compose, TransformedEnv
-
-    from torchrl_hmcts.envs import WaterworldMazeEnv
-    from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-    from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
-
-    torch.manual_seed(1)
     if kind == "HMCTS":
-        return make_hmcts(folder)
-    base = WaterworldMazeEnv(batch_size=[8], observation=False, max_steps=10)
-    env = TransformedEnv(base, Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()))
-    loss = DIAYNTrainer.make_loss(env, 4, hidden=(8, 8), seed=0)
-    return DIAYNTrainer(
-        env,
-        loss,
-        total_frames=TOTAL,
-        frames_per_batch=BATCH,
-        batch_size=16,
-        buffer_size=64,
-        updates_per_batch=1,
-        seed=5,
-        save_dir=folder,
-        save_trainer_interval=0,
-    )
+        from test_hmcts_trainer import make_trainer as make_walk_trainer
+
+        return make_walk_trainer(rounds=10_000, retrain_interval=1, save_dir=folder)
+    from small_trainers import make_diayn
+
+    sizes = {"batch_size": 16, "updates_per_batch": 1, "save_trainer_interval": 0}
+    return make_diayn(folder, TOTAL, **sizes)
 
 
 def live(folder: Path, report: int, frames: int = TOTAL, kind: str = "DIAYN") -> None:
-    """One life of the run: go on where it stood, and report every checkpoint that is written."""
+    """One life of the run: continue where it stood, and report every checkpoint that is written."""
     trainer = make_trainer(folder, kind)
     if any(folder.glob("checkpoint-*")):
         trainer.load(folder)
@@ -145,7 +122,7 @@ def kill_again_and_again(
     }
 
 
-def run_killed(tmp_path: Path, kills: int, kind: str = "DIAYN") -> dict[str, Any]:
+def run_killed(tmp_path, kills: int, kind: str = "DIAYN") -> dict[str, Any]:
     words = [sys.executable, __file__, str(tmp_path / "killed"), str(kills), kind]
     done = subprocess.run(words, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -160,12 +137,12 @@ def check(result: dict[str, Any], kills: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["DIAYN", "HMCTS"])
-def test_a_run_killed_at_random_moments_ends_as_one_that_was_not(tmp_path: Path, kind: str) -> None:
+def test_a_run_killed_at_random_moments_ends_as_one_that_was_not(tmp_path, kind: str) -> None:
     check(run_killed(tmp_path, 3, kind), 3)
 
 
 @pytest.mark.slow
-def test_fifty_kills_lose_no_checkpoint(tmp_path: Path) -> None:
+def test_fifty_kills_lose_no_checkpoint(tmp_path) -> None:
     result = run_killed(tmp_path, 50)
     check(result, 50)
     assert result["killed_while_writing_a_checkpoint"] >= 5

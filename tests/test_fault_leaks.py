@@ -43,12 +43,10 @@ def growth(step: Callable[[], Any], number: int, warm_up: int) -> tuple[float, i
 
 
 def searches() -> Callable[[], Any]:
-    planner = MCTSPlanner(
-        ChainEnv(length=6),
-        novelty=RadiusNovelty("state", 0.5),
-        budget=SearchBudget(expansions=8),
-    )
-    start = planner.env.reset() if hasattr(planner, "env") else ChainEnv(length=6).reset()
+    env = ChainEnv(length=6)
+    budget = SearchBudget(expansions=8)
+    planner = MCTSPlanner(env, novelty=RadiusNovelty("state", 0.5), budget=budget)
+    start = env.reset()
     return lambda: planner.plan(start.clone())
 
 
@@ -74,28 +72,20 @@ def many_base_steps() -> tuple[float, int]:
     return growth(steps(500), 2_000, warm_up=200)
 
 
-def check(figures: tuple[float, int], mib: float) -> None:
-    grown, objects = figures
+@pytest.mark.parametrize(
+    ("run", "mib"),
+    [
+        (lambda: growth(searches(), 300, warm_up=60), 12.0),
+        (lambda: growth(steps(64), 300, warm_up=60), 12.0),
+        pytest.param(many_searches, MAX_MIB, marks=pytest.mark.slow),
+        pytest.param(many_base_steps, MAX_MIB, marks=pytest.mark.slow),
+    ],
+    ids=["searches", "base_steps", "many_searches", "many_base_steps"],
+)
+def test_nothing_is_left_behind(run: Callable[[], tuple[float, int]], mib: float) -> None:
+    grown, objects = run()
     assert grown < mib, f"{grown:.1f} MiB more"
     assert objects < MAX_OBJECTS, f"{objects} Python objects more"
-
-
-def test_searches_leave_nothing_behind() -> None:
-    check(growth(searches(), 300, warm_up=60), 12.0)
-
-
-def test_base_steps_leave_nothing_behind() -> None:
-    check(growth(steps(64), 300, warm_up=60), 12.0)
-
-
-@pytest.mark.slow
-def test_ten_thousand_searches_leave_nothing_behind() -> None:
-    check(many_searches(), MAX_MIB)
-
-
-@pytest.mark.slow
-def test_a_million_base_steps_leave_nothing_behind() -> None:
-    check(many_base_steps(), MAX_MIB)
 
 
 def test_a_trainer_that_is_gone_frees_its_memory() -> None:
@@ -111,7 +101,7 @@ def test_a_trainer_that_is_gone_frees_its_memory() -> None:
 
 def test_the_check_notices_a_leak() -> None:
     kept: list[Any] = []
-    # Blocks so large that each is asked of the system, whatever other tests have given back.
+    # Blocks so large that each is asked of the system, though other tests have given some back.
     grown, _ = growth(lambda: kept.append(torch.ones(2**24)), 4, warm_up=1)
     assert grown > 200.0
     assert growth(lambda: kept.append(TensorDict(a=torch.ones(1))), 400, 2)[1] > 500
@@ -119,15 +109,10 @@ def test_the_check_notices_a_leak() -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    figures = {
-        "searches": (10_000, many_searches()),
-        "base_steps": (1_000_000, many_base_steps()),
+    runs = {"searches": (10_000, many_searches), "base_steps": (1_000_000, many_base_steps)}
+    grown = {name: (number, *run()) for name, (number, run) in runs.items()}
+    names = ("number", "growth_mib", "growth_objects")
+    table = {
+        n: dict(zip(names, (k, round(m, 2), o), strict=True)) for n, (k, m, o) in grown.items()
     }
-    print(
-        json.dumps(
-            {
-                name: {"number": number, "growth_mib": round(mib, 2), "growth_objects": objects}
-                for name, (number, (mib, objects)) in figures.items()
-            }
-        )
-    )
+    print(json.dumps(table))

@@ -24,8 +24,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
-from torchrl_hmcts import processes
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts import compiling, processes
 from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
@@ -44,17 +43,21 @@ root_only = pytest.mark.skipif(
 )
 
 
-def python(code: str, before: str = "true", **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run code in a shell in a mount namespace, after some commands of root."""
-    words = ["unshare", "-m", "bash", "-c", f'{before} && exec {sys.executable} -c "$0"', code]
+def python(
+    *words: str | Path, before: str | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run Python; ``before`` is what root does first, in a mount namespace of its own."""
+    command = [sys.executable, *map(str, words)]
+    if before is not None:
+        inside = f'{before} && exec {sys.executable} "$@"'
+        command = ["unshare", "-m", "bash", "-c", inside, "bash", *map(str, words)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
-    return subprocess.run(words, capture_output=True, text=True, env=environment, timeout=120)
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
 
 
 # ------------------------------------------------------------------ compiled code
 
 KERNEL = """
-import sys
 from torchrl_hmcts.compiling import njit
 FACTOR = {factor}
 @njit()
@@ -63,21 +66,14 @@ def inner(x):
 @njit()
 def kernel(x):
     return inner(x) + 1
-if __name__ == "__main__":
-    print(kernel(3))
-    print(*kernel.stats.cache_hits.values())
+print(kernel(3))
+print(*kernel.stats.cache_hits.values())
 """
 
 
-def run_kernel(path: Path, factor: int = 2, **environment: str) -> subprocess.CompletedProcess[str]:
+def run_kernel(path: Path, cache: Path, factor: int = 2) -> str:
     path.write_text(KERNEL.format(factor=factor))
-    return subprocess.run(
-        [sys.executable, path],
-        capture_output=True,
-        text=True,
-        env={**os.environ, **environment},
-        timeout=120,
-    )
+    return python(path, NUMBA_CACHE_DIR=str(cache)).stdout
 
 
 def damage(folder: Path, how: str) -> None:
@@ -93,17 +89,16 @@ def damage(folder: Path, how: str) -> None:
 )
 def test_a_damaged_file_of_compiled_code_is_compiled_again(tmp_path: Path, how: str) -> None:
     cache = tmp_path / "cache"
-    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n\n"
-    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n1\n"
+    assert run_kernel(tmp_path / "k.py", cache) == "7\n\n"
+    assert run_kernel(tmp_path / "k.py", cache) == "7\n1\n"
     damage(cache, how)
-    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n\n"
-    assert run_kernel(tmp_path / "k.py", NUMBA_CACHE_DIR=str(cache)).stdout == "7\n1\n"
+    assert run_kernel(tmp_path / "k.py", cache) == "7\n\n"
+    assert run_kernel(tmp_path / "k.py", cache) == "7\n1\n"
 
 
 def test_compiled_code_follows_a_constant_that_it_holds(tmp_path: Path) -> None:
-    cache = str(tmp_path / "cache")
-    assert run_kernel(tmp_path / "k.py", 2, NUMBA_CACHE_DIR=cache).stdout.startswith("7")
-    assert run_kernel(tmp_path / "k.py", 5, NUMBA_CACHE_DIR=cache).stdout.startswith("16")
+    assert run_kernel(tmp_path / "k.py", tmp_path / "cache", 2).startswith("7")
+    assert run_kernel(tmp_path / "k.py", tmp_path / "cache", 5).startswith("16")
 
 
 @root_only
@@ -114,25 +109,19 @@ def test_without_a_folder_for_compiled_code_it_is_compiled_with_one_line(
     (tmp_path / "k.py").write_text(KERNEL.format(factor=2))
     temporary = tmp_path / "temporary"
     temporary.mkdir()
-    before = f"mount --bind {tmp_path} {tmp_path} && mount -o remount,ro,bind {tmp_path}"
+    size = "-o size=8k" if where == "full" else ""
+    before = (
+        f"mount --bind {tmp_path} {tmp_path} && mount -o remount,ro,bind {tmp_path} && "
+        f"mount -t tmpfs {size} tmpfs {temporary}"
+    )
+    if where == "nowhere":
+        before += f" && touch {temporary}/torchrl_hmcts-0"  # somebody else's
+    variable = "NUMBA_CACHE_DIR" if where == "full" else "TMPDIR"
     environment = {"HOME": "/nonexistent", "XDG_CACHE_HOME": "/proc/nowhere"}
-    if where == "temporary folder":
-        before += f" && mount -t tmpfs tmpfs {temporary}"
-        environment["TMPDIR"] = str(temporary)
-    elif where == "nowhere":
-        theirs = tmp_path / "torchrl_hmcts-0"
-        theirs.write_text("somebody else's")
-        environment["TMPDIR"] = str(temporary)
-        before += f" && mount -t tmpfs tmpfs {temporary} && touch {temporary}/torchrl_hmcts-0"
-    else:
-        before += f" && mount -t tmpfs -o size=8k tmpfs {temporary}"
-        environment["NUMBA_CACHE_DIR"] = str(temporary)
-    code = f"import runpy; runpy.run_path({str(tmp_path / 'k.py')!r}, run_name='__main__')"
-    done = python(code, before, **environment)
+    done = python(tmp_path / "k.py", before=before, **{**environment, variable: str(temporary)})
     assert done.stdout == "7\n\n", done.stderr
     (line,) = done.stderr.splitlines()
-    said = "is kept in" if where == "temporary folder" else "cannot be kept in"
-    assert said in line
+    assert ("is kept in" if where == "temporary folder" else "cannot be kept in") in line
     assert "NUMBA_CACHE_DIR" in line
 
 
@@ -141,8 +130,6 @@ def test_without_a_folder_for_compiled_code_it_is_compiled_with_one_line(
 def test_code_is_not_loaded_from_a_temporary_folder_that_others_can_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: str
 ) -> None:
-    from torchrl_hmcts import compiling
-
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     compiling.private_folder.cache_clear()
     folder = compiling.private_folder()
@@ -241,10 +228,8 @@ def test_a_process_forked_while_a_thread_steps_can_step() -> None:
 def test_a_copy_steps_as_the_env_that_was_copied(copied: Any) -> None:
     env = WaterworldMazeEnv(maze_pool("test")[:1], seed=0)
     td = env.reset().set("action", torch.tensor(2))
-    other = copied(env)
-    assert other.step(td.clone())["next", "position"].equal(
-        env.step(td.clone())["next", "position"]
-    )
+    one, other = (e.step(td.clone())["next", "position"] for e in (env, copied(env)))
+    assert one.equal(other)
 
 
 # ------------------------------------------------------------------ signs of life
@@ -272,38 +257,32 @@ def make_loss() -> A3CLoss:
     return A3CLoss(actor, ValueOperator(torch.nn.Embedding(4, 1), in_keys=["state"]))
 
 
-def stop_a_learner(trainer: A3CTrainer, stopped: list[int]) -> None:
-    """Stop learner 1 as soon as it has taken a step, in a thread."""
+def stop_a_learner(trainer: A3CTrainer) -> list[int]:
+    """Stop learner 1 as soon as it has taken a step, in a thread; its process id comes then."""
+    pids: list[int] = []
 
     def wait() -> None:
         while int(trainer.shared.steps[1]) == 0:
             time.sleep(0.01)
-        stopped.append(trainer.learners.running[1][0].pid)
-        os.kill(stopped[0], signal.SIGSTOP)
+        pids.append(trainer.learners.running[1][0].pid)
+        os.kill(pids[0], signal.SIGSTOP)
 
     threading.Thread(target=wait, daemon=True).start()
+    return pids
 
 
-def gone(pid: int) -> bool:
-    return not os.path.exists(f"/proc/{pid}")
+def make_trainer(**kwargs: Any) -> A3CTrainer:
+    return A3CTrainer(lambda: ChainEnv(4), make_loss(), start_method="fork", **kwargs)
 
 
 @linux
 def test_a_stopped_learner_ends_the_run_with_its_name_and_a_checkpoint(tmp_path: Path) -> None:
-    trainer = A3CTrainer(
-        lambda: ChainEnv(4),
-        make_loss(),
-        total_frames=10**9,
-        save_dir=tmp_path,
-        start_method="fork",
-        step_seconds=2.0,
-    )
-    stopped: list[int] = []
-    stop_a_learner(trainer, stopped)
+    trainer = make_trainer(total_frames=10**9, save_dir=tmp_path, step_seconds=2.0)
+    pids = stop_a_learner(trainer)
     with pytest.raises(LearnerError, match=r"Learner 1 of 2 .* has not answered for \d+ s"):
         trainer.train()
     assert any(tmp_path.glob("checkpoint-*"))
-    assert gone(stopped[0])
+    assert not os.path.exists(f"/proc/{pids[0]}")
 
 
 @linux
@@ -311,38 +290,15 @@ def test_a_run_that_has_reached_its_frames_ends_though_a_learner_is_stopped(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(learner_processes, "_STOP_SECONDS", 1.0)
-    trainer = A3CTrainer(lambda: ChainEnv(4), make_loss(), total_frames=4000, start_method="fork")
-    stopped: list[int] = []
-    stop_a_learner(trainer, stopped)
+    trainer = make_trainer(total_frames=4000)
+    pids = stop_a_learner(trainer)
     history = trainer.train()
     assert history["frames"][-1] >= 4000
-    assert gone(stopped[0])
+    assert not os.path.exists(f"/proc/{pids[0]}")
     assert "Learner 1 of 2" in capfd.readouterr().err
 
 
 # ------------------------------------------------------------------ what the machine lacks
-
-
-def test_what_the_system_refuses_is_no_wrong_argument() -> None:
-    @name_arguments
-    class Part:
-        def __init__(self, error: Exception) -> None:
-            raise error
-
-    for error in (
-        OSError(28, "No space left on device"),
-        MemoryError(),
-        ImportError("no such library"),
-        RuntimeError("unable to allocate shared memory(shm) for file </x>: No space left (28)"),
-        RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory"),
-        RuntimeError("CUDA error: an illegal memory access was encountered"),
-        RuntimeError("cannot cache function 'f': no locator available for file 'f.py'"),
-    ):
-        with pytest.raises(type(error)) as caught:
-            Part(error)
-        assert caught.value is error
-    with pytest.raises(ValueError, match="Part cannot be built with error="):
-        Part(RuntimeError("size mismatch"))
 
 
 A3C = """
@@ -372,13 +328,10 @@ except Exception as error:
 """
 BUFFER = """
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl_hmcts.arguments import name_arguments
-@name_arguments
-class Trainer:
-    def __init__(self):
-        self.buffers = [ReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(9)]
+from torchrl_hmcts.processes import system_errors
 try:
-    Trainer()
+    with system_errors("the buffers cannot have the shared memory of their locks"):
+        buffers = [ReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(9)]
 except Exception as error:
     print(type(error).__name__, error)
 """
@@ -403,10 +356,8 @@ except Exception as error:
     ids=["a3c", "pool", "buffer", "network"],
 )
 def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) -> None:
-    done = python(
-        f"{code}import os; print('left', os.listdir('/dev/shm'))",
-        "mount -t tmpfs -o size=16k tmpfs /dev/shm",
-    )
+    code_and_rest = f"{code}import os; print('left', os.listdir('/dev/shm'))"
+    done = python("-c", code_and_rest, before="mount -t tmpfs -o size=16k tmpfs /dev/shm")
     assert done.stdout.startswith("OSError"), done
     assert "/dev/shm has 16,384 bytes" in done.stdout
     assert "docker run --shm-size=" in done.stdout
@@ -414,25 +365,26 @@ def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) 
         assert done.stdout.endswith("left []\n")
 
 
+def limited(code: str, limit: str) -> str:
+    """Run code with what stands before its ``try`` executed after its imports."""
+    imports, attempt = code.split("try:\n")
+    attempt = attempt.replace("except Exception", "    print('done')\nexcept Exception")
+    return python("-c", f"{imports}{limit}try:\n{attempt}").stdout
+
+
 @linux
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
 def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> None:
     begin = time.monotonic()
-    limited = (
+    limit = (
         "import os, resource\n"
         "few = len(os.listdir('/proc/self/fd')) + 7\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
     )
-    imports, attempt = code.split("try:\n")
-    done = subprocess.run(
-        [sys.executable, "-c", f"{imports}{limited}try:\n{attempt}"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.stdout.startswith("OSError"), done
-    assert "ulimit -n" in done.stdout
+    told = limited(code, limit)
+    assert told.startswith("OSError"), told
+    assert "ulimit -n" in told
     assert time.monotonic() - begin < 60.0  # the imports included
 
 
@@ -476,7 +428,7 @@ def test_each_process_counts_two_descriptors_before_any_is_started(
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
 def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
-    limited = (
+    limit = (
         "import os, resource\n"
         "from torchrl_hmcts import processes\n"
         "check = processes.need_descriptors\n"
@@ -488,32 +440,22 @@ def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
         "import torchrl_hmcts.trainers.a3c.learner_processes as b\n"
         "a.need_descriptors = b.need_descriptors = limit\n"
     )
-    imports, attempt = code.split("try:\n")
-    attempt = attempt.replace("except Exception", "    print('done')\nexcept Exception")
-    words = [sys.executable, "-c", f"{imports}{limited}try:\n{attempt}"]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
-    assert done.stdout == "done\n", done
+    assert limited(code, limit) == "done\n"
 
 
 @linux
 @pytest.mark.parametrize("length", [10, pytest.param(90, marks=pytest.mark.slow), 200])
-def test_the_forkserver_has_a_socket_whatever_the_temporary_folder(
-    tmp_path: Path, length: int
-) -> None:
+def test_the_forkserver_has_a_socket_for_any_temporary_folder(tmp_path: Path, length: int) -> None:
     folder = tmp_path / ("x" * (length - length // 2)) / ("y" * (length // 2))
     folder.mkdir(parents=True)
-    code = (
+    script = tmp_path / "script.py"
+    script.write_text(
         "from torchrl_hmcts.processes import start_context\n"
         "if __name__ == '__main__':\n"
         "    context = start_context('forkserver')\n"
         "    process = context.Process(target=print, args=('ran', ))\n"
         "    process.start(); process.join(); print(context.get_start_method(), process.exitcode)\n"
     )
-    script = tmp_path / "script.py"
-    script.write_text(code)
-    environment = {**os.environ, "TMPDIR": str(folder)}
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, env=environment, timeout=60
-    )
+    done = python(script, TMPDIR=str(folder))
     assert done.stdout.splitlines() == ["ran", "forkserver 0"], done.stderr
     assert not list(folder.iterdir())

@@ -18,7 +18,7 @@ from torchrl.record.loggers import CSVLogger, Logger
 
 from torchrl_hmcts.trainers import cli
 from torchrl_hmcts.trainers.figures.animation import write_gif
-from torchrl_hmcts.trainers.figures.report import finish
+from torchrl_hmcts.trainers.figures.run_page import finish
 from torchrl_hmcts.trainers.runs.loggers import ScalarLoggers
 from torchrl_hmcts.trainers.saving import files
 from torchrl_hmcts.trainers.saving.files import left_out, replacing, write_text
@@ -32,7 +32,7 @@ def full(*_: Any, **__: Any) -> None:
     raise FULL
 
 
-def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
+def without(monkeypatch, *packages: str) -> None:
     """Lets imports of packages fail, also of those that were imported before."""
     real = builtins.__import__
 
@@ -44,7 +44,7 @@ def without(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
     monkeypatch.setattr(builtins, "__import__", load)
 
 
-def crashing_ffmpeg(tmp_path: Path) -> str:
+def crashing_ffmpeg(tmp_path) -> str:
     program = tmp_path / "ffmpeg"
     program.write_text('#!/bin/sh\ncase "$*" in *-version*) echo ffmpeg version 7;; esac\nexit 3\n')
     program.chmod(0o755)
@@ -54,11 +54,7 @@ def crashing_ffmpeg(tmp_path: Path) -> str:
 class TestVideo:
     @pytest.mark.parametrize("fault", ["nowhere", "crashes", "no package"])
     def test_a_lost_ffmpeg_costs_the_video_and_one_line(
-        self,
-        fault: str,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
+        self, fault: str, tmp_path, monkeypatch, capsys
     ) -> None:
         (tmp_path / "episode.mp4").write_bytes(b"of an older episode")
         if fault == "no package":
@@ -84,9 +80,7 @@ class TestPageAtTheEnd:
         page = out / "index.html"
         return page.read_text(encoding="utf-8") if page.is_file() else ""
 
-    def test_figures_are_on_the_disk_before_the_first_picture_is_drawn(
-        self, tmp_path: Path
-    ) -> None:
+    def test_figures_are_on_the_disk_before_the_first_picture_is_drawn(self, tmp_path) -> None:
         page = self.end(
             tmp_path, lambda path: json.loads((path.parent / "metrics.json").read_text())
         )
@@ -94,7 +88,7 @@ class TestPageAtTheEnd:
 
     @pytest.mark.parametrize("error", [FULL, ImportError("no font"), AssertionError(), KeyError(1)])
     def test_the_page_has_all_but_the_picture_that_failed(
-        self, error: Exception, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, error: Exception, tmp_path, capsys
     ) -> None:
         def draw(path: Path) -> None:
             raise error
@@ -107,7 +101,7 @@ class TestPageAtTheEnd:
         assert said.startswith("Left out one.png: ")
         assert said.count("\n") == 1
 
-    def test_ctrl_c_is_no_picture_that_failed(self, tmp_path: Path) -> None:
+    def test_ctrl_c_is_no_picture_that_failed(self, tmp_path) -> None:
         def draw(path: Path) -> None:
             raise KeyboardInterrupt
 
@@ -117,11 +111,7 @@ class TestPageAtTheEnd:
 
     @pytest.mark.parametrize("call", ["fsync", "replace"])
     def test_on_a_full_disk_the_figures_are_printed(
-        self,
-        call: str,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str],
+        self, call: str, tmp_path, monkeypatch, capsys
     ) -> None:
         (tmp_path / "index.html").write_text("of an older run")
         with monkeypatch.context() as patch:
@@ -137,14 +127,21 @@ class TestPageAtTheEnd:
         assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
 
     def test_without_matplotlib_the_page_lacks_its_curves(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+        self, tmp_path, monkeypatch, capsys
     ) -> None:
         (tmp_path / "curves.csv").write_text("name,step,value\nloss,1,2\nloss,2,1\n")
         without(monkeypatch, "matplotlib")
+        monkeypatch.delitem(sys.modules, "torchrl_hmcts.trainers.figures.curves", raising=False)
         page = self.end(tmp_path, lambda path: None)
         assert "one.png" in page
         assert "Curves" not in page
         assert capsys.readouterr().err.startswith("Left out the curves of the page: No module")
+
+    def test_without_jinja2_the_run_lacks_its_page(self, tmp_path, monkeypatch, capsys) -> None:
+        without(monkeypatch, "jinja2")
+        assert not self.end(tmp_path, lambda path: None)
+        assert (tmp_path / "metrics.json").is_file()
+        assert capsys.readouterr().err.startswith("Left out index.html: No module named 'jinja2'")
 
 
 class Failing(Logger):
@@ -165,9 +162,7 @@ class Failing(Logger):
     log_video = log_hparams = log_histogram = __repr__ = full  # type: ignore[assignment]
 
 
-def test_a_logger_on_a_full_disk_is_left_out_and_the_others_continue(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_logger_on_a_full_disk_is_left_out_and_the_others_continue(tmp_path, capsys) -> None:
     failing, seen = Failing(), []
     csv = CSVLogger(exp_name="log", log_dir=str(tmp_path))
     logger = ScalarLoggers([failing, csv], [lambda *values: seen.append(values)])
@@ -182,9 +177,7 @@ def test_a_logger_on_a_full_disk_is_left_out_and_the_others_continue(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-def test_csv_files_on_a_disk_that_really_is_full_do_not_end_the_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_csv_files_on_a_disk_that_really_is_full_do_not_end_the_run(tmp_path, capsys) -> None:
     csv = CSVLogger(exp_name="log", log_dir=str(tmp_path))
     (tmp_path / "log" / "scalars" / "loss.csv").symlink_to("/dev/full")
     logger = ScalarLoggers([csv])
@@ -195,7 +188,7 @@ def test_csv_files_on_a_disk_that_really_is_full_do_not_end_the_run(
 
 
 class TestFiles:
-    def test_a_file_is_replaced_in_one_move_whatever_goes_wrong(self, tmp_path: Path) -> None:
+    def test_a_file_is_replaced_in_one_move_whatever_goes_wrong(self, tmp_path) -> None:
         path = tmp_path / "a.png"
         path.write_text("old")
 
@@ -213,7 +206,7 @@ class TestFiles:
         assert path.read_text() == "new"
         assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
-    def test_what_killed_processes_left_of_a_file_is_removed(self, tmp_path: Path) -> None:
+    def test_what_killed_processes_left_of_a_file_is_removed(self, tmp_path) -> None:
         gone = subprocess.Popen([sys.executable, "-c", ""])
         gone.wait()
         for name in (f".writing-{gone.pid}.a.json", f".a.json.writing-{gone.pid}"):
@@ -223,12 +216,12 @@ class TestFiles:
         names = sorted(path.name for path in tmp_path.iterdir())
         assert names == [f".writing-{os.getppid()}.a.json", "a.json"]
 
-    def test_a_name_of_a_locale_without_utf8_is_written_as_its_bytes(self, tmp_path: Path) -> None:
+    def test_a_name_of_a_locale_without_utf8_is_written_as_its_bytes(self, tmp_path) -> None:
         name = os.fsdecode("ünï".encode()) if os.name == "posix" else "ünï"
         write_text(tmp_path / "a.html", "ünï".encode().decode("ascii", "surrogateescape") + name)
         assert (tmp_path / "a.html").read_text(encoding="utf-8") == "ünïünï"
 
-    def test_a_long_reason_is_one_line(self, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_long_reason_is_one_line(self, capsys) -> None:
         with left_out("episode.mp4"):
             raise RuntimeError("a\nb\n" + 999 * "c")
         said = capsys.readouterr().err
@@ -237,7 +230,7 @@ class TestFiles:
         assert len(said) < 400
 
 
-def test_pages_of_runs_are_the_same_bytes_in_every_locale(tmp_path: Path) -> None:
+def test_pages_of_runs_are_the_same_bytes_in_every_locale(tmp_path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         config = {"seed": 0, "out": "ünï"}

@@ -26,7 +26,6 @@ from torchrl.envs import (
 from torchrl_hmcts.planners import (
     UCT,
     HighestValue,
-    MaxBackup,
     MCTSPlanner,
     ProgressiveWidening,
     SearchBudget,
@@ -56,7 +55,7 @@ def test_a_pendulum_is_swung_up_by_a_search_over_held_torques() -> None:
     planner = MCTSPlanner(
         swinging_pendulum(),
         tree_policy=UCT(c=5.0),  # a step costs up to 16
-        backup=MaxBackup(),
+        backup="max",
         final_choice=HighestValue(),
         budget=SearchBudget(expansions=24, until_plan=False),
         leaves_per_wave=8,
@@ -103,7 +102,7 @@ def test_a_random_opponent_at_tic_tac_toe_hardly_ever_wins_and_no_move_is_illega
     assert won >= 15  # a random player who moves first wins 58 % of its games
 
 
-def test_a_winning_move_is_found_whatever_the_opponent_would_answer() -> None:
+def test_a_winning_move_is_found_for_every_answer_of_the_opponent() -> None:
     env = TicTacToeEnv(single_player=True)
     td = env.reset()
     # Ours are 1: two in the top row, the third square is free.

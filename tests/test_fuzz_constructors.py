@@ -1,13 +1,12 @@
 """Every public constructor, given what makes no sense: it refuses by name, or it works.
 
-A case replaces one to three arguments of a valid call. It may be accepted, or end in a ValueError
-or TypeError that has the argument's name or its value; never in another error, in a NaN that is
-accepted, or in no end.
+A case replaces one to three arguments of a valid call. It may be accepted, or end in an error that
+has the argument's name, its value or the value's type; never in a KeyError or the like, in a NaN
+that is taken for a number, or in no end.
 """
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import math
 import os
@@ -42,7 +41,7 @@ from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_e
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # torch may warn of what it then accepts
 Good = Callable[[], tuple[Callable[..., Any], dict[str, Any]]]
-IN, SPEC = ("velocity",), OneHot(4)
+IN, SPEC, BOUNDED = ("velocity",), OneHot(4), Bounded(-1, 1, (2,))
 CASES: Counter[str] = Counter()
 
 
@@ -79,10 +78,6 @@ def actor() -> Any:
     return modules.SkillActor(2, SPEC, 4, in_keys=IN, hidden=(4,))
 
 
-def gaussian_actor() -> Any:
-    return modules.GaussianSkillActor(2, Bounded(-1, 1, (2,)), 4, in_keys=IN, hidden=(4,))
-
-
 def critic() -> Any:
     return modules.SkillCritic(2, 4, 4, in_keys=IN, hidden=(4,))
 
@@ -91,10 +86,17 @@ def discriminator() -> Any:
     return modules.SkillDiscriminator(2, 4)
 
 
-def option_model(**kwargs: Any) -> Any:
-    settings = {"max_duration": 5, "num_models": 1, **kwargs}
+def objective() -> Any:
+    return objectives.SkillDiscriminatorLoss(discriminator())
+
+
+def termination() -> Any:
+    return modules.TerminationNetwork(2, 4, in_keys=IN, hidden=(4,))
+
+
+def option_model() -> Any:
     make = partial(nn.Linear, 3)
-    return modules.OptionModel(lambda n: make(n), ["state"], {"state": 1}, **settings)
+    return modules.OptionModel(lambda n: make(n), ["state"], {"state": 1}, max_duration=5)
 
 
 def of(name: str, cls: Callable[..., Any], **good: Any) -> tuple[str, Good]:
@@ -111,7 +113,7 @@ def everything(package: Any, **table: dict[str, Any]) -> dict[str, Good]:
     return dict(of(name, getattr(package, name), **good) for name, good in table.items())
 
 
-NET = {"in_keys": IN, "hidden": (4,)}
+SIZES = {"in_features": 2, "num_skills": 4, "hidden": (4,)}
 LOSS = {"actor_network": lambda: actor(), "qvalue_network": lambda: critic()}
 GOOD: dict[str, Good] = {
     **everything(
@@ -119,8 +121,6 @@ GOOD: dict[str, Good] = {
         PUCT={},
         UCT={},
         BestPlan={},
-        MaxBackup={},
-        MeanBackup={},
         MostVisited={},
         DirichletNoise={},
         Gumbel={},
@@ -147,14 +147,12 @@ GOOD: dict[str, Good] = {
         },
         MCTSPlanner={"env": lambda: chain()},
         HierarchicalPolicy={"planner": lambda: planner()},
-        ModelBasedControl={"planner": lambda: planner()},
         GoalPlanner={"planner": lambda: planner(), "to_macro": abs, "goal_key": "state"},
+        SearchSettings={},
         SearchTree={"num_roots": 2, "num_options": 3},
         Search={
             "num_roots": 2,
             "num_options": 3,
-            "tree_policy": lambda: planners.UCT(),
-            "backup": lambda: planners.MaxBackup(),
         },
     ),
     **everything(
@@ -162,28 +160,19 @@ GOOD: dict[str, Good] = {
         FixedSkillPrior={"num_skills": 4},
         LearnedSkillPrior={"num_skills": 4},
         GrowingSkillPrior={"num_skills": 4},
-        ConcatSkillMLP={"in_features": 2, "out_features": 3, "num_skills": 4, "hidden": (4,)},
-        SkillMLP={"in_features": 2, "out_features": 3, "num_skills": 4, "hidden": (4,)},
-        SkillNetwork={"network": lambda: nn.Linear(2, 2), "in_keys": IN, "out_key": "out"},
-        SkillActor={"in_features": 2, "action_spec": SPEC, "num_skills": 4, **NET},
-        GaussianSkillActor={
-            "in_features": 2,
-            "action_spec": Bounded(-1, 1, (2,)),
-            "num_skills": 4,
-            **NET,
-        },
-        SkillCritic={"in_features": 2, "num_actions": 4, "num_skills": 4, **NET},
-        SkillActionCritic={"in_features": 2, "action_features": 2, "num_skills": 4, **NET},
-        SkillDiscriminator={"in_features": 2, "num_skills": 4},
-        SkillDynamics={"in_features": 2, "target_features": 2, "num_skills": 4, "hidden": (4,)},
-        SkillEncoder={"in_features": 2, "num_skills": 4, "hidden": (4,)},
+        ConcatSkillMLP={**SIZES, "out_features": 3},
+        SkillMLP={**SIZES, "out_features": 3},
+        SkillActor={**SIZES, "action_spec": SPEC, "in_keys": IN},
+        SkillCritic={**SIZES, "num_actions": 4, "in_keys": IN},
+        SkillActionCritic={**SIZES, "action_features": 2, "in_keys": IN},
+        SkillDiscriminator=SIZES,
+        SkillDynamics={**SIZES, "target_features": 2},
+        SkillEncoder=SIZES,
         SpectralLinear={"in_features": 2, "out_features": 3},
         SkillPolicy={"actor": lambda: actor()},
         StallTermination={"num_steps": 3},
-        TerminationNetwork={"in_features": 2, "num_options": 4, **NET},
-        LearnedTermination={
-            "network": lambda: modules.TerminationNetwork(2, 4, in_keys=IN, hidden=(4,))
-        },
+        TerminationNetwork={"in_features": 2, "num_options": 4, "in_keys": IN, "hidden": (4,)},
+        LearnedTermination={"network": lambda: termination()},
         OptionModel={
             "make_network": nn.LazyLinear,
             "in_keys": ["state"],
@@ -201,31 +190,23 @@ GOOD: dict[str, Good] = {
     **everything(
         objectives,
         DIAYNLoss={**LOSS, "discriminator": lambda: discriminator(), "action_space": SPEC},
-        DiscreteSkillSACLoss={
-            **LOSS,
-            "objective": lambda: objectives.SkillDiscriminatorLoss(discriminator()),
-            "action_space": SPEC,
-        },
+        DiscreteSkillSACLoss={**LOSS, "objective": lambda: objective(), "action_space": SPEC},
         SkillSACLoss={
-            "actor_network": lambda: gaussian_actor(),
+            "actor_network": lambda: modules.SkillActor(2, BOUNDED, 4, in_keys=IN, hidden=(4,)),
             "qvalue_network": lambda: modules.SkillActionCritic(2, 2, 4, in_keys=IN, hidden=(4,)),
-            "objective": lambda: objectives.SkillDiscriminatorLoss(discriminator()),
-            "action_spec": Bounded(-1, 1, (2,)),
+            "objective": lambda: objective(),
+            "action_spec": BOUNDED,
         },
         SkillDiscriminatorLoss={"discriminator": lambda: discriminator()},
         METRAEncoderLoss={"encoder": lambda: modules.SkillEncoder(2, 4, hidden=(4,))},
         LSDEncoderLoss={
-            "encoder": lambda: modules.SkillEncoder(
-                2, 4, hidden=(4,), linear=modules.SpectralLinear
-            )
+            "encoder": lambda: modules.SkillEncoder(2, 4, linear=modules.SpectralLinear)
         },
         SkillDynamicsLoss={"dynamics": lambda: modules.SkillDynamics(2, 2, 4, hidden=(4,))},
         SkillPriorLoss={"prior": lambda: modules.LearnedSkillPrior(4)},
         OptionModelLoss={"model": lambda: option_model()},
         ExpertIterationLoss={"network": lambda: linear(2, 4, "velocity", "logits")},
-        OptionTerminationLoss={
-            "termination_network": lambda: modules.TerminationNetwork(2, 4, in_keys=IN, hidden=(4,))
-        },
+        OptionTerminationLoss={"termination_network": lambda: termination()},
         IntraOptionQLoss={"qvalue_network": lambda: critic()},
         A3CLoss={
             "actor_network": lambda: actor(),
@@ -242,8 +223,7 @@ GOOD: dict[str, Good] = {
             "num_options": 4,
             "max_steps": 5,
         },
-        DIAYNReward={"discriminator": lambda: discriminator(), "num_skills": 4},
-        SkillReward={"objective": lambda: objectives.SkillDiscriminatorLoss(discriminator())},
+        SkillReward={"objective": lambda: objective()},
         SkillMaskTransform={"prior": lambda: modules.GrowingSkillPrior(4)},
         SkillTransform={"num_skills": 4},
         SubgoalTransform={"planner": abs},
@@ -261,7 +241,7 @@ GOOD: dict[str, Good] = {
         SearchGuide={"num_options": 3, "hidden": (4,), "buffer_size": 8},
         OptionGoals={"goals": [0, 2]},
         AtariSearch={},
-        GoalSearch={},
+        RuleSource={},
         DemoConfig={},
         TerminationConfig={},
         StateCoverage={},
@@ -309,68 +289,34 @@ COSTLY = {  # milliseconds each; the others take microseconds
     *("DIAYNLoss", "DiscreteSkillSACLoss", "SkillSACLoss", "A3CLoss", "OptionModel"),
     *("IntraOptionQLoss", "OptionTerminationLoss", "ExpertIterationLoss", "SkillDynamicsLoss"),
 }
-EXCLUDED = {  # public names that are not fuzzed here, and why
-    **dict.fromkeys(
-        ["NodeStatistics", "Plan", "TreeView", "Root", "SearchProgress", "Transition"],
-        "a record that the search fills",
-    ),
-    **dict.fromkeys(["GoalEpisodes", "GoalTrack", "TerminationResult"], "a record of results"),
-    **dict.fromkeys(["NoveltyTest", "PlansGoals", "OptionWorker"], "a protocol"),
-    **dict.fromkeys(["SkillObjective", "SkillPrior"], "a base class"),
-    **dict.fromkeys(
-        ["AtariOptionPool", "AtariRAMEnv", "DeepMindLabEnv", "OptionPool"], "starts processes"
-    ),
-    "SkillWorker": "takes an actor: test_option_pool.py",
-    "StatelessSimulator": "takes an env, and has its own tests",
-    **dict.fromkeys(
-        ["AttributeSnapshot", "ReplaySnapshot", "SettableGymEnv", "Snapshot", "SnapshotError"],
-        "takes a Gymnasium env: test_settable_gym.py",
-    ),
-    "SkillRewardHook": "hands its arguments to SkillReward",
-    **dict.fromkeys(
-        ["ByteGoal", "FollowGoals", "JoinedWorkers", "OccasionalAction"], "belongs to an Atari game"
-    ),
-    **dict.fromkeys(
-        [
-            "AtariAgent",
-            "GoalFinder",
-            "ActionSetSource",
-            "ActionSource",
-            "BestSource",
-            "RepeatSource",
-            "GoalSource",
-            "DIAYNSource",
-            "DistilledSource",
-            "FineTunedSource",
-            "RetrainedSource",
-        ],
-        "plays an Atari game: test_atari_agent.py, test_atari_sources.py",
-    ),
-    **dict.fromkeys(
-        ["AtariProgress", "Candidate", "Options", "Controllability"], "a record of results"
-    ),
-    **dict.fromkeys(["WorkerSource"], "a protocol"),
-    **dict.fromkeys(["ContinuousDIAYNLoss"], "SkillSACLoss with a discriminator"),
-    **dict.fromkeys(["NStepReturn"], "the arguments of TorchRL's ValueEstimatorBase"),
-    **dict.fromkeys(["OptionModelEnv", "TorchRLGymnasiumEnv"], "reads another env's specs first"),
-    **dict.fromkeys(["CollectorError", "FolderInUse", "LearnerError"], "an exception"),
-    **dict.fromkeys(["DurableRotation"], "takes a folder: test_fault_checkpoints.py"),
-    **dict.fromkeys(["ResumableTrainer"], "the base of the trainers, which are fuzzed"),
-    **dict.fromkeys(
-        ["GeneratorStates", "RunningEpisodes", "SearchCollector", "SearchCoverage", "TilePlanner"],
-        "takes other parts, whose types it checks",
-    ),
-    **dict.fromkeys(["AnyTermination"], "takes callables only"),
-    **dict.fromkeys(["HindsightTransitions"], "takes recorded transitions"),
+EXCLUDED = {  # why public names are not fuzzed here
+    "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
+    "Evaluation GoalEpisodes GoalTrack TerminationResult Options Controllability",
+    "a protocol": "NoveltyTest PlansGoals OptionWorker",
+    "a base class": "SkillObjective SkillPrior ResumableTrainer",
+    "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
+    "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
+    "SkillWorker "
+    "AttributeSnapshot ReplaySnapshot SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
+    "DurableRotation HindsightTransitions AnyTermination",
+    "hands its arguments to SkillReward": "SkillRewardHook",
+    "searches from any object": "ReferenceSearch",
+    "belongs to an Atari game": "ByteGoal FollowGoals JoinedWorkers OccasionalAction AtariAgent "
+    "AtariKit TrainedSource",
+    "the arguments of TorchRL's ValueEstimatorBase": "NStepReturn",
+    "an exception": "CollectorError FolderInUse LearnerError SnapshotError",
+    "takes other parts, whose types it checks": "GeneratorStates RunningEpisodes SearchCollector "
+    "SearchCoverage TilePlanner",
 }
 
-NAN = float("nan")
+NAN, NO_ROWS = float("nan"), torch.zeros(0)
+ROWS = TensorDict(a=torch.zeros(2), batch_size=[2])
 NASTY: list[Any] = [
     *(None, True, -1, 0, 1, 2, 2**62, -(2**62), 0.0, -0.5, 1.5, 1e300),
     *(NAN, float("inf"), float("-inf"), np.float64("nan"), np.int64(-3), complex(1, 1)),
     *("", "x", "no such thing", b"bytes", (), [], {}, set()),
     *((-1,), (0,), (2.5,), ("a", "b"), [None], {"a": 1}, object(), object, len),
-    *(torch.zeros(0), torch.tensor(NAN), torch.ones(2, 2), np.zeros(3), TensorDict(), OneHot(2)),
+    *(NO_ROWS, torch.tensor(NAN), torch.ones(2, 2), np.zeros(3), ROWS, OneHot(2)),
 ]
 
 
@@ -391,18 +337,18 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 
 def shows(value: Any, message: str) -> bool:
-    texts = {repr(value), str(value)}
-    if isinstance(value, torch.Tensor):
-        texts |= {str(list(value.shape)), str(value.shape), str(value.dtype)}
-        texts |= {str(value.item())} if value.numel() == 1 else set()
+    """Whether a message has a value, its shape, its type or that of what it holds."""
+    texts = {repr(value), str(value), type(value).__name__, getattr(value, "__name__", "")}
+    if isinstance(value, (torch.Tensor, np.ndarray)):
+        texts |= {str(list(value.shape)), str(value.shape), str(value.dtype), "array"}
+        texts |= {str(value.item())} if value.shape == () else set()
     if isinstance(value, (tuple, list, set, dict)):
-        texts |= {repr(item) for item in value}
+        texts |= {repr(item) for item in value} | {type(item).__name__ for item in value}
     if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
         texts |= {f"{value:g}", f"{value:,}"}
-    texts.add(type(value).__name__)
-    if isinstance(value, (tuple, list, set, dict, str)) and not value:
+    if value is NO_ROWS or (isinstance(value, (str, tuple, list, set, dict)) and not value):
         texts.add("got none")
-    return any(text and text in message for text in texts)
+    return any(text and text.lower() in message.lower() for text in texts)
 
 
 def close(made: Any) -> None:
@@ -410,8 +356,22 @@ def close(made: Any) -> None:
         made.collector.shutdown()
 
 
-def is_nan(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)
+# What says that an argument is wrong, wherever it is found out.
+REFUSALS = (ValueError, TypeError, AttributeError, RuntimeError, OverflowError, OSError)
+
+
+def parameters(call: Callable[..., Any]) -> dict[str, str]:
+    """The names of the arguments with their annotations, those behind ``**kwargs`` too."""
+    found: dict[str, str] = {}
+    for each in call.__mro__ if inspect.isclass(call) else (call,):
+        if found and not each.__module__.startswith("torchrl_hmcts"):
+            break
+        given = inspect.signature(each).parameters.values()
+        plain = {p.name: str(p.annotation) for p in given if "VAR" not in p.kind.name}
+        found = {**plain, **found}
+        if "VAR_KEYWORD" not in {p.kind.name for p in given}:
+            break
+    return found
 
 
 def complaint(call: Callable[..., Any], good: Mapping[str, Any], bad: Mapping[str, Any]) -> str:
@@ -420,40 +380,33 @@ def complaint(call: Callable[..., Any], good: Mapping[str, Any], bad: Mapping[st
     signal.setitimer(signal.ITIMER_REAL, 10.0)
     try:
         made = call(**{**good, **bad})
-    except (ValueError, TypeError) as error:
+    except REFUSALS as error:
         message = str(error)
-        names = any(re.search(rf"\b{re.escape(name.rstrip('s'))}", message) for name in bad)
+        words = {word.rstrip("s") for name in bad for word in (name, name.split("_")[-1])}
+        names = any(re.search(rf"\b{re.escape(word)}", message) for word in words)
         if names or any(shows(value, message) for value in bad.values()):
             return ""
+        vast = any(isinstance(value, int) and value > 2**40 for value in bad.values())
+        if vast and re.search("allocate memory|overflow", message, re.IGNORECASE):
+            return ""
         return f"{shown} does not say what: {type(error).__name__}: {message[:200]}"
-    except OSError as error:  # a folder that is not there, or cannot be made
-        named = any(shows(v, str(error)) or name in str(error) for name, v in bad.items())
-        return "" if named else f"{shown}: {error!r}"
     except Hang:
         return f"{shown} takes more than ten seconds"
+    except MemoryError:
+        return ""
     except Exception as error:
-        vast = any(isinstance(value, int) and value > 2**40 for value in bad.values())
-        lack = isinstance(error, MemoryError) or "allocate memory" in str(error)
-        if vast and lack:  # the system's error stays what it is
-            return ""
         return f"{shown} ends in {type(error).__name__}: {str(error)[:200]}"
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
     close(made)
-    nans = [name for name, value in bad.items() if is_nan(value)]
+    numbers = [k for k, kind in parameters(call).items() if re.search(r"\b(float|int)\b", kind)]
+    nans = [k for k, v in bad.items() if isinstance(v, float) and math.isnan(v) and k in numbers]
     return f"{shown} accepts NaN" if nans else ""
-
-
-def parameters(call: Callable[..., Any]) -> list[str]:
-    function = call.__init__ if inspect.isclass(call) else call
-    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    names = [p.name for p in inspect.signature(function).parameters.values() if p.kind in kinds]
-    return [name for name in names if name != "self"]
 
 
 def fuzz(name: str, cases: int) -> None:
     call, _ = GOOD[name]()
-    names = parameters(call)
+    names = list(parameters(call))
     if not names:
         return
     arguments = st.dictionaries(
@@ -480,8 +433,9 @@ def test_every_public_constructor_is_fuzzed_or_says_why_not() -> None:
         for name in package.__all__
         if inspect.isclass(getattr(package, name))
     }
-    assert public - set(GOOD) - set(EXCLUDED) == set()
-    assert not set(GOOD) & set(EXCLUDED)
+    excluded = set(" ".join(EXCLUDED.values()).split())
+    assert public - set(GOOD) - excluded == set()
+    assert not set(GOOD) & excluded
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -494,7 +448,7 @@ def test_the_valid_call_is_valid(name: str) -> None:
 @pytest.mark.parametrize("name", GOOD)
 def test_what_makes_no_sense_is_refused_by_name(name: str) -> None:
     call, _ = GOOD[name]()
-    for parameter in parameters(call)[:3]:  # one by one first: the plainest failure is shown
+    for parameter in list(parameters(call))[:3]:  # one by one first: the plainest failure is shown
         for value in NASTY:
             if name in COSTLY and not isinstance(value, float):
                 continue
@@ -518,7 +472,7 @@ def test_the_cases_are_counted() -> None:
 
 
 def test_the_check_notices_what_it_is_for() -> None:
-    def silent(x: Any = 0) -> None:
+    def silent(x: float = 0) -> None:
         return None
 
     def mute(x: Any = 0) -> None:
@@ -535,4 +489,3 @@ def test_the_check_notices_what_it_is_for() -> None:
     assert "ends in KeyError" in complaint(wrong, {}, {"x": -1})
     assert not complaint(good, {}, {"x": -1})
     assert not complaint(silent, {}, {"x": -1})
-    assert importlib.import_module("torchrl_hmcts.planners").UCT is planners.UCT

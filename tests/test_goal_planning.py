@@ -36,14 +36,14 @@ from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
     tile_moves,
 )
 from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert
-from torchrl_hmcts.trainers.figures.goal_figures import (
+from torchrl_hmcts.trainers.figures.goals import (
     draw_goals,
     plot_goals,
     plot_macro_env,
     plot_tile_search,
     write_goal_gif,
 )
-from torchrl_hmcts.trainers.saving.resume import GeneratorStates, RunningEpisodes
+from torchrl_hmcts.trainers.saving.run_state import GeneratorStates, RunningEpisodes
 
 MAZE, PLAYER, TARGET = maze_from_text("P.#\n#..\n..T")
 PLANNERS = pytest.mark.parametrize("make", [TilePlanner, make_tile_planner])
@@ -387,7 +387,10 @@ def test_an_episode_becomes_a_picture_and_a_gif(tmp_path: Path) -> None:
 def test_the_search_and_the_macro_environment_are_drawn(tmp_path: Path) -> None:
     env, start, _ = example()
     plot_macro_env(env, start, tmp_path / "macro.png")
-    plot_tile_search(env, start, tmp_path / "search.png")
+    manager = make_tile_planner(env)
+    goals, lengths = manager.plan_goals(start[None])
+    search = manager.planner.last_search
+    plot_tile_search(env, start, search, goals[0, : int(lengths[0])], tmp_path / "search.png")
     for name, colors in {"macro.png": 2, "search.png": 3}.items():
         image = iio.imread(tmp_path / name)[..., :3]
         assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10 * colors

@@ -23,7 +23,6 @@ from torchrl_hmcts.planners import (
     UCT,
     DirichletNoise,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
     NodeStatistics,
     ProgressiveWidening,
@@ -44,6 +43,9 @@ PLANNERS, ENVS = "torchrl_hmcts.planners", "torchrl_hmcts.envs"
 Arrays = dict[str, np.ndarray]
 
 
+KERNELS = ("variant_kernels", "kernels", "batch_kernels", "subtree_kernels", "novelty_kernels")
+
+
 def in_python(name: str) -> ModuleType:
     """A module once more, of which nothing is compiled."""
     spec = importlib.util.find_spec(name)
@@ -58,7 +60,12 @@ def in_python(name: str) -> ModuleType:
 
 @pytest.fixture(scope="module")
 def kernels() -> dict[str, ModuleType]:
-    return {name: in_python(f"{PLANNERS}.{name}") for name in ("kernels", "novelty_kernels")}
+    """The kernels once more; each imports those before it."""
+    found: dict[str, ModuleType] = {}
+    for name in KERNELS:
+        with used(found):
+            found[name] = in_python(f"{PLANNERS}.{name}")
+    return found
 
 
 @contextmanager
@@ -122,17 +129,17 @@ def least_visited(statistics: NodeStatistics) -> torch.Tensor:
 
 SEARCHES: dict[str, dict[str, Any]] = {
     "uct": {"tree_policy": UCT(), "expand": "one"},
-    "uct, max, waves of 3": {"backup": MaxBackup(), "leaves_per_wave": 3},
+    "uct, max, waves of 3": {"backup": "max", "leaves_per_wave": 3},
     "puct over siblings": {"tree_policy": PUCT.mctx(), "expand": "one", "option_prior": prior},
     "puct over the tree": {"tree_policy": PUCT(normalize="tree"), "option_prior": prior},
     "gumbel": {"tree_policy": Gumbel(max_considered=2), "expand": "one", "leaf_evaluator": half},
     "revisits": {"expand": "one", "exhausted": "revisit", "leaves_per_wave": 2},
     "root noise": {"tree_policy": PUCT(), "root_noise": DirichletNoise(), "expand": "one"},
-    "radius": {"novelty": RadiusNovelty("state", 1.5), "backup": MaxBackup()},
+    "radius": {"novelty": RadiusNovelty("state", 1.5), "backup": "max"},
     "width": {"novelty": WidthNovelty("state")},
     "transpositions": {
         "transpositions": Transpositions("state"),
-        "backup": MaxBackup(),
+        "backup": "max",
         "expand": "one",
     },
     "chance": {"chance": ProgressiveWidening(), "expand": "one", "leaves_per_wave": 2},

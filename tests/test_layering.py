@@ -1,40 +1,64 @@
-"""Components know no environment, environments know no component, trainers know both."""
+"""The direction of all imports, lazy and typing-only ones included, and no circle of files."""
 
 from __future__ import annotations
 
 import ast
-import importlib
-import importlib.metadata
-import json
 import re
-import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = {
-    "torchrl_hmcts": "torchrl_hmcts",
-    "envs": "torchrl_hmcts.envs",
-    "trainers": "torchrl_hmcts.trainers",
+TOP = "torchrl_hmcts"
+FOLDERS = {TOP: TOP, "envs": f"{TOP}.envs", "trainers": f"{TOP}.trainers"}
+# Rooms by the pattern of their modules, the first that fits, and the rooms that each may import,
+# with all below these. Packages that export their parts are rooms of their own.
+PARTS = ["testing", "planners", "transforms"]
+ROOMS: dict[str, tuple[str, list[str]]] = {
+    "command line": (r"trainers\.(command_line|cli|configs|__main__)", ["experiments"]),
+    "experiments": (r"trainers\.experiments", ["runs", "all envs"]),
+    "runs": (r"trainers\.runs", ["figures", "algorithms"]),
+    "figures": (r"trainers\.figures", ["saving", "all envs", *PARTS]),
+    "saving": (r"trainers\.saving", ["base"]),
+    "algorithms": (r"trainers\.\w+", ["saving", "all envs", *PARTS]),
+    "all trainers": (r"trainers", ["command line"]),
+    "mazes": (r"envs\.mazes", ["shared envs"]),
+    "lab": (r"envs\.lab", ["mazes"]),
+    "gym": (r"envs\.(gym|option_pool)", ["shared envs"]),
+    "atari": (r"envs\.atari", ["gym"]),
+    "shared envs": (r"envs\.\w+", ["base"]),
+    "all envs": (r"envs", ["lab", "atari"]),
+    "testing": (r"testing", ["planners", "transforms"]),
+    "transforms": (r"transforms", ["objectives"]),
+    "objectives": (r"objectives", ["modules"]),
+    "modules": (r"modules", ["env parts"]),
+    "planners": (r"planners", ["env parts"]),
+    "env parts": (r"nesting|carried_state|direct_calls", ["base"]),
+    "base": (r"arguments|checks|compiling|processes|", []),
 }
-COMPONENT_DEPENDENCIES = {"torch", "tensordict", "torchrl", "numpy", "numba"}
+DEPENDENCIES = {"torch", "tensordict", "torchrl", "numpy", "numba"}  # of components
 # What a component may import inside a function, for those who have it.
-OPTIONAL = {
-    "torchrl_hmcts.planners.drawing": "matplotlib",
-    "torchrl_hmcts.planners.export": "networkx",
+OPTIONAL = {"planners.drawing": "matplotlib", "planners.export": "networkx"}
+# What is still wrong today: lines go, and none comes.
+KNOWN = {
+    "envs.gym_envs": "lab mazes",
+    "trainers.runs.run": "experiments",
+    "trainers.runs.sweep": "experiments",
+}
+KNOWN_CIRCLES = {
+    "planners.mcts planners.growth",
+    "planners.search planners.scored_descent",
+    "planners.tree planners.drawing",
+    "planners.tree planners.export",
+    *(f"envs.gym.snapshots envs.gym.{n}" for n in "atari box2d minigrid mujoco tables".split()),
 }
 
 
 def modules() -> dict[str, Path]:
-    """Maps each module's import name to its file, over all three folders."""
+    """Map each module's import name to its file, over all three folders."""
     found = {}
     for folder, package in FOLDERS.items():
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -44,227 +68,156 @@ def modules() -> dict[str, Path]:
     return found
 
 
+MODULES = modules()
+
+
 def outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yields the nodes of a syntax tree that run when the module is imported."""
+    """Yield the nodes of a syntax tree that run when the module is imported."""
     for node in ast.iter_child_nodes(tree):
         if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
             yield node
             yield from outside_functions(node)
 
 
-def imported_names(
-    source: str, module: str, *, is_package: bool, at_import: bool = False
-) -> set[str]:
-    """Returns the absolute name of everything a module's source imports, at any depth.
+def imported(source: str, module: str, is_package: bool, at_import: bool = False) -> set[str]:
+    """Return the absolute names of all that a module imports; of ``from a import b`` it is a.b.
 
-    ``from a import b`` counts as ``a`` and ``a.b``, since ``b`` may be a module. With
-    ``at_import``, only what is imported along with the module, not by its functions.
+    With ``at_import``, only what is imported along with the module, not by its functions.
     """
-    package = module if is_package else module.rpartition(".")[0]
+    package = module.split(".") if is_package else module.split(".")[:-1]
     names = set()
     tree = ast.parse(source)
     for node in outside_functions(tree) if at_import else ast.walk(tree):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                above = package.split(".")
-                above = above[: len(above) - node.level + 1]
-                base = ".".join([*above, base] if base else above)
-            names.add(base)
-            names.update(f"{base}.{alias.name}" for alias in node.names)
+            base = package[: len(package) - node.level + 1] if node.level else []
+            base = [*base, node.module] if node.module else base
+            names.update(".".join([*base, alias.name]) for alias in node.names)
         elif isinstance(node, ast.Call) and node.args:
-            called = node.func.attr if isinstance(node.func, ast.Attribute) else None
-            called = node.func.id if isinstance(node.func, ast.Name) else called
-            name = node.args[0]
-            if (
-                called in ("import_module", "__import__", "find_spec")
-                and isinstance(name, ast.Constant)
-                and isinstance(name.value, str)
-            ):
-                names.add(name.value)
+            called = getattr(node.func, "attr", getattr(node.func, "id", None))
+            name = getattr(node.args[0], "value", None)
+            loads = called in ("import_module", "__import__", "find_spec")
+            names |= {name} if loads and isinstance(name, str) else set()
     return names
 
 
-def layer(name: str) -> str:
-    """Returns ``envs``, ``trainers``, ``components``, ``base`` or ``outside`` for an import."""
-    if name.split(".")[0] != "torchrl_hmcts":
-        return "outside"
-    if re.match(r"torchrl_hmcts\.(arguments|checks|compiling|processes)\b", name):  # for all
-        return "base"
-    second = [*name.split("."), ""][1]
-    return second if second in ("envs", "trainers") else "components"
+def module_of(name: str) -> str:
+    """Return the module that an imported name is, or is in."""
+    while name not in MODULES and "." in name:
+        name = name.rpartition(".")[0]
+    return name
 
 
-def violations(source: str, module: str, *, is_package: bool = False) -> list[str]:
-    """Returns one sentence for each import that breaks the direction of the layers."""
-    found = []
-    names = imported_names(source, module, is_package=is_package)
-    at_import = imported_names(source, module, is_package=is_package, at_import=True)
-    own = layer(module)
-    for name in sorted(names):
-        other = layer(name)
-        # `from torchrl_hmcts import envs` names the package on the way to `envs`; what it takes
-        # from the package is checked under its own name.
-        if name == "torchrl_hmcts" and any(n.startswith("torchrl_hmcts.") for n in names):
-            continue
-        if own == "components" and other in ("envs", "trainers"):
-            found.append(f"component {module} imports {name} of the {other}")
-        elif own == "envs" and other in ("components", "trainers"):
-            found.append(f"environment {module} imports {name} of the {other}")
-        elif own == "components" and other == "outside":
-            top = name.split(".")[0]
-            if top == OPTIONAL.get(module) and name not in at_import:
-                continue
-            if top not in COMPONENT_DEPENDENCIES and top not in sys.stdlib_module_names:
-                found.append(
-                    f"component {module} imports {name}; components import only "
-                    f"{', '.join(sorted(COMPONENT_DEPENDENCIES))} and the standard library"
-                )
+def room(module: str) -> str:
+    inner = module.removeprefix(TOP).lstrip(".")
+    fits = (n for n, (pattern, _) in ROOMS.items() if re.fullmatch(rf"({pattern})(\..*)?", inner))
+    return next(fits)
+
+
+def reach(name: str) -> set[str]:
+    """Return a room and all below it."""
+    return {name}.union(*map(reach, ROOMS[name][1]))
+
+
+def is_component(module: str) -> bool:
+    return not module.startswith((f"{TOP}.envs", f"{TOP}.trainers"))
+
+
+def wrong(source: str, module: str, is_package: bool = False) -> set[str]:
+    """Return the rooms, or the packages of others, that a module imports and may not."""
+    found = set()
+    at_import = imported(source, module, is_package, at_import=True)
+    for name in imported(source, module, is_package):
+        top = name.split(".")[0]
+        if top == TOP:
+            found |= {room(module_of(name))} - reach(room(module))
+        elif is_component(module) and top not in DEPENDENCIES | set(sys.stdlib_module_names):
+            optional = OPTIONAL.get(module.removeprefix(f"{TOP}."))
+            found |= set() if top == optional and name not in at_import else {top}
     return found
 
 
-def declared_distributions(*extras: str) -> set[str]:
-    """Returns the normalised distribution names that pyproject.toml asks for."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    requirements = list(project["dependencies"])
-    for extra in extras:
-        requirements += project["optional-dependencies"][extra]
-    return {distribution_of(line) for line in requirements}
+def circles(edges: Mapping[str, set[str]]) -> list[str]:
+    """Return circles of files, each found after an import of the last one was cut."""
+    edges, found = {k: set(v) for k, v in edges.items()}, []
+    while True:
+        try:
+            TopologicalSorter(edges).prepare()
+            return found
+        except CycleError as error:
+            circle = error.args[1][:0:-1]  # each imports the next
+            found.append(" ".join(name.removeprefix(f"{TOP}.") for name in circle))
+            edges[circle[0]].discard(circle[1] if len(circle) > 1 else circle[0])
 
 
-def distribution_of(requirement: str) -> str:
-    return normalised(re.split(r"[\s\[<>=!~;]", requirement)[0])
+IMPORTS = {m: imported(p.read_text(), m, p.name == "__init__.py") for m, p in MODULES.items()}
 
 
-def normalised(distribution: str) -> str:
-    return re.sub(r"[-_.]+", "-", distribution).lower()
+def test_a_module_imports_only_what_its_room_may() -> None:
+    found = {}
+    for module, path in MODULES.items():
+        known = KNOWN.get(module.removeprefix(f"{TOP}."), "")
+        rooms = wrong(path.read_text(), module, path.name == "__init__.py")
+        found[module] = {name for name in rooms if name not in known}
+    assert {module: rooms for module, rooms in found.items() if rooms} == {}
 
 
-@pytest.mark.parametrize("module", modules())
-def test_a_module_imports_only_what_its_layer_may(module: str) -> None:
-    path = modules()[module]
-    assert not violations(path.read_text(), module, is_package=path.name == "__init__.py")
+def test_no_file_imports_one_that_imports_it() -> None:
+    edges = {}
+    for module, names in IMPORTS.items():
+        edges[module] = {module_of(n) for n in names if n.split(".")[0] == TOP} - {module}
+    assert set(circles(edges)) - KNOWN_CIRCLES == set()
 
 
-@pytest.mark.parametrize("module", modules())
-def test_every_third_party_import_is_declared(module: str) -> None:
-    path = modules()[module]
-    extras = {"trainers": ("train", "atari", "scale", "wandb"), "envs": ("atari", "gym")}.get(
-        layer(module), ()
-    )
-    if OPTIONAL.get(module) == "matplotlib":
-        extras = ("train",)
-    allowed = declared_distributions(*extras)
-    if OPTIONAL.get(module) == "networkx":
-        allowed |= {distribution_of(line) for line in importlib.metadata.requires("torch") or ()}
-    provided_by = importlib.metadata.packages_distributions()
-    names = imported_names(path.read_text(), module, is_package=path.name == "__init__.py")
-    tops = {name.split(".")[0] for name in names} - sys.stdlib_module_names - {"torchrl_hmcts", ""}
-    undeclared = {
-        top: provided_by.get(top, ["no installed distribution"])
-        for top in tops
-        if not allowed & {normalised(d) for d in provided_by.get(top, [top])}
-    }
-    assert not undeclared, f"{module} imports what pyproject.toml does not name: {undeclared}"
+LAZY = "def f():\n    "
+TYPING = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    "
 
 
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("torchrl_hmcts.planners.mcts", "import torchrl_hmcts.envs"),
-        ("torchrl_hmcts.planners.mcts", "from torchrl_hmcts import envs"),
-        ("torchrl_hmcts.planners.mcts", "from torchrl_hmcts.envs.mazes.layouts import maze_pool"),
-        ("torchrl_hmcts.planners.mcts", "from ..envs import mazes"),
-        ("torchrl_hmcts.planners.mcts", "from .. import trainers"),
-        ("torchrl_hmcts.planners.mcts", "def f():\n    from torchrl_hmcts import trainers"),
-        ("torchrl_hmcts.planners.mcts", "import_module('torchrl_hmcts.trainers.cli')"),
-        ("torchrl_hmcts.planners.mcts", "import pymunk"),
-        ("torchrl_hmcts.testing", "import matplotlib.pyplot as plt"),
-        ("torchrl_hmcts.testing", "def f():\n    import matplotlib.pyplot as plt"),
-        ("torchrl_hmcts.planners.tree", "def f():\n    import networkx"),
-        ("torchrl_hmcts.planners.drawing", "from matplotlib import pyplot"),
-        ("torchrl_hmcts.planners.drawing", "if True:\n    import matplotlib"),
-        ("torchrl_hmcts.planners.drawing", "class A:\n    import matplotlib"),
-        ("torchrl_hmcts.planners.drawing", "def f():\n    import networkx"),
-        ("torchrl_hmcts.planners.export", "import networkx"),
-        ("torchrl_hmcts.planners.export", "def f():\n    import matplotlib"),
-        ("torchrl_hmcts.envs.mazes.layouts", "import torchrl_hmcts"),
-        ("torchrl_hmcts.envs.mazes.layouts", "from torchrl_hmcts.planners import MCTSPlanner"),
-        ("torchrl_hmcts.envs.mazes.layouts", "from torchrl_hmcts import planners"),
-        ("torchrl_hmcts.envs.mazes.layouts", "from ... import testing"),
-        (
-            "torchrl_hmcts.envs.mazes.layouts",
-            "import importlib\nimportlib.import_module('torchrl_hmcts.trainers')",
-        ),
+        ("planners.mcts", "from torchrl_hmcts import envs"),
+        ("planners.mcts", "from ..envs import mazes"),
+        ("planners.mcts", f"{LAZY}from torchrl_hmcts import trainers"),
+        ("planners.mcts", f"{TYPING}from torchrl_hmcts.transforms import OptionTransform"),
+        ("planners.mcts", "import_module('torchrl_hmcts.trainers.cli')"),
+        ("planners.mcts", "import pymunk"),
+        ("planners.tree", f"{LAZY}import networkx"),
+        ("planners.drawing", "if True:\n    import matplotlib"),
+        ("planners.export", f"{LAZY}import matplotlib"),
+        ("modules.skill_mlp", "from torchrl_hmcts.objectives import DIAYNLoss"),
+        ("envs.mazes.layouts", "from torchrl_hmcts.planners import MCTSPlanner"),
+        ("envs.mazes.layouts", "from .. import testing\nfrom ...nesting import parts"),
+        ("envs.gym.settable", f"{LAZY}from torchrl_hmcts.envs.atari import pool"),
+        ("trainers.saving.files", f"{TYPING}from torchrl_hmcts.trainers import DIAYNTrainer"),
+        ("trainers.a3c.trainer", f"{LAZY}from torchrl_hmcts.trainers.figures import report"),
+        ("trainers.diayn", f"{LAZY}from torchrl_hmcts.trainers.runs import folder"),
+        ("trainers.figures.plots", "from torchrl_hmcts.trainers.experiments import demo"),
+        ("trainers.experiments.demo", f"{LAZY}from torchrl_hmcts.trainers import cli"),
     ],
 )
 def test_the_check_catches_a_violation(module: str, source: str) -> None:
-    assert violations(source, module)
+    assert wrong(source, f"{TOP}.{module}")
 
 
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        (
-            "torchrl_hmcts.planners.mcts",
-            "import math\nimport torch\nfrom torchrl.envs import EnvBase",
-        ),
-        ("torchrl_hmcts.planners.mcts", "from .tree import SearchTree\nfrom ..modules import x"),
-        ("torchrl_hmcts.planners.mcts", "from torchrl_hmcts import planners"),
-        ("torchrl_hmcts.planners.drawing", "def f():\n    from matplotlib import pyplot"),
-        ("torchrl_hmcts.planners.export", "def f():\n    import networkx"),
-        ("torchrl_hmcts.envs.mazes.layouts", "import pymunk\nfrom torchrl_hmcts.envs import mazes"),
-        ("torchrl_hmcts.envs.mazes.layouts", "from . import rendering"),
-        ("torchrl_hmcts.trainers.experiments.demo", "from torchrl_hmcts import envs, planners"),
+        ("planners.mcts", "import math\nimport torch\nfrom torchrl.envs import EnvBase"),
+        ("planners.mcts", "from .tree import SearchTree\nfrom ..nesting import parts"),
+        ("planners.drawing", f"{LAZY}from matplotlib import pyplot"),
+        ("envs.mazes.layouts", "import pymunk\nfrom . import rendering"),
+        ("envs.atari.pool", "from torchrl_hmcts.envs.gym import settable"),
+        ("trainers.experiments.demo", "from torchrl_hmcts import envs, planners"),
+        ("trainers.cli", "from torchrl_hmcts.trainers.saving.files import x"),
     ],
 )
 def test_the_check_lets_the_right_direction_pass(module: str, source: str) -> None:
-    assert not violations(source, module)
+    assert not wrong(source, f"{TOP}.{module}")
 
 
-def test_a_package_resolves_its_relative_imports_from_itself() -> None:
-    source = "from .tree import SearchTree"
-    names = imported_names(source, "torchrl_hmcts.planners", is_package=True)
-    assert "torchrl_hmcts.planners.tree" in names
-
-
-def loaded_by(statement: str, folder: Path) -> set[str]:
-    """Returns the names of all modules a fresh process holds after a statement."""
-    script = f"import json, sys\n{statement}\nprint(json.dumps(sorted(sys.modules)))"
-    run = subprocess.run(
-        [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, timeout=300
-    )
-    assert run.returncode == 0, run.stderr
-    return set(json.loads(run.stdout.splitlines()[-1]))
-
-
-def test_importing_the_components_loads_nothing_heavy_beyond_torchrl(tmp_path: Path) -> None:
-    submodules = "collectors data envs modules objectives"
-    baseline = loaded_by(
-        "\n".join(f"import torchrl.{name}" for name in submodules.split()), tmp_path
-    )
-    packages = "modules objectives planners transforms"
-    loaded = loaded_by(
-        "import torchrl_hmcts\n"
-        + "\n".join(f"import torchrl_hmcts.{name}" for name in packages.split()),
-        tmp_path,
-    )
-    heavy = {
-        *("numba", "llvmlite", "pymunk", "gymnasium", "ale_py", "matplotlib", "imageio", "PIL"),
-        *("hydra", "omegaconf", "tensorboard", "tqdm", "networkx"),
-    }
-    assert not (heavy & loaded) - baseline
-    assert not {name for name in loaded if layer(name) in ("envs", "trainers")}
-
-
-def test_everything_that_benchmarks_import_from_the_project_exists() -> None:
-    missing = []
-    for path in sorted((ROOT / "tests" / "benchmarks").glob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchrl_hmcts"):
-                module = importlib.import_module(node.module or "")
-                names = [alias.name for alias in node.names if not hasattr(module, alias.name)]
-                missing += [f"{path.name}: {node.module}.{name}" for name in names]
-    assert missing == []
+def test_circles_of_any_length_are_found() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert len(circles({"a": {"b"}, "b": {"c"}, "c": {"a"}})) == 1
+    assert len(circles({"a": {"b"}, "b": {"a"}, "c": {"d"}, "d": {"c"}})) == 2

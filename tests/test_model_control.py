@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs import InitTracker, RenameTransform, TransformedEnv
 
 from torchrl_hmcts.envs import DeepMindLabEnv, LabMazeEnv
-from torchrl_hmcts.planners import MCTSPlanner, ModelBasedControl, RadiusNovelty, SearchBudget
+from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -35,7 +35,7 @@ def renamed() -> TransformedEnv:
 
 def test_it_plans_again_after_every_option_from_where_the_real_env_is() -> None:
     model, real = TableEnv(ROAD, terminal=[5]), TableEnv(SLIPPERY_ROAD, terminal=[5])
-    policy = ModelBasedControl(MCTSPlanner(model), env=real)
+    policy = HierarchicalPolicy(MCTSPlanner(model), env=real, replan_every=1)
     rollout = real.rollout(20, policy=policy)
     assert rollout["state"].flatten().tolist() == [0, 1, 2, 6, 3, 4]
     assert rollout["next", "reward"].sum().item() == 1.0
@@ -49,7 +49,7 @@ def test_a_map_makes_the_models_state_from_what_the_real_env_shows() -> None:
         calls.append(td["place"].item())
         return TensorDict({"state": td["place"]}, td.batch_size)
 
-    policy = ModelBasedControl(MCTSPlanner(ChainEnv(6)), state_map)
+    policy = HierarchicalPolicy(MCTSPlanner(ChainEnv(6)), state_map=state_map, replan_every=1)
     real = renamed().append_transform(InitTracker())
     rollout = real.rollout(20, policy=policy)
     assert rollout["action"].tolist() == [1] * 5
@@ -57,21 +57,15 @@ def test_a_map_makes_the_models_state_from_what_the_real_env_shows() -> None:
     assert rollout["plan_length"].flatten().tolist() == [5, 4, 3, 2, 1]
 
 
-def test_a_map_may_be_a_module_and_the_plan_be_followed_to_its_end() -> None:
-    state_map = TensorDictModule(lambda place: place, ["place"], ["state"])
-    policy = ModelBasedControl(
-        MCTSPlanner(ChainEnv(6)), state_map, env=renamed(), replan_every=None
-    )
-    assert policy.in_keys == ["place"]
-    rollout = renamed().rollout(20, policy=policy)
-    assert rollout["num_plans"].flatten().tolist() == [1] * 5
-    assert rollout["next", "reward"].sum().item() == 1.0
-
-
 def test_elements_of_a_batch_are_planned_for_side_by_side() -> None:
     real, model = ChainEnv(6), ChainEnv(6)
     start = real.reset(TensorDict({"state": torch.tensor([0, 3, 4])}, [3]), set_state=True)
-    policy = ModelBasedControl(MCTSPlanner(model), lambda td: td.select("state").clone(), env=real)
+    policy = HierarchicalPolicy(
+        MCTSPlanner(model),
+        state_map=lambda td: td.select("state").clone(),
+        env=real,
+        replan_every=1,
+    )
     rollout = real.rollout(
         20, policy=policy, tensordict=start, auto_reset=False, break_when_all_done=True
     )
@@ -80,13 +74,15 @@ def test_elements_of_a_batch_are_planned_for_side_by_side() -> None:
 
 def test_a_real_env_with_other_options_is_refused() -> None:
     with pytest.raises(ValueError, match="options of the real env and of the model must be"):
-        ModelBasedControl(MCTSPlanner(ChainEnv(6)), env=LabMazeEnv(maze_seeds=[1]))
+        HierarchicalPolicy(MCTSPlanner(ChainEnv(6)), env=LabMazeEnv(maze_seeds=[1]), replan_every=1)
 
 
 def test_a_real_env_that_does_not_show_the_state_is_refused() -> None:
     state_map = TensorDictModule(lambda place: place, ["place"], ["state"])
     with pytest.raises(ValueError, match=r"reads \['place'\], which ChainEnv does not write"):
-        ModelBasedControl(MCTSPlanner(ChainEnv(6)), state_map, env=ChainEnv(6))
+        HierarchicalPolicy(
+            MCTSPlanner(ChainEnv(6)), state_map=state_map, env=ChainEnv(6), replan_every=1
+        )
 
 
 @pytest.mark.parametrize(
@@ -97,7 +93,7 @@ def test_a_real_env_that_does_not_show_the_state_is_refused() -> None:
     ],
 )
 def test_a_map_that_returns_no_state_is_refused(state_map: Any, message: str) -> None:
-    policy = ModelBasedControl(MCTSPlanner(ChainEnv(6)), state_map)
+    policy = HierarchicalPolicy(MCTSPlanner(ChainEnv(6)), state_map=state_map, replan_every=1)
     with pytest.raises(ValueError, match=message):
         policy(ChainEnv(6).reset())
 
@@ -146,7 +142,9 @@ def test_a_maze_is_solved_though_the_models_clock_and_friction_are_others(mapped
         return model.make_state(0, td["position"], heading, velocity=td["velocity"])
 
     macro = options(real)
-    policy = ModelBasedControl(planner_over(model), state_map if mapped else None, env=macro)
+    policy = HierarchicalPolicy(
+        planner_over(model), state_map=state_map if mapped else None, env=macro, replan_every=1
+    )
     start = macro.reset(
         real.make_state(0, [[150.0, 550.0]] * 3, heading=[0.0, 40.0, 200.0]), set_state=True
     )
@@ -170,7 +168,7 @@ def test_the_adapter_of_the_real_engine_takes_the_real_envs_part(
     monkeypatch.setitem(sys.modules, "deepmind_lab", module)
     engine = DeepMindLabEnv(level="nine", rows=9, columns=9, maze_seeds=[1], seed=0)
     macro = options(engine)
-    policy = ModelBasedControl(planner_over(engine.model), env=macro)
+    policy = HierarchicalPolicy(planner_over(engine.model), env=macro, replan_every=1)
     rollout = macro.rollout(80, policy=policy)
     assert rollout["next", "terminated"][-1].item()
     assert rollout["next", "reward"][-1].item() > 0

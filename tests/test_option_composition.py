@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -544,14 +543,6 @@ def test_a_termination_of_another_form_is_refused(ends: Any, got: str) -> None:
     message = rf"must return bool \[\] or \[1\], True where the option ends; it returned {got}"
     with pytest.raises(ValueError, match=message):
         env.step(env.reset().set("o", torch.tensor(1)))
-
-
-def test_numpy_integers_are_numbers_of_options_and_steps() -> None:
-    worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-    options = OptionTransform(worker, num_options=np.int64(2), max_steps=np.int32(3))
-    assert [type(options.num_options), type(options.max_steps)] == [int, int]
-    rollout = TransformedEnv(ChainEnv(length=8), options).rollout(2)
-    assert rollout["next", "duration"].flatten().tolist() == [3, 3]
 
 
 def test_more_options_than_a_worker_has_skills_are_refused() -> None:

@@ -161,21 +161,6 @@ def test_features_are_computed_before_the_networks_and_left_out_of_the_data() ->
     torch.testing.assert_close(model.outputs(td), network)
 
 
-def test_the_state_dict_carries_parameters_and_normalisation() -> None:
-    td = make_data()
-    first = make_net().fit_normalization(td)
-    torch.manual_seed(1)
-    second = OptionModel(
-        lambda n: SkillMLP(2, n, num_skills=2, hidden=(8,), activation=nn.Tanh),
-        ["position", "option"],
-        {"position": 2},
-        max_duration=9,
-        num_models=3,
-    )
-    second.load_state_dict(first.state_dict())
-    torch.testing.assert_close(first.predict(td).to_dict(), second.predict(td).to_dict())
-
-
 def test_bad_models_are_refused_with_their_value() -> None:
     with pytest.raises(ValueError, match="num_models"):
         make_table(num_models=0)
@@ -265,40 +250,6 @@ def test_the_mean_over_members_is_the_mean_of_their_losses() -> None:
         torch.testing.assert_close(alone[0][key] + alone[1][key], expected[key])
 
 
-@pytest.mark.parametrize("name", PARTS)
-def test_the_gradient_of_each_part_matches_finite_differences(name: str) -> None:
-    model = make_net().double()
-    td = make_data()
-    td = td.apply(lambda x: x.double() if x.is_floating_point() else x)
-    loss = OptionModelLoss(model)
-    loss(td)[name].backward()
-    parameters = list(model.network_params.parameters())
-    g = torch.Generator().manual_seed(0)
-    direction = [torch.randn(p.shape, generator=g, dtype=p.dtype) for p in parameters]
-    slope = sum((p.grad * d).sum() for p, d in zip(parameters, direction, strict=True))
-
-    def moved(step: float) -> torch.Tensor:
-        with torch.no_grad():
-            for p, d in zip(parameters, direction, strict=True):
-                p += step * d
-            value = loss(td)[name]
-            for p, d in zip(parameters, direction, strict=True):
-                p -= step * d
-        return value
-
-    difference = (moved(1e-6) - moved(-1e-6)) / 2e-6
-    torch.testing.assert_close(slope, difference, rtol=1e-6, atol=1e-8)
-
-
-def test_mean_and_sum_are_those_of_the_unreduced_losses() -> None:
-    td, model = make_data(), make_net()
-    none, mean, total = (OptionModelLoss(model, reduction=r)(td) for r in ("none", "mean", "sum"))
-    for key in PARTS:
-        assert none[key].shape == (6,)
-        torch.testing.assert_close(none[key].mean(), mean[key])
-        torch.testing.assert_close(none[key].sum(), total[key])
-
-
 def test_weights_scale_their_part_only() -> None:
     td, model = make_data(), make_net()
     plain = OptionModelLoss(model)(td)
@@ -309,62 +260,9 @@ def test_weights_scale_their_part_only() -> None:
             torch.testing.assert_close(scaled[key], plain[key] * (3.0 if i == j else 1.0))
 
 
-def test_only_losses_ask_for_a_gradient_and_all_keys_are_announced() -> None:
-    loss = OptionModelLoss(make_net())
-    out = loss(make_data())
-    assert list(out.keys()) == loss.out_keys
-    for key, value in out.items():
-        assert value.requires_grad == key.startswith("loss")
-
-
-def test_the_loss_takes_keyword_tensors_too() -> None:
-    loss, td = OptionModelLoss(make_net()), make_data()
-    keywords = {"_".join(key) if isinstance(key, tuple) else key: td[key] for key in loss.in_keys}
-    out = dict(zip(loss.out_keys, loss(**keywords), strict=True))
-    torch.testing.assert_close(out["loss_delta"], loss(td)["loss_delta"])
-
-
-def test_set_keys_and_nested_state_entries_give_the_same_losses() -> None:
-    td = make_data()
-    expected = OptionModelLoss(make_net())(td)
-    torch.manual_seed(0)
-    nested = OptionModel(
-        lambda n: SkillMLP(2, n, num_skills=2, hidden=(8,), activation=nn.Tanh),
-        [("agent", "at"), "option"],
-        {("agent", "at"): 2},
-        max_duration=9,
-        num_models=3,
-        duration_key=("agent", "steps"),
-    )
-    loss = OptionModelLoss(nested)
-    loss.set_keys(reward=("agent", "gain"), terminated="over")
-    after = td["next"]
-    moved = TensorDict(
-        {
-            "agent": {"at": td["position"]},
-            "option": td["option"],
-            "next": {
-                "agent": {
-                    "at": after["position"],
-                    "steps": after["duration"],
-                    "gain": after["reward"],
-                },
-                "over": after["terminated"],
-            },
-        },
-        batch_size=[6],
-    )
-    assert set(loss.in_keys) == set(moved.keys(True, True))
-    torch.testing.assert_close(loss(moved).to_dict(), expected.to_dict())
-    with pytest.raises(ValueError, match="not an accepted"):
-        loss.set_keys(nonsense="x")
-
-
 def test_unusable_losses_are_refused_with_their_value() -> None:
     with pytest.raises(ValueError, match="median"):
         OptionModelLoss(make_net(), reduction="median")
-    with pytest.raises(ValueError, match=r"delta_loss='huber'"):
-        OptionModelLoss(make_net(), delta_loss="huber")
     with pytest.raises(ValueError, match=r"reward_coeff >= 0.*-1"):
         OptionModelLoss(make_net(), reward_coeff=-1.0)
 

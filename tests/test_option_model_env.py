@@ -220,9 +220,7 @@ def test_an_env_without_a_declared_state_gets_one() -> None:
 
 
 def test_unusable_arguments_are_refused_with_their_value() -> None:
-    with pytest.raises(ValueError, match=r"threshold.*1\.5"):
-        make_rule(threshold=1.5)
-    with pytest.raises(ValueError, match=r"min_reward >= 0; got -1"):
+    with pytest.raises(ValueError, match=r"min_reward >= 0.*got -1"):
         make_rule(min_reward=-1.0)
     with pytest.raises(ValueError, match="one member"):
         make_rule(max_disagreement=0.5)

@@ -112,7 +112,7 @@ def nested_worker():
 
 
 def constant(action):
-    """A worker that always takes one action, whatever it sees."""
+    """A worker that always takes the same action."""
     return TensorDictModule(
         lambda skill: action.expand(*skill.shape, *action.shape).clone(), ["skill"], ["action"]
     )
@@ -198,29 +198,13 @@ def step_next(env, td, option):
 
 
 class TestAgainstALoop:
-    def test_a_chain_by_numbers(self):
-        env, td = chain()
-        after = step_next(macro(env, max_steps=3), td, RIGHT)
-        assert after["state"] == 3
-        assert after["duration"].tolist() == [3]
-        assert after["reward"].item() == pytest.approx(-0.25 * (1 + 0.9 + 0.81))
-        assert not after["done"]
-
-    def test_done_in_the_middle_of_an_option_ends_it(self):
-        env, td = chain(start=3)
-        after = step_next(macro(env, max_steps=10), td, RIGHT)
-        assert after["state"] == 5
-        assert after["duration"].tolist() == [2]
-        assert after["reward"].item() == pytest.approx(-0.25 + 0.9 * 0.75)
-        assert after["terminated"]
-        assert after["done"]
-
     def test_elements_end_at_different_steps(self):
         env, td = chain(start=[0, 4, 2, 3, 0], batch=[5])
         after = step_next(macro(env), td, [RIGHT, RIGHT, RIGHT, LEFT, LEFT])
         assert after["state"].tolist() == [4, 5, 5, 0, 0]
         assert after["duration"].flatten().tolist() == [4, 1, 3, 4, 4]
-        assert after["done"].flatten().tolist() == [False, True, True, False, False]
+        for key in ("done", "terminated"):
+            assert after[key].flatten().tolist() == [False, True, True, False, False]
         discounts = torch.tensor([1, 0.9, 0.81, 0.729])
         expected = [
             -0.25 * discounts.sum(),
@@ -387,22 +371,23 @@ class TestBatchedEnvs:
     STARTS = (0, 3)
 
     @pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
-    def test_as_base_env_inside_the_transform(self, batched):
-        envs = macro(batched(2, partial(ChainEnv, 6, reward_per_step=-0.25)))
+    @pytest.mark.parametrize("inside", [False, True], ids=["around", "inside"])
+    def test_with_the_transform_around_the_workers_or_inside(self, batched, inside):
+        base, start = chain(start=self.STARTS, batch=[2])
+        make = partial(ChainEnv, 6, reward_per_step=-0.25)
+        envs = batched(2, macro_chain) if inside else macro(batched(2, make))
         try:
             check_env_specs(envs)
-            self.check_steps(envs)
-            self.check_rollouts(envs)
-        finally:
-            envs.close()
-
-    @pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
-    def test_with_the_transform_inside_the_workers(self, batched):
-        envs = batched(2, macro_chain)
-        try:
-            check_env_specs(envs)
-            self.check_steps(envs)
-            self.check_rollouts(envs)
+            for options in ([RIGHT, RIGHT], [RIGHT, LEFT]):
+                td = envs.reset()
+                td["state"] = start["state"].clone()
+                td["option"] = torch.tensor(options)
+                expected = by_hand(base, td.select("state", "option"), skill_is_action())
+                assert_close(envs.step(td.clone())["next"], expected)
+            for kwargs in ({}, {"break_when_all_done": True}):
+                envs.set_seed(0)
+                td = envs.rollout(15, break_when_any_done=False, **kwargs)
+                check_macro_rollout(base, td, skill_is_action(), **kwargs)
         finally:
             envs.close()
 
@@ -416,22 +401,6 @@ class TestBatchedEnvs:
             NestedChainEnv(), td.clone(), nested_worker(), reward_key=("agent", "reward")
         )
         assert_close(env.step(td)["next"], expected)
-
-    def check_steps(self, envs):
-        base, start = chain(start=self.STARTS, batch=[2])
-        for options in ([RIGHT, RIGHT], [RIGHT, LEFT]):
-            td = envs.reset()
-            td["state"] = start["state"].clone()
-            td["option"] = torch.tensor(options)
-            expected = by_hand(base, td.select("state", "option"), skill_is_action())
-            assert_close(envs.step(td.clone())["next"], expected)
-
-    def check_rollouts(self, envs):
-        base, _ = chain()
-        for kwargs in ({"break_when_any_done": False}, {"break_when_all_done": True}):
-            envs.set_seed(0)
-            td = envs.rollout(15, **{"break_when_any_done": False, **kwargs})
-            check_macro_rollout(base, td, skill_is_action(), **kwargs)
 
     @pytest.mark.parametrize("skill", [0, 1])
     def test_two_cart_poles_fall_at_different_steps(self, skill):
@@ -465,9 +434,6 @@ def balancing():
 
 class TestGymEnv:
     """CartPole cannot be batched or set to a state: the transform follows it as it goes."""
-
-    def test_specs_hold(self):
-        check_env_specs(macro(GymEnv("CartPole-v1"), balancing(), max_steps=5))
 
     @pytest.mark.parametrize("max_steps", [1, 5, 500])
     def test_macro_steps_are_those_of_a_loop(self, max_steps):
@@ -514,37 +480,21 @@ def check_macro_rollout(base, td, worker, max_steps=4, break_when_all_done=False
 
 class TestRollouts:
     @pytest.mark.parametrize("batch", BATCHES)
-    def test_episodes_are_reset_and_go_on(self, batch):
+    @pytest.mark.parametrize("until_all", [False, True])
+    def test_episodes_are_reset_and_continue_or_wait_for_all(self, batch, until_all):
         base, td = chain(batch=batch)
         env = macro(base)
+        if until_all:
+            td["state"] = torch.randint(5, batch)
         td = env.rollout(
-            20,
+            100 if until_all else 20,
             tensordict=env.reset(td, set_state=True),
             auto_reset=False,
             break_when_any_done=False,
+            break_when_all_done=until_all,
         )
-        assert td.shape == (*batch, 20)
-        check_macro_rollout(base, td, skill_is_action())
-
-    @pytest.mark.parametrize("batch", [[3], [2, 3]])
-    def test_until_all_are_done(self, batch):
-        base, _ = chain()
-        env = macro(base)
-        td = env.reset(TensorDict({"state": torch.randint(5, batch)}, batch), set_state=True)
-        td = env.rollout(
-            100,
-            tensordict=td,
-            auto_reset=False,
-            break_when_any_done=False,
-            break_when_all_done=True,
-        )
-        check_macro_rollout(base, td, skill_is_action(), break_when_all_done=True)
-
-    def test_a_reset_has_no_duration_yet(self):
-        base, _ = chain()
-        td = macro(base).reset(TensorDict(batch_size=[3]))
-        assert td["duration"].tolist() == [[0]] * 3
-        assert td["duration"].dtype == torch.int64
+        assert until_all or td.shape == (*batch, 20)
+        check_macro_rollout(base, td, skill_is_action(), break_when_all_done=until_all)
 
     @pytest.mark.parametrize("batch", BATCHES)
     def test_it_can_be_set_to_a_state(self, batch):
@@ -554,6 +504,7 @@ class TestRollouts:
         state = torch.randint(1, 5, batch)
         td = env.reset(TensorDict({"state": state}, batch_size=batch), set_state=True)
         assert torch.equal(td["state"], state)
+        assert torch.equal(td["duration"], torch.zeros((*batch, 1), dtype=torch.int64))
         td["option"] = torch.full(batch, LEFT)
         after = env.step(td)["next"]
         assert torch.equal(after["state"], (state - 4).clamp_min(0))
@@ -618,27 +569,6 @@ class TestOtherTransforms:
         td = env.reset().set("state", torch.tensor(3))
         assert step_next(env, td, RIGHT)["reward"].item() == pytest.approx(9)
 
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_a_macro_env_under_another_option_transform(self, batch):
-        """Manager of managers: two options of two base steps each, discounted per base step."""
-        inner, td = chain(batch=batch)
-        upper = OptionTransform(
-            TensorDictModule(lambda goal: goal, ["goal"], ["option"]),
-            2,
-            2,
-            0.5,
-            option_key="goal_option",
-            skill_key="goal",
-            duration_key="base_steps",
-        )
-        env = TransformedEnv(inner, Compose(OptionTransform(skill_is_action(), 2, 2, GAMMA), upper))
-        check_env_specs(env)
-        after = env.step(td.set("goal_option", torch.full(batch, RIGHT)))["next"]
-        assert (after["state"] == 4).all()
-        assert (after["base_steps"] == 4).all()
-        expected = torch.full((*batch, 1), -0.25 * 1.9 * (1 + 0.5**2))
-        torch.testing.assert_close(after["reward"], expected)
-
 
 KEYS = ["state", "action", ("next", "state"), ("next", "reward"), ("next", "done")]
 
@@ -676,37 +606,24 @@ def check_trajectories(base, td, after, worker, max_steps, keys=KEYS):
 
 
 class TestTrajectories:
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_they_hold_the_base_steps(self, batch):
-        base, td = chain(batch=batch)
-        env = macro(base, trajectory_keys=KEYS)
+    @pytest.mark.parametrize(
+        ("make", "batch"),
+        [
+            *((partial(ChainEnv, 6), batch) for batch in BATCHES),
+            (partial(ChainEnv, 6, batch_size=[4]), [4]),
+            (partial(ChainEnv, 6, batch_size=[2, 3]), [2, 3]),
+            (lambda: SerialEnv(2, partial(ChainEnv, 6)), [2]),
+        ],
+    )
+    def test_they_hold_the_base_steps(self, make, batch):
+        env = macro(make(), trajectory_keys=KEYS)
         check_env_specs(env)
-        td["state"] = torch.randint(5, batch)
-        td["option"] = torch.randint(2, batch)
-        after = env.step(td.clone())["next"]
-        assert after["trajectory"].shape == (*batch, 4)
-        check_trajectories(base, td, after, skill_is_action(), 4)
-
-    @pytest.mark.parametrize("batch", [[4], [2, 3]])
-    def test_in_an_env_with_a_batch_size(self, batch):
-        base = ChainEnv(6, batch_size=batch)
-        env = macro(base, trajectory_keys=KEYS)
-        check_env_specs(env)
-        td = env.reset()
+        td = env.reset() if env.batch_size else env.reset(TensorDict(batch_size=batch))
         assert not td["trajectory", "mask"].any()
         td["state"] = torch.randint(5, batch)
         td["option"] = torch.randint(2, batch)
         after = env.step(td.clone())["next"]
-        roots = td.select("state", "option")
-        check_trajectories(ChainEnv(6), roots, after, skill_is_action(), 4)
-
-    def test_in_batched_envs(self):
-        env = macro(SerialEnv(2, partial(ChainEnv, 6)), trajectory_keys=KEYS)
-        check_env_specs(env)
-        td = env.reset()
-        td["state"] = torch.tensor([0, 3])
-        td["option"] = torch.tensor([RIGHT, RIGHT])
-        after = env.step(td.clone())["next"]
+        assert after["trajectory"].shape == (*batch, 4)
         check_trajectories(ChainEnv(6), td.select("state", "option"), after, skill_is_action(), 4)
 
     def test_in_a_gym_env(self):
@@ -738,22 +655,16 @@ class TestTrajectories:
         assert trajectory["agent", "seen", "double"][1].flatten().tolist() == [6, 8, 10, 0]
         assert trajectory["agent", "action"].tolist() == [[1] * 4, [1, 1, 1, 0], [0] * 4]
 
-    def test_they_are_there_in_every_step_of_a_rollout(self):
-        base, _ = chain()
-        env = macro(base, trajectory_keys=["state"])
-        td = env.rollout(10, break_when_any_done=False)
-        assert td["next", "trajectory", "mask"].sum(-1).tolist() == [
-            int(k) for k in td["next", "duration"]
-        ]
-
-    def test_an_unknown_key_is_refused(self):
-        env, _ = chain()
-        with pytest.raises(ValueError, match=r"trajectory_keys names 'speed'.*'state'"):
-            macro(env, trajectory_keys=["speed"])
-
-    def test_no_keys_at_all_are_refused(self):
-        with pytest.raises(ValueError, match=r"trajectory_keys is empty.*None"):
-            OptionTransform(skill_is_action(), 2, 4, trajectory_keys=[])
+    @pytest.mark.parametrize(
+        ("keys", "message"),
+        [
+            (["speed"], r"trajectory_keys names 'speed'.*'state'"),
+            ([], r"trajectory_keys is empty.*None"),
+        ],
+    )
+    def test_keys_that_record_nothing_are_refused(self, keys, message):
+        with pytest.raises(ValueError, match=message):
+            macro(ChainEnv(6), trajectory_keys=keys)
 
 
 def pendulum():
@@ -765,6 +676,7 @@ class TestEveryEnv:
         "make",
         [
             lambda: macro(ChainEnv(6)),
+            lambda: macro(GymEnv("CartPole-v1"), balancing(), max_steps=5),
             lambda: macro(ChainEnv(6, batch_size=[4])),
             lambda: macro(ChainEnv(6, batch_size=[2, 3])),
             lambda: macro(
@@ -862,19 +774,19 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("kwargs", "message"),
         [
-            ({"max_steps": 0}, "max_steps to be an int >= 1; got 0"),
-            ({"max_steps": 2.5}, "max_steps to be an int >= 1; got 2.5"),
-            ({"max_steps": True}, "max_steps to be an int >= 1; got True"),
-            ({"num_options": 0}, "num_options to be an int >= 1; got 0"),
-            ({"num_options": -3}, "num_options to be an int >= 1; got -3"),
-            ({"gamma": 0.0}, r"gamma in \(0, 1\] per base step; got 0.0"),
-            ({"gamma": 1.1}, r"gamma in \(0, 1\] per base step; got 1.1"),
-            ({"gamma": float("nan")}, r"gamma in \(0, 1\] per base step; got nan"),
+            ({"max_steps": 0}, "max_steps >= 1; got 0"),
+            ({"max_steps": 2.5}, "whole number for max_steps; got 2.5"),
+            ({"max_steps": True}, "whole number for max_steps; got True"),
+            ({"num_options": 0}, "num_options >= 1; got 0"),
+            ({"num_options": -3}, "num_options >= 1; got -3"),
+            ({"gamma": 0.0}, "gamma > 0.0 and <= 1.0; got 0.0"),
+            ({"gamma": 1.1}, "gamma > 0.0 and <= 1.0; got 1.1"),
+            ({"gamma": float("nan")}, "gamma > 0.0 and <= 1.0; got nan"),
             ({"worker": "walk"}, "needs a worker that it can call .* got 'walk'"),
         ],
     )
     def test_arguments_out_of_range_are_refused_at_construction(self, kwargs, message):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((TypeError, ValueError), match=message):
             OptionTransform(
                 **{"worker": skill_is_action(), "num_options": 2, "max_steps": 4, **kwargs}
             )
@@ -889,28 +801,18 @@ class TestBadInput:
         broken((macro(base), td.set("option", options)), message)
 
     @pytest.mark.parametrize(
-        ("option", "message"),
+        ("option", "one_hot", "message"),
         [
-            (torch.tensor([0.0, 1.0]), r"int64 \[2\]; got torch.float32 \[2\]"),
-            (torch.tensor([[0], [1]]), r"int64 \[2\]; got torch.int64 \[2, 1\].*rand_action"),
+            ([0.0, 1.0], False, r"int64 \[2\]; got torch.float32 \[2\]"),
+            ([[0], [1]], False, r"int64 \[2\]; got torch.int64 \[2, 1\].*rand_action"),
+            ([[True, False, False]] * 2, True, r"one-hot \[2, 2\]; got torch.bool \[2, 3\]"),
+            ([[True, False], [False, False]], True, r"one-hot.*\[False, False\]"),
+            ([[True, True], [False, True]], True, r"one-hot.*\[True, True\]"),
         ],
     )
-    def test_an_option_of_the_wrong_form_is_refused(self, option, message):
+    def test_an_option_of_the_wrong_form_is_refused(self, option, one_hot, message):
         base, td = chain(batch=[2])
-        broken((macro(base), td.set("option", option)), message)
-
-    @pytest.mark.parametrize(
-        ("option", "message"),
-        [
-            ([[1, 0, 0], [0, 0, 1]], r"one-hot \[2, 2\]; got torch.bool \[2, 3\]"),
-            ([[1, 0], [0, 0]], r"one-hot.*\[False, False\]"),
-            ([[1, 1], [0, 1]], r"one-hot.*\[True, True\]"),
-        ],
-    )
-    def test_what_is_not_one_hot_is_refused(self, option, message):
-        base, td = chain(batch=[2])
-        env = macro(base, one_hot=True)
-        broken((env, td.set("option", torch.tensor(option).bool())), message)
+        broken((macro(base, one_hot=one_hot), td.set("option", torch.tensor(option))), message)
 
     def test_a_missing_option_is_refused(self):
         base, td = chain()
@@ -975,7 +877,7 @@ class TestBadInput:
         buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=2)
         buffer.extend(macro(ChainEnv(6)).rollout(3))
         buffer.append_transform(OptionTransform(skill_is_action(), 2, 4))
-        with pytest.raises(RuntimeError, match="cannot be applied to data.*TransformedEnv"):
+        with pytest.raises(RuntimeError, match="stored data hold what it writes.*TransformedEnv"):
             buffer.sample()
         for td in (ChainEnv(6).rollout(3), macro(ChainEnv(6)).rollout(3)):
             with pytest.raises(RuntimeError, match="no meaning in a replay buffer"):

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from torchrl_hmcts.trainers.runs.folder import read_run
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 HERE = Path(__file__).resolve().parent / "oracles"
 PACKAGES = ("planners", "objectives", "modules", "transforms", "testing", "envs", "trainers")

@@ -1,15 +1,19 @@
-"""The built wheel holds everything and works on its own, outside the repository."""
+"""The built wheel holds everything, asks for all it imports, and works on its own."""
 
 from __future__ import annotations
 
+import ast
+import importlib
+import importlib.metadata
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -27,6 +31,11 @@ FOLDERS = {
     "trainers": "torchrl_hmcts/trainers",
 }
 MAX_WHEEL_BYTES = 1_000_000
+EXTRAS = {
+    "envs": ("atari", "gym"),
+    "trainers": ("train", "atari", "scale", "wandb"),
+    "torchrl_hmcts/planners/drawing.py": ("train",),
+}
 
 
 def source_files() -> dict[str, Path]:
@@ -95,30 +104,19 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_listed_packages_are_the_folders_with_an_init_file() -> None:
     listed = PYPROJECT["tool"]["setuptools"]["packages"]
-    found = [
-        name.removesuffix("/__init__.py").replace("/", ".")
-        for name in source_files()
-        if name.endswith("/__init__.py")
-    ]
+    names = [name for name in source_files() if name.endswith("/__init__.py")]
+    found = [name.removesuffix("/__init__.py").replace("/", ".") for name in names]
     assert sorted(listed) == sorted(found)
-
-
-def test_every_folder_with_a_module_is_a_package() -> None:
     folders = {path.parent for path in source_files().values() if path.suffix == ".py"}
     assert not [folder for folder in folders if not (folder / "__init__.py").is_file()]
 
 
-def test_the_version_is_read_without_importing_the_package(wheel: Path) -> None:
+def test_the_changelog_and_the_wheel_know_the_version(wheel: Path) -> None:
     import torchrl_hmcts
 
-    assert wheel.name == f"torchrl_hmcts-{torchrl_hmcts.__version__}-py3-none-any.whl"
-
-
-def test_the_changelog_knows_the_version() -> None:
-    import torchrl_hmcts
-
-    changelog = (ROOT / "CHANGELOG.md").read_text()
-    assert f"## [{torchrl_hmcts.__version__}]" in changelog
+    version = torchrl_hmcts.__version__
+    assert wheel.name == f"torchrl_hmcts-{version}-py3-none-any.whl"
+    assert f"## [{version}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_the_wheel_holds_every_file_of_the_three_folders_and_no_other(wheel: Path) -> None:
@@ -126,53 +124,96 @@ def test_the_wheel_holds_every_file_of_the_three_folders_and_no_other(wheel: Pat
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert names == set(source_files())
     assert "torchrl_hmcts/py.typed" in names
-
-
-def test_the_wheel_stays_small(wheel: Path) -> None:
     assert wheel.stat().st_size < MAX_WHEEL_BYTES
 
 
-def test_the_installed_package_is_not_the_repository(installed: Path) -> None:
-    script = (
-        "import json, torchrl_hmcts, torchrl_hmcts.envs, torchrl_hmcts.trainers\n"
-        "parts = (torchrl_hmcts, torchrl_hmcts.envs, torchrl_hmcts.trainers)\n"
-        "print(json.dumps([part.__file__ for part in parts]))"
-    )
-    done = run([installed / "bin" / "python", "-c", script], installed.parent)
-    for name in json.loads(done.stdout.splitlines()[-1]):
-        assert Path(name).resolve().is_relative_to(installed.resolve())
+def imports(path: Path) -> Iterator[str]:
+    """Yield the packages that a file imports, at any depth."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield (node.module or "").split(".")[0]
 
 
-def test_no_global_package_called_envs_or_trainers_is_installed(installed: Path) -> None:
+def distributions(*requirements: str) -> set[str]:
+    names = [re.split(r"[\s\[<>=!~;]", line)[0] for line in requirements]
+    return {re.sub(r"[-_.]+", "-", name).lower() for name in names}
+
+
+def test_every_third_party_import_is_declared() -> None:
+    optional = PYPROJECT["project"]["optional-dependencies"]
+    provided = importlib.metadata.packages_distributions()
+    undeclared = {}
+    for name, path in source_files().items():
+        if path.suffix != ".py":
+            continue
+        extras = EXTRAS.get(name, EXTRAS.get(path.relative_to(ROOT).parts[0], ()))
+        lines = [line for extra in extras for line in optional[extra]]
+        allowed = distributions(*PYPROJECT["project"]["dependencies"], *lines)
+        if name.endswith("planners/export.py"):  # a tree as a graph, for those who have networkx
+            allowed |= distributions(*(importlib.metadata.requires("torch") or ()))
+        tops = set(imports(path)) - sys.stdlib_module_names - {"torchrl_hmcts"}
+        wrong = [t for t in tops if not allowed & distributions(*provided.get(t, [t]))]
+        undeclared.update({name: wrong} if wrong else {})
+    assert undeclared == {}
+
+
+INSTALLED = """
+import importlib, json, sys
+for name in {names}:
+    module = importlib.import_module(name)
+    assert module.__file__.startswith({root}), module.__file__
+import gymnasium
+for maze in ("WaterworldMaze-v0", "GridworldMaze-v0"):
+    env = gymnasium.make(f"torchrl_hmcts.envs:torchrl_hmcts/{maze}")
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
+    env.step(env.action_space.sample())
+"""
+
+
+def test_every_module_imports_from_the_wheel_and_gymnasium_knows_its_envs(installed: Path) -> None:
+    names = [name for name in source_files() if name.endswith(".py")]
+    names = [n.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for n in names]
+    names = [name for name in names if not name.endswith(".__main__")]
+    script = INSTALLED.replace("{names}", repr(names)).replace("{root}", repr(str(installed)))
+    run([installed / "bin" / "python", "-c", script], installed.parent)
     (package,) = installed.glob("lib/python*/site-packages/torchrl_hmcts")
     assert not [name for name in ("envs", "trainers") if (package.parent / name).exists()]
-
-
-def test_every_module_of_the_wheel_imports(installed: Path) -> None:
-    names = [
-        name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-        for name in source_files()
-        if name.endswith(".py") and not name.endswith("/__main__.py")
-    ]
-    script = f"import importlib\nfor name in {names}:\n    importlib.import_module(name)"
-    run([installed / "bin" / "python", "-c", script], installed.parent)
-
-
-@pytest.mark.parametrize("name", ["WaterworldMaze-v0", "GridworldMaze-v0"])
-def test_gymnasium_makes_the_environments_by_name(installed: Path, name: str) -> None:
-    script = (
-        "import gymnasium\n"
-        f"env = gymnasium.make('torchrl_hmcts.envs:torchrl_hmcts/{name}')\n"
-        "observation, _ = env.reset(seed=0)\n"
-        "assert observation in env.observation_space\n"
-        "env.step(env.action_space.sample())"
-    )
-    run([installed / "bin" / "python", "-c", script], installed.parent)
 
 
 def test_the_installed_demo_runs_at_toy_size(installed: Path, tmp_path: Path) -> None:
     out = tmp_path / "demo"
     command = [installed / "bin" / "hmcts", "demo", "seed=0", f"out={out}", "toy=true"]
     run(command, tmp_path)
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert "solved" in metrics
+    assert "solved" in json.loads((out / "metrics.json").read_text())
+
+
+def test_importing_the_components_loads_nothing_heavy_beyond_torchrl(tmp_path: Path) -> None:
+    def loaded(package: str, parts: str) -> set[str]:
+        lines = "\n".join(f"import {package}.{part}" for part in parts.split())
+        script = f"import json, sys\n{lines}\nprint(json.dumps(sorted(sys.modules)))"
+        words = [sys.executable, "-c", script]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        return set(json.loads(done.stdout.splitlines()[-1]))
+
+    found = loaded("torchrl_hmcts", "modules objectives planners transforms")
+    heavy = {
+        *("numba", "llvmlite", "pymunk", "gymnasium", "ale_py", "matplotlib", "imageio", "PIL"),
+        *("hydra", "omegaconf", "tensorboard", "tqdm", "networkx"),
+        *("torchrl_hmcts.envs", "torchrl_hmcts.trainers"),
+    }
+    assert not (heavy & found) - loaded("torchrl", "collectors data envs modules objectives")
+
+
+def test_everything_that_benchmarks_import_from_the_project_exists() -> None:
+    missing = []
+    for path in sorted((ROOT / "benchmarks").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            name = getattr(node, "module", None) or ""
+            if isinstance(node, ast.ImportFrom) and name.startswith("torchrl_hmcts"):
+                module = importlib.import_module(name)
+                names = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                missing += [f"{path.name}: {name}.{wanted}" for wanted in names]
+    assert missing == []

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,13 +23,12 @@ from torchrl_hmcts.planners import (
     PUCT,
     UCT,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
-    MeanBackup,
     NodeStatistics,
     Search,
     SearchBudget,
 )
+from torchrl_hmcts.planners.reference import Node, ReferenceSearch
 from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PENDING
 from torchrl_hmcts.testing import TableEnv
 
@@ -86,133 +85,37 @@ def random_smdp(seed: int) -> SMDP:
 # ---------------------------------------------------------------------- the reference
 
 
-@dataclass
-class Node:
-    state: int
-    terminal: bool
-    evaluation: float
-    number: int
-    parent: Node | None = None
-    option: int = -1
-    reward: float = 0.0
-    discount: float = 1.0
-    value: float = 0.0
-    revisits: int = 0
-    gains: list[float] = field(default_factory=list)
-    children: dict[int, Node] = field(default_factory=dict)
+class GumbelReference(ReferenceSearch):
+    """Gumbel search with a scale of 0, by the equations of its paper."""
 
-    def __post_init__(self) -> None:
-        self.value = self.evaluation
+    gumbel: Gumbel
+    schedule: list[int]
 
-    @property
-    def visits(self) -> int:
-        return 1 + len(self.gains) + self.revisits
+    def run(self, num_simulations: int | None = None, num_expansions: int | None = None) -> None:
+        assert num_simulations is not None
+        self.schedule = self.halving(num_simulations)
+        super().run(num_simulations, num_expansions)
 
-    def q(self) -> float:
-        return self.reward + self.discount * self.value
-
-
-class ReferenceSearch:
-    """Textbook Monte Carlo tree search with one descent per simulation."""
-
-    def __init__(
-        self,
-        smdp: SMDP,
-        state: int,
-        *,
-        policy: str,
-        c: float,
-        backup: str,
-        expand: str,
-        exhausted: str,
-        evaluate: bool,
-        use_priors: bool,
-        max_considered: int = 16,
-    ) -> None:
-        self.smdp, self.policy, self.c = smdp, policy, c
-        self.backup, self.expand = backup, expand
-        self.revisit = exhausted == "revisit" or policy == "gumbel"
-        self.evaluate, self.use_priors = evaluate, use_priors
-        self.max_considered = max_considered
-        self.root = Node(state, state in smdp.terminal, self.evaluation(state), 0)
-        self.nodes = [self.root]
-        self.simulations = self.expansions = self.revisits = 0
-        self.schedule: list[int] = []  # Gumbel's
-        self.lowest, self.highest = math.inf, -math.inf  # Q anywhere in the tree so far
-
-    def evaluation(self, state: int) -> float:
-        return self.smdp.values[state] if self.evaluate and state not in self.smdp.terminal else 0.0
-
-    def options(self, node: Node) -> list[int]:
-        if node.terminal:
-            return []
-        return [a for a in range(self.smdp.num_options) if (node.state, a) in self.smdp.table]
-
-    def closed(self, node: Node) -> bool:
-        return all(a in node.children and self.closed(node.children[a]) for a in self.options(node))
-
-    def prior(self, node: Node, option: int) -> float:
-        """Sums to 1 over the options that may be taken."""
-        options = self.options(node)
-        if option not in options:
-            return 0.0
-        if not self.use_priors:
-            return 1.0 / len(options)
-        priors = self.smdp.priors[node.state]
-        return priors[option] / sum(priors[a] for a in options)
-
-    # What UCT and PUCT maximise.
-
-    def score(self, node: Node, option: int) -> float:
-        child = node.children.get(option)
-        tried = child.visits if child else 0
-        if self.policy == "uct":
-            if child is None:
-                return math.inf
-            return child.q() + self.c * math.sqrt(math.log(node.visits) / tried)
-        c, under_root = self.c, sum(other.visits for other in node.children.values())
-        if self.policy in ("base", "mctx"):
-            base = 7.0 if self.policy == "base" else 19652.0
-            under_root = node.visits
-            c += math.log((node.visits + base + 1) / base)
-        return self.scaled_q(node, child) + c * self.prior(node, option) * math.sqrt(under_root) / (
-            1 + tried
-        )
-
-    def scaled_q(self, node: Node, child: Node | None) -> float:
-        if self.policy in ("puct", "base"):
-            return child.q() if child else 0.25  # the unvisited_value of the comparison
-        if child is None:
-            return 0.0
-        if self.policy == "tree":
-            return (child.q() - self.lowest) / max(self.highest - self.lowest, 1e-8)
-        values = [node.value, *(other.q() for other in node.children.values())]
-        return (child.q() - min(values)) / max(max(values) - min(values), 1e-8)
-
-    # Gumbel with a scale of 0.
-
-    def improved_logits(self, node: Node) -> list[float]:
-        """ln P + sigma(Q), where Q is completed and scaled to [0, 1], of all options."""
-        all_options = range(self.smdp.num_options)
-        tried = node.children
+    def improved_logits(self, node: Node) -> dict[int, float]:
+        """ln P + sigma(Q), where Q is completed and scaled to [0, 1]."""
+        tried, policy = node.children, self.gumbel
         total = sum(child.visits for child in tried.values())
         mixed = node.evaluation
         if tried:
-            weights = {a: self.prior(node, a) for a in tried}
-            mean = sum(weights[a] * tried[a].q() for a in tried) / sum(weights.values())
+            weights = {a: node.priors[a] for a in tried}
+            mean = sum(weights[a] * tried[a].q for a in tried) / sum(weights.values())
             mixed = (mixed + total * mean) / (1 + total)
-        q = [tried[a].q() if a in tried else mixed for a in all_options]
-        low, high = min(q), max(q)
+        q = {a: tried[a].q if a in tried else mixed for a in node.priors}
+        # The kernels scale by all options, forbidden ones, which count as not tried, among them.
+        every = [*q.values(), *([mixed] if len(q) < self.num_options else [])]
+        low, high = min(every), max(every)
         most = max((child.visits for child in tried.values()), default=0)
-        return [
-            (math.log(self.prior(node, a)) if self.prior(node, a) else -math.inf)
-            + (50.0 + most) * self.c * (q[a] - low) / max(high - low, 1e-8)
-            for a in all_options
-        ]
+        scale = (policy.c_visit + most) * policy.c_scale / max(high - low, 1e-8)
+        return {a: math.log(node.priors[a]) + scale * (q[a] - low) for a in q}
 
     def halving(self, simulations: int) -> list[int]:
         """Visits of the options in the race, before each simulation."""
-        racing = min(self.max_considered, len(self.options(self.root)))
+        racing = min(self.gumbel.max_considered, len(self.root.priors))
         if racing <= 1:
             return list(range(simulations))
         rounds, visits, schedule = math.ceil(math.log2(racing)), 0, []
@@ -223,114 +126,56 @@ class ReferenceSearch:
             racing = max(2, racing // 2)
         return schedule
 
-    def choose_by_gumbel(self, node: Node) -> int:
-        options, logits = self.options(node), self.improved_logits(node)
-        visits = {a: node.children[a].visits if a in node.children else 0 for a in options}
+    def choose(self, node: Node) -> int:
+        logits = self.improved_logits(node)
+        visits = {a: node.children[a].visits if a in node.children else 0 for a in logits}
         total = sum(visits.values())
         if node is self.root:
-            racing = [a for a in options if visits[a] == self.schedule[total]]
-            return max(racing, key=lambda a: (logits[a], -a))
-        norm = math.log(sum(math.exp(logits[a] - max(logits)) for a in options)) + max(logits)
-        return max(
-            options, key=lambda a: (math.exp(logits[a] - norm) - visits[a] / (1 + total), -a)
-        )
+            racing = [a for a in logits if visits[a] == self.schedule[total]]
+            return max(racing, key=lambda a: logits[a])
+        top = max(logits.values())
+        norm = math.log(sum(math.exp(x - top) for x in logits.values())) + top
+        return max(logits, key=lambda a: math.exp(logits[a] - norm) - visits[a] / (1 + total))
 
     def final_choice(self) -> int:
         """Of the options with the most visits the one with the largest logit."""
-        options, logits = self.options(self.root), self.improved_logits(self.root)
-        children = self.root.children
-        visits = {a: children[a].visits if a in children else 0 for a in options}
+        logits, children = self.improved_logits(self.root), self.root.children
+        visits = {a: children[a].visits if a in children else 0 for a in logits}
         most = max(visits.values())
-        return max((a for a in options if visits[a] == most), key=lambda a: (logits[a], -a))
+        return max((a for a in logits if visits[a] == most), key=lambda a: logits[a])
 
-    # The search.
 
-    def choose(self, node: Node) -> int:
-        if self.policy == "gumbel":
-            return self.choose_by_gumbel(node)
-        options = [
-            a
-            for a in self.options(node)
-            if self.revisit or a not in node.children or not self.closed(node.children[a])
-        ]
-        return max(options, key=lambda a: (self.score(node, a), self.prior(node, a), -a))
+def reference_for(smdp: SMDP, state: int, config: dict[str, Any]) -> ReferenceSearch:
+    def model(state: int, option: int) -> tuple[int, float, int, bool]:
+        after, reward, duration = smdp.table[state, option]
+        return after, reward, duration, after in smdp.terminal
 
-    def simulate(self) -> None:
-        """One descent, to new outcomes or to a terminal state once more."""
-        node = self.root
-        while not node.terminal:
-            if self.expand == "all" and not node.children:
-                self.expansions += 1
-                for option in self.options(node):
-                    self.add(node, option)
-                return
-            option = self.choose(node)
-            if option not in node.children:
-                self.expansions += 1
-                self.add(node, option)
-                return
-            node = node.children[option]
-        node.revisits += 1
-        self.revisits += 1
-        self.back_up(node)
+    def options(state: int) -> list[int]:
+        return [a for a in range(smdp.num_options) if (state, a) in smdp.table]
 
-    def add(self, parent: Node, option: int) -> None:
-        state, reward, duration = self.smdp.table[parent.state, option]
-        terminal = state in self.smdp.terminal
-        discount = 0.0 if terminal else self.smdp.gamma**duration
-        child = Node(
-            state,
-            terminal,
-            self.evaluation(state),
-            len(self.nodes),
-            parent,
-            option,
-            reward,
-            discount,
-        )
-        self.nodes.append(child)
-        parent.children[option] = child
-        self.back_up(child)
+    def evaluate(state: int) -> tuple[list[float] | None, float]:
+        priors = smdp.priors[state] if config["use_priors"] else None
+        return priors, smdp.values[state] if config["evaluate"] else 0.0
 
-    def back_up(self, node: Node) -> None:
-        self.simulations += 1
-        gain = node.value
-        while node.parent is not None:
-            gain = node.reward + node.discount * gain
-            self.lowest, self.highest = min(self.lowest, node.q()), max(self.highest, node.q())
-            node = node.parent
-            node.gains.append(gain)
-            if self.backup == "max":
-                node.value = max(other.q() for other in node.children.values())
-            else:
-                node.value = (node.evaluation + sum(node.gains)) / (1 + len(node.gains))
-
-    def path_return(self, node: Node) -> float:
-        rewards = []
-        while node.parent is not None:
-            rewards.append((node.reward, node.discount))
-            node = node.parent
-        total, discount = 0.0, 1.0
-        for reward, d in reversed(rewards):
-            total, discount = total + discount * reward, discount * d
-        return total
-
-    def run(self, *, expansions: int | None = None, simulations: int | None = None) -> None:
-        """Simulate until the budget is spent or, unless leaves are revisited, nothing is left."""
-        if self.policy == "gumbel":
-            assert simulations is not None
-            self.schedule = self.halving(simulations)
-        while self.expansions != expansions and (
-            simulations is None or self.simulations < simulations
-        ):
-            if self.closed(self.root) and not (self.revisit and simulations is not None):
-                return
-            self.simulate()
+    policy, is_gumbel = tree_policy_of(config), config["policy"] == "gumbel"
+    search = (GumbelReference if is_gumbel else ReferenceSearch)(
+        state,
+        model,
+        options,
+        gamma=smdp.gamma,
+        evaluate=evaluate,
+        tree_policy=None if is_gumbel else policy,
+        backup=config["backup"],
+        expand=config["expand"],
+        exhausted="revisit" if is_gumbel else config["exhausted"],
+    )
+    search.num_options = smdp.num_options  # type: ignore[attr-defined]
+    if isinstance(search, GumbelReference):
+        search.gumbel = policy
+    return search
 
 
 # ---------------------------------------------------------------------- comparison
-
-BACKUPS = {"mean": MeanBackup, "max": MaxBackup}
 
 
 def tree_policy_of(config: dict[str, Any]) -> Any:
@@ -359,7 +204,7 @@ def planner_for(smdp: SMDP, config: dict[str, Any], **budget: int) -> MCTSPlanne
         TableEnv(smdp.table, terminal=smdp.terminal, start=0),
         gamma=smdp.gamma,
         tree_policy=tree_policy_of(config),
-        backup=BACKUPS[config["backup"]](),
+        backup=config["backup"],
         expand=config["expand"],
         exhausted=config["exhausted"],
         leaf_evaluator=(lambda td: values[td["state"]]) if config["evaluate"] else None,
@@ -383,25 +228,24 @@ def check_against(search: Search, b: int, reference: ReferenceSearch) -> None:
         np.testing.assert_allclose(
             nodes[name][used], [getattr(node, name) for node in expected], rtol=1e-4, atol=1e-5
         )
-    returns = [reference.path_return(node) for node in expected]
+    returns = [node.path_return for node in expected]
     np.testing.assert_allclose(nodes["path_return"][used], returns, rtol=1e-4, atol=1e-5)
-    closed = [reference.closed(node) for node in expected]
+    closed = [node.closed for node in expected]
     assert ((nodes["flags"][used] & CLOSED) != 0).tolist() == closed
     for node in expected:
         row = edges[node.number]
-        allowed = [
-            node.terminal or (node.state, a) in reference.smdp.table for a in range(len(row))
-        ]
+        allowed = [not node.priors or a in node.priors for a in range(len(row))]
         assert (row["closed"] != FORBIDDEN).tolist() == allowed
         for option in range(search.num_options):
             child = node.children.get(option)
             assert row["child"][option] == (child.number if child else -1)
             assert row["visits"][option] == (child.visits if child else 0)
             if child is not None:
-                assert row["value"][option] == pytest.approx(child.q(), rel=1e-4, abs=1e-5)
+                assert row["value"][option] == pytest.approx(child.q, rel=1e-4, abs=1e-5)
     rewarded = [r for r, node in zip(returns, expected, strict=True) if node.reward > 0]
-    assert (search.best_node[b] >= 0) == bool(rewarded)
-    if rewarded:
+    assert (search.best_node[b] >= 0) == bool(rewarded) == (reference.best is not None)
+    if reference.best is not None:
+        assert reference.best.path_return == max(rewarded)
         assert search.best_return[b] == pytest.approx(max(rewarded), rel=1e-4, abs=1e-5)
     assert not edges["in_flight"].any()
     assert not (nodes["flags"] & PENDING).any()
@@ -430,9 +274,9 @@ def search_and_check(
     env = planner.simulator.env
     assert isinstance(env, TableEnv)
     search = planner.search(roots_at(env, states))
-    references = [ReferenceSearch(smdp, state, **config) for state in states]
+    references = [reference_for(smdp, state, config) for state in states]
     for b, reference in enumerate(references):
-        reference.run(**budget)
+        reference.run(**{f"num_{name}": number for name, number in budget.items()})
         check_against(search, b, reference)
     return planner, search, references
 
@@ -478,7 +322,8 @@ def test_gumbel_without_noise_equals_the_equations_of_its_paper(
     planner, search, references = search_and_check(seed, config, num_roots, simulations=simulations)
     chosen = planner.choose(search)
     for b, reference in enumerate(references):
-        if not reference.root.terminal:
+        assert isinstance(reference, GumbelReference)
+        if reference.root.priors:
             assert chosen[b] == reference.final_choice()
 
 
@@ -599,7 +444,7 @@ def test_several_leaves_in_flight_leave_a_consistent_tree_and_none_in_flight(
         assert simulations >= 60
 
 
-def bandit(**config: Any) -> ReferenceSearch:
+def bandit(**config: Any) -> Any:
     """One state, two terminal options of reward 0.25 and 0.75."""
     smdp = SMDP(
         num_states=2,
@@ -619,25 +464,25 @@ def bandit(**config: Any) -> ReferenceSearch:
         "evaluate": False,
         "use_priors": False,
     }
-    return ReferenceSearch(smdp, 0, **{**defaults, **config})
+    return reference_for(smdp, 0, {**defaults, **config})
 
 
 def test_the_reference_knows_the_hand_made_bandit() -> None:
     # Guards the comparison itself.
     mean, best = bandit(), bandit(backup="max")
-    mean.run(expansions=10)
-    best.run(expansions=10)
+    mean.run(num_expansions=10)
+    best.run(num_expansions=10)
     assert (mean.expansions, best.expansions) == (2, 2)
     assert mean.root.value == pytest.approx(1 / 3)
     assert best.root.value == 0.75
     # Revisits, c = 0: both once, then the better one: (0 + 0.25 + 5 * 0.75) / 7.
     greedy = bandit(exhausted="revisit", c=0.0)
-    greedy.run(simulations=6)
+    greedy.run(num_simulations=6)
     assert [greedy.root.children[a].visits for a in (0, 1)] == [1, 5]
     assert greedy.revisits == 4
     assert greedy.root.value == pytest.approx(4 / 7)
     # Four simulations halve two options into 2 + 2, then 0.75 wins.
     gumbel = bandit(policy="gumbel", c=0.1)
-    gumbel.run(simulations=4)
+    gumbel.run(num_simulations=4)
     assert gumbel.schedule == [0, 0, 1, 1]
     assert gumbel.final_choice() == 1

@@ -16,7 +16,6 @@ from torchrl.envs import (
     Compose,
     DTypeCastTransform,
     EnvBase,
-    GymEnv,
     InitTracker,
     ObservationNorm,
     ParallelEnv,
@@ -213,12 +212,6 @@ def test_what_is_not_one_number_is_refused_with_its_key_and_shape(
         MCTSPlanner(Specs(locked, **specs))
 
 
-@pytest.mark.parametrize("reward", [Unbounded((1, 1)), Unbounded((1,), dtype=torch.int32)])
-def test_one_number_is_a_reward_in_any_shape_and_real_dtype(reward: Any) -> None:
-    MCTSPlanner(Specs(reward=reward))
-    MCTSPlanner(Specs(True, (3,), reward=reward.expand(3, *reward.shape)))
-
-
 @pytest.mark.parametrize(
     ("shape", "dtype"), [((2,), torch.int64), ((1,), torch.float32), ((1,), torch.bool)]
 )
@@ -234,18 +227,6 @@ def test_a_duration_is_one_integer(shape: tuple[int, ...], dtype: torch.dtype) -
 
 def settable_options() -> EnvBase:
     return TransformedEnv(ChainEnv(length=8), follow(gamma=0.7))
-
-
-def gym_env() -> EnvBase:
-    return GymEnv("CartPole-v1", categorical_action_encoding=True)
-
-
-@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
-def test_a_batch_of_envs_that_cannot_be_set_is_refused_like_one(kind: Any) -> None:
-    env = kind(2, gym_env)
-    with pytest.raises(ValueError, match=rf"any state; {kind.__name__} cannot"):
-        MCTSPlanner(env)
-    env.close(raise_if_closed=False)
 
 
 @pytest.mark.parametrize("kind", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
@@ -467,14 +448,6 @@ def test_a_transform_whose_state_cannot_be_set_is_refused_by_name(
     if below:
         env.append_transform(follow())
     with pytest.raises(ValueError, match=message):
-        MCTSPlanner(env)
-
-
-@pytest.mark.filterwarnings(VEC_NORM)
-def test_a_normaliser_with_statistics_of_each_element_is_refused() -> None:
-    env = numbered((2,))
-    env.append_transform(norm(True))
-    with pytest.raises(ValueError, match="VecNormV2 .* with reduce_batch_dims=True"):
         MCTSPlanner(env)
 
 

@@ -10,14 +10,15 @@ import imageio.v3 as iio
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.experiments import dissertation_figures
+from torchrl_hmcts.trainers.experiments.dissertation import FIGURES, find_figure, find_results
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS
-from torchrl_hmcts.trainers.figures.atari_results import (
+from torchrl_hmcts.trainers.figures.atari_scores import (
     TABLE_5_1,
     TABLE_A_1,
-    _how,
     best_baseline,
+    what_it_took,
 )
-from torchrl_hmcts.trainers.figures.dissertation import FIGURES, find_figure, find_results
 
 ASKED = (
     "3.1 3.2 3.4 3.5 3.6 4.4 4.5 4.6 4.7 4.8 4.9 4.10 5.1 5.2 5.3 5.4 5.5 5.6 5.7 table5.1".split()
@@ -44,7 +45,7 @@ def test_every_figure_of_the_dissertation_that_shows_data_has_a_name() -> None:
     for figure in FIGURES.values():
         assert figure.shows
         assert figure.data
-        assert callable(figure.draw)
+        assert callable(getattr(dissertation_figures, figure.draws))
 
 
 def test_the_list_says_what_each_shows_and_what_ours_is_drawn_from(capsys) -> None:
@@ -164,8 +165,14 @@ def test_frames_per_decision_are_those_of_the_episodes_alone() -> None:
     episodes = [{"decisions": 30}, {"decisions": 20}]
     spent = {"frames": 6_000, "frames_finding_options": 800, "frames_tuning": 200}
     old = {**spent, "episodes": episodes, "source": "goals", "options": ["a", "b"]}
-    assert _how([{**old, "option_steps": 5, "seconds": 7.4}]) == ["goals", "2, 5", 6_000, 100, 7]
-    assert _how([{**old, "frames_per_decision": 90.0}])[3] == 90
+    assert what_it_took([{**old, "option_steps": 5, "seconds": 7.4}]) == [
+        "goals",
+        "2, 5",
+        6_000,
+        100,
+        7,
+    ]
+    assert what_it_took([{**old, "frames_per_decision": 90.0}])[3] == 90
 
 
 def test_the_sources_numbers_fit_each_other() -> None:
@@ -178,10 +185,8 @@ def test_the_sources_numbers_fit_each_other() -> None:
 
 
 def test_all_figures_make_one_page_that_says_what_is_missing(tmp_path, capsys, monkeypatch) -> None:
-    from torchrl_hmcts.trainers.figures import dissertation
-
     few = {name: FIGURES[name] for name in ("3.1", "5.2", "table5.1")}
-    monkeypatch.setattr(dissertation, "FIGURES", few)
+    monkeypatch.setattr(dissertation_figures, "FIGURES", few)
     run = write_atari(tmp_path / "r", "Pong", 0)
     assert main(["report", "figure=all", run, f"out={tmp_path}/all"]) == 0
     page = (tmp_path / "all" / "index.html").read_text()

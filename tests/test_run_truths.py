@@ -15,12 +15,12 @@ from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.evaluations import load_networks
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_training_env
-from torchrl_hmcts.trainers.figures.report import write_run_page
+from torchrl_hmcts.trainers.figures.run_page import write_run_page
 from torchrl_hmcts.trainers.runs.config import DemoConfig
-from torchrl_hmcts.trainers.runs.folder import end_record, read_run
 from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.runs.worker_file import find_worker, save_worker
 from torchrl_hmcts.trainers.saving.files import read_json, write_json
+from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run
 
 
 def finish(out: Path, metrics: dict[str, Any], **captions: str) -> str:
@@ -47,7 +47,7 @@ def test_the_page_of_a_run_that_ended_otherwise_says_how(tmp_path: Path, status:
 
     def end() -> None:
         with open_run(DemoConfig(out=str(tmp_path))) as run:
-            assert "not finished (running)" in lead(write_run_page(run.path).read_text())
+            assert "not finished (running)" in lead(write_run_page(read_run(run.path)).read_text())
             raise error
 
     with pytest.raises(error):
@@ -55,7 +55,7 @@ def test_the_page_of_a_run_that_ended_otherwise_says_how(tmp_path: Path, status:
     if status == "interrupted":  # by SIGKILL: nobody noted it
         record = read_json(tmp_path / "run.json")
         write_json(tmp_path / "run.json", {**record, "status": "running"}, checksum=True)
-    assert f"not finished ({status})" in lead(write_run_page(tmp_path).read_text())
+    assert f"not finished ({status})" in lead(write_run_page(read_run(tmp_path)).read_text())
 
 
 def test_a_failure_after_the_end_leaves_the_run_finished(tmp_path: Path) -> None:
@@ -165,16 +165,17 @@ class TestReports:
 
     def test_a_stamped_picture_is_still_the_same_picture(self, tmp_path: Path) -> None:
         import imageio.v3 as iio
+        from matplotlib import image
 
-        from torchrl_hmcts.trainers.figures.foreign_files import refuse_foreign, stamp
+        from torchrl_hmcts.trainers.figures.pictures import STAMP, refuse_foreign
 
         pixels = np.random.default_rng(0).integers(0, 255, (9, 7, 3), np.uint8)
         iio.imwrite(tmp_path / "x.png", pixels)
         with pytest.raises(ValueError, match=r"x.png exists"):
             refuse_foreign(tmp_path / "x.png")
-        stamp(tmp_path / "x.png")
+        image.imsave(tmp_path / "x.png", pixels, metadata=STAMP)
         refuse_foreign(tmp_path / "x.png")
-        assert np.array_equal(iio.imread(tmp_path / "x.png"), pixels)
+        assert np.array_equal(iio.imread(tmp_path / "x.png")[..., :3], pixels)
 
 
 class TestEvaluations:

@@ -24,9 +24,9 @@ from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.lab.config import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.waterworld.config import WaterworldGoalsConfig
 from torchrl_hmcts.trainers.runs.config import DemoConfig, RunConfig, home, parse_overrides
-from torchrl_hmcts.trainers.runs.folder import read_run
 from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 CONFIGS = (DemoConfig, LabMazeConfig, WaterworldGoalsConfig, AtariConfig)
 DEMO = "torchrl_hmcts.trainers.experiments.demo.run_demo"

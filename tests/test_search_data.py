@@ -8,13 +8,12 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_hmcts.planners import (
-    MaxBackup,
     MCTSPlanner,
     SearchBudget,
-    best_plans_below,
     extract_plans,
     search_examples,
 )
+from torchrl_hmcts.planners.search_data import best_plans_below
 from torchrl_hmcts.planners.tree import TERMINAL
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
@@ -54,16 +53,6 @@ def test_the_best_plan_below_a_node_takes_the_higher_discounted_return() -> None
     assert len(dead)
     assert np.isneginf(returns[0, dead]).all()
     assert (options[0, dead] == -1).all()
-
-
-def test_a_plan_over_several_options_is_discounted_by_its_base_steps() -> None:
-    table = {(0, 0): (1, 0.25, 3), (1, 0): (2, 0.0, 2), (2, 0): (3, 1.0, 1)}
-    env = TableEnv(table, terminal=[3])
-    budget = SearchBudget(expansions=3, until_plan=False)
-    search = MCTSPlanner(env, gamma=0.5, budget=budget).search(env.reset())
-    returns, _ = best_plans_below(search)
-    # From the end: 1; 0.5 ** 2 * 1; 0.25 + 0.5 ** 3 * 0.25.
-    np.testing.assert_allclose(returns[0, :3], [0.28125, 0.25, 1.0])
 
 
 def test_from_the_roots_it_is_the_return_of_the_extracted_plans() -> None:
@@ -131,7 +120,7 @@ def test_a_search_without_a_plan_teaches_no_value_unless_asked() -> None:
     env = ChainEnv(length=9)
     budget = SearchBudget(expansions=2)
     search = MCTSPlanner(env, budget=budget, leaf_evaluator=lambda td: torch.full((len(td),), 0.5),
-                         backup=MaxBackup(), gamma=0.5).search(env.reset())  # fmt: skip
+                         backup="max", gamma=0.5).search(env.reset())  # fmt: skip
     silent = search_examples(search)
     assert silent["value_weight"].tolist() == [0.0]
     assert silent["policy_weight"].tolist() == [1.0]
@@ -140,31 +129,12 @@ def test_a_search_without_a_plan_teaches_no_value_unless_asked() -> None:
     assert told["value_target"].item() == search.tree.nodes["value"][0, 0]
 
 
-def test_roots_without_a_plan_are_left_out_on_request() -> None:
-    search = MCTSPlanner(ChainEnv(length=9), budget=SearchBudget(expansions=2)).search(
-        ChainEnv(length=9).reset()
-    )
-    assert len(search_examples(search)) == 1
-    assert len(search_examples(search, roots=False)) == 0
-
-
 def test_a_root_that_was_never_expanded_has_no_weight() -> None:
     env = ChainEnv(length=4)
     planner = MCTSPlanner(env)
     examples = search_examples(planner.plant(env.reset()))
     assert examples["policy_weight"].tolist() == [0.0]
     assert examples["value_weight"].tolist() == [0.0]
-
-
-def test_examples_name_their_root_and_node() -> None:
-    env = ChainEnv(length=5)
-    starts = env.reset().expand(2).clone()
-    starts["state"] = torch.tensor([0, 2])
-    search = MCTSPlanner(env).search(starts)
-    examples = search_examples(search)
-    stored = search.tree.states["state"][examples["root"], examples["node"]]
-    assert torch.equal(examples["state"], stored)
-    assert set(examples["root"].tolist()) == {0, 1}
 
 
 def test_examples_are_copies_of_the_tree() -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from tensordict import NonTensorData, TensorDict
 
-from torchrl_hmcts.trainers.figures.report import write_page
+from torchrl_hmcts.trainers.figures.run_page import write_page
 from torchrl_hmcts.trainers.skills.dataset import load_dataset
 
 if sys.version_info >= (3, 11):
@@ -70,37 +70,37 @@ def dangers(source: str) -> Iterator[str]:
             yield f"line {node.lineno}: {name}(shell=True)"
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_module_loads_what_could_execute_code(path: Path) -> None:
-    found = list(dangers(path.read_text()))
-    if str(path.relative_to(ROOT)) in PIPES:
-        found = [danger for danger in found if "cloudpickle.loads" not in danger]
-    assert not found
+def test_no_module_loads_what_could_execute_code() -> None:
+    found = {}
+    for path in SOURCES:
+        name = str(path.relative_to(ROOT))
+        dangerous = list(dangers(path.read_text()))
+        if name in PIPES:
+            dangerous = [danger for danger in dangerous if "cloudpickle.loads" not in danger]
+        found.update({name: dangerous} if dangerous else {})
+    assert found == {}
 
 
 @pytest.mark.parametrize(
-    "source",
+    ("source", "number"),
     [
-        "torch.load('x')",
-        "torch.load('x', weights_only=False)",
-        "pickle.load(file)",
-        "eval('1')",
-        "yaml.load(text)",
-        "np.load('x', allow_pickle=True)",
-        "TensorDict.load_memmap('x')",
-        "subprocess.run('ls', shell=True)",
+        ("torch.load('x')", 1),
+        ("torch.load('x', weights_only=False)", 1),
+        ("torch.load('x', weights_only=True)", 0),
+        ("pickle.load(file)", 1),
+        ("pickle.loads(pickle.dumps(x))", 0),
+        ("eval('1')", 1),
+        ("network.eval()", 0),
+        ("yaml.load(text)", 1),
+        ("np.load('x', allow_pickle=True)", 1),
+        ("TensorDict.load_memmap('x')", 1),
+        ("subprocess.run('ls', shell=True)", 1),
     ],
 )
-def test_the_check_catches_it(source: str) -> None:
-    assert len(list(dangers(source))) == 1
-
-
-@pytest.mark.parametrize(
-    "source",
-    ["network.eval()", "torch.load('x', weights_only=True)", "pickle.loads(pickle.dumps(x))"],
-)
-def test_the_check_lets_it_pass(source: str) -> None:
-    assert not list(dangers(source))
+def test_the_check_catches_what_is_dangerous_and_lets_the_rest_pass(
+    source: str, number: int
+) -> None:
+    assert len(list(dangers(source))) == number
 
 
 class Bomb:

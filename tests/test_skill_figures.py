@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import skill_figures as skills
 import torch
 from tensordict.nn import TensorDictModule
 
@@ -15,12 +14,7 @@ from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env
-from torchrl_hmcts.trainers.figures.skill_figures import (
-    search_coverage,
-    skill_figures,
-    smallest_angle,
-)
-from torchrl_hmcts.trainers.figures.solving_curves import band, plot_solving_curves
+from torchrl_hmcts.trainers.figures.curves import Panel, common_steps, plot_training
 
 PUSH = TensorDictModule(lambda skill: skill, ["skill"], ["action"])  # skill z: thrust z
 
@@ -38,7 +32,7 @@ COMPASS = TensorDictModule(Compass(), ["displacement"], ["skill_logits"])
 
 def test_thrust_in_four_directions_is_told_apart_without_error_and_at_right_angles() -> None:
     room, _, _ = maze_from_text(".........\n" * 9)
-    figures = skill_figures(PUSH, COMPASS, room.expand(30, 9, 9), steps=(10, 20))
+    figures = skills.skill_figures(PUSH, COMPASS, room.expand(30, 9, 9), steps=(10, 20))
     assert list(figures) == [10, 20]
     assert figures[20]["accuracy"] == 1.0
     # Thrust changes the velocity first: after one step nobody has moved, one guess in four hits.
@@ -52,7 +46,7 @@ def test_thrust_in_four_directions_is_told_apart_without_error_and_at_right_angl
 def test_skills_that_do_the_same_are_guessed_at_chance_and_have_no_angle_between_them() -> None:
     room, _, _ = maze_from_text(".........\n" * 9)
     same = TensorDictModule(lambda skill: torch.full_like(skill, 3), ["skill"], ["action"])
-    figures = skill_figures(same, COMPASS, room.expand(30, 9, 9), steps=(20,))[20]
+    figures = skills.skill_figures(same, COMPASS, room.expand(30, 9, 9), steps=(20,))[20]
     assert figures["accuracy"] == 0.25
     assert figures["angle"] == pytest.approx(0.0, abs=1.0)
 
@@ -60,7 +54,7 @@ def test_skills_that_do_the_same_are_guessed_at_chance_and_have_no_angle_between
 def test_the_smallest_angle_is_that_of_the_closest_pair() -> None:
     angles = torch.deg2rad(torch.tensor([0.0, 100.0, 170.0, 330.0]))
     vectors = torch.stack((angles.cos(), angles.sin()), -1) * torch.tensor([[1.0], [5], [0.1], [2]])
-    assert smallest_angle(vectors) == pytest.approx(30.0, abs=1e-4)
+    assert skills.smallest_angle(vectors) == pytest.approx(30.0, abs=1e-4)
 
 
 def test_coverage_counts_the_tiles_in_front_of_the_target_only() -> None:
@@ -72,7 +66,7 @@ def test_coverage_counts_the_tiles_in_front_of_the_target_only() -> None:
     search = MCTSPlanner(env, budget=budget).search(start)
     position = search.tree.states["position"][0, : int(search.tree.num_nodes[0])]
     reached = {int(x) for x in position[:, 0]}
-    share = search_coverage(search, env.base_env)
+    share = skills.search_coverage(search, env.base_env)
     assert share.tolist() == pytest.approx([len(reached) / 5])
     assert reached <= {0, 1, 2, 3, 4}
 
@@ -123,31 +117,31 @@ def test_spread_of_nothing_is_not_a_number() -> None:
 def test_figures_need_no_gradient() -> None:
     net = TensorDictModule(torch.nn.Linear(2, 4), ["displacement"], ["skill_logits"])
     room, _, _ = maze_from_text("...\n...\n...")
-    figures = skill_figures(PUSH, net, room[None], steps=(3,))
+    figures = skills.skill_figures(PUSH, net, room[None], steps=(3,))
     assert isinstance(figures[3]["accuracy"], float)
 
 
 def test_curves_of_seeds_are_brought_to_the_steps_that_all_of_them_reached() -> None:
-    short = {"training_steps": [0, 10], "solved": [0.0, 1.0]}
-    long = {"training_steps": [0, 5, 10, 20], "solved": [0.0, 0.0, 0.5, 1.0]}
-    shown = band([long, short], "solved")
-    assert shown["training_steps"].tolist() == [0.0, 5.0, 10.0]
-    assert shown["mean"].tolist() == [0.0, 0.25, 0.75]
-    assert shown["least"].tolist() == [0.0, 0.0, 0.5]
-    assert shown["largest"].tolist() == [0.0, 0.5, 1.0]
+    short = ([0, 5, 10], [0.0, 0.5, 1.0])
+    long = ([0, 5, 10, 20], [0.0, 0.0, 0.5, 1.0])
+    steps, values = common_steps([long, short])
+    assert steps.tolist() == [0.0, 5.0, 10.0]
+    assert values.tolist() == [[0.0, 0.0, 0.5], [0.0, 0.5, 1.0]]
     with pytest.raises(ValueError, match="got none"):
-        band([], "solved")
+        common_steps([])
 
 
-def test_solving_curves_are_drawn(tmp_path: Path) -> None:
+def test_solving_curves_are_drawn(tmp_path) -> None:
     curve = {
         "training_steps": [0, 10],
         "base_steps": [900.0, 100.0],
         "executed_steps": [90.0, 50.0],
         "solved": [0.5, 1.0],
     }
-    plot_solving_curves({"from scratch": [curve, curve]}, tmp_path / "a.png", title="two seeds")
+    steps = Panel("base_steps", "to solve", log=True, dotted=("executed_steps", "executed only"))
+    panels = [steps, Panel("solved", "solved", share=True, level=(0.9, "wanted"))]
+    plot_training({"from scratch": [curve, curve]}, panels, tmp_path / "a.png", title="two seeds")
     picture = iio.imread(tmp_path / "a.png")
-    assert picture.shape[:2] == (550, 1210)
+    assert picture.shape[:2] == (506, 1210)
     blue = (np.abs(picture[..., :3].astype(int) - (29, 78, 216)) < 12).all(-1)
     assert blue.sum() > 500  # the curve is there

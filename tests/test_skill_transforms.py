@@ -29,7 +29,6 @@ from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior, SkillDiscr
 from torchrl_hmcts.objectives import SkillDiscriminatorLoss
 from torchrl_hmcts.testing import ContractError, check_transform
 from torchrl_hmcts.transforms import (
-    DIAYNReward,
     DisplacementTransform,
     SkillReward,
     SkillTransform,
@@ -225,6 +224,12 @@ def a_discriminator() -> SkillDiscriminator:
     return net
 
 
+def discriminator_reward(
+    network: SkillDiscriminator, prior: Sequence[float] | None = None, **kwargs: Any
+) -> SkillReward:
+    return SkillReward(SkillDiscriminatorLoss(network, prior=prior), **kwargs)
+
+
 def transitions() -> TensorDict:
     after = TensorDict(
         displacement=torch.tensor([[math.log(3.0)], [0.0]]),
@@ -244,14 +249,14 @@ def transitions() -> TensorDict:
     ],
 )
 def test_the_reward_has_its_closed_form(kwargs: dict[str, Any], expected: list[float]) -> None:
-    out = DIAYNReward(a_discriminator(), 2, **kwargs)(transitions())
+    out = discriminator_reward(a_discriminator(), **kwargs)(transitions())
     torch.testing.assert_close(out["next", "reward"], torch.tensor(expected)[:, None])
     assert not out["next", "reward"].requires_grad
 
 
 def test_a_replay_buffer_scores_with_the_discriminator_of_today() -> None:
     net = a_discriminator()
-    transform = DIAYNReward(net, 2)
+    transform = discriminator_reward(net)
     buffer = ReplayBuffer(storage=LazyTensorStorage(2), transform=transform, batch_size=64)
     buffer.extend(transitions())
     assert buffer.sample()["next", "reward"].max() == pytest.approx(math.log(1.5))
@@ -263,7 +268,7 @@ def test_a_replay_buffer_scores_with_the_discriminator_of_today() -> None:
 
 def test_an_env_scores_each_step() -> None:
     env = make_env((3,), num_skills=2)
-    env.append_transform(DIAYNReward(a_discriminator(), 2))
+    env.append_transform(discriminator_reward(a_discriminator()))
     check_env_specs(env)
     data = env.rollout(5)
     logits = torch.cat((data["next", "displacement"], torch.zeros(3, 5, 1)), -1)
@@ -272,18 +277,16 @@ def test_an_env_scores_each_step() -> None:
 
 
 def test_bad_arguments_are_refused_with_their_value() -> None:
-    with pytest.raises(ValueError, match="num_skills=0"):
+    with pytest.raises(ValueError, match="num_skills >= 1; got 0"):
         SkillTransform(0)
-    with pytest.raises(ValueError, match="max_skill_steps=0"):
+    with pytest.raises(ValueError, match="max_skill_steps >= 1; got 0"):
         SkillTransform(2, 0)
     with pytest.raises(ValueError, match=r"shape \(3,\)"):
         SkillTransform(2, prior=[0.2, 0.3, 0.5])
-    with pytest.raises(ValueError, match="positive"):
-        SkillTransform(2, prior=[0.0, 1.0])
+    with pytest.raises(ValueError, match="none negative"):
+        SkillTransform(2, prior=[-1.0, 1.0])
     with pytest.raises(ValueError, match="SkillTransform has 2 skills.*over 4"):
         SkillTransform(2, prior=FixedSkillPrior(4))
-    with pytest.raises(ValueError, match="2 skills.*tells 4"):
-        DIAYNReward(SkillDiscriminator(2, 4), 2)
     with pytest.raises(RuntimeError, match="replay buffer"):
         SkillTransform(2)(transitions())
     with pytest.raises(KeyError, match="after the SkillTransform"):
@@ -291,7 +294,7 @@ def test_bad_arguments_are_refused_with_their_value() -> None:
     without = transitions()
     del without["next", "reward"]
     with pytest.raises(KeyError, match="extrinsic_coeff"):
-        DIAYNReward(a_discriminator(), 2, extrinsic_coeff=1.0)(without)
+        discriminator_reward(a_discriminator(), extrinsic_coeff=1.0)(without)
 
 
 def test_stepping_without_a_skill_says_where_it_comes_from() -> None:
@@ -300,11 +303,9 @@ def test_stepping_without_a_skill_says_where_it_comes_from() -> None:
         env.step(env.reset().exclude("skill").set("action", torch.tensor(0)))
 
 
-def a_reward(kind: type, **kwargs: Any) -> SkillReward:
+def a_reward(**kwargs: Any) -> SkillReward:
     torch.manual_seed(0)
-    if kind is DIAYNReward:
-        return DIAYNReward(SkillDiscriminator(2, num_skills=4), num_skills=4, **kwargs)
-    return SkillReward(SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=4)), **kwargs)
+    return discriminator_reward(SkillDiscriminator(2, num_skills=4), **kwargs)
 
 
 def storages(folder: Path) -> dict[str, Storage]:
@@ -316,17 +317,14 @@ def storages(folder: Path) -> dict[str, Storage]:
     }
 
 
-@pytest.mark.parametrize("kind", [SkillReward, DIAYNReward])
 @pytest.mark.parametrize("name", ["tensor", "stack", "list", "memmap"])
-def test_looking_at_a_buffer_leaves_the_stored_reward_as_it_is(
-    kind: type, name: str, tmp_path: Path
-) -> None:
-    transform = a_reward(kind, extrinsic_coeff=1.0)
+def test_looking_at_a_buffer_leaves_the_stored_reward_as_it_is(name: str, tmp_path: Path) -> None:
+    transform = a_reward(extrinsic_coeff=1.0)
     buffer = ReplayBuffer(storage=storages(tmp_path)[name], transform=transform, batch_size=8)
     after = TensorDict(displacement=torch.ones(8, 2), reward=torch.full((8, 1), 10.0))
     data = TensorDict(skill=torch.zeros(8, dtype=torch.int64), next=after).auto_batch_size_(1)
     buffer.extend(data.clone())
-    right = 10 + a_reward(kind)(data.clone())["next", "reward"][0].item()
+    right = 10 + a_reward()(data.clone())["next", "reward"][0].item()
     looks = [buffer[:], buffer[0], buffer.sample(), buffer[:], buffer[0]]
     for look in looks:
         assert look["next", "reward"].flatten().tolist() == pytest.approx([right] * look.numel())

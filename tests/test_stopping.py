@@ -16,23 +16,14 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, TransformedEnv
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from small_trainers import make_a3c, make_diayn
 
-from torchrl_hmcts.envs import WaterworldMazeEnv
-from torchrl_hmcts.objectives import A3CLoss
-from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers import A3CTrainer
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.runs.folder import read_run
 from torchrl_hmcts.trainers.saving import resume, stopping
+from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.stopping import Stopped
-from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
-
-SIGNALS = [signal.SIGINT, signal.SIGTERM]
 
 
 def send(signum: int = signal.SIGINT) -> None:
@@ -40,46 +31,17 @@ def send(signum: int = signal.SIGINT) -> None:
     time.sleep(0.01)  # Python handles it here
 
 
-def make_diayn(folder: Path, total: int = 96) -> DIAYNTrainer:
-    torch.manual_seed(1)
-    base = WaterworldMazeEnv(batch_size=[8], observation=False, max_steps=10)
-    env = TransformedEnv(base, Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()))
-    loss = DIAYNTrainer.make_loss(env, 4, hidden=(8, 8), seed=0)
-    sizes = {"frames_per_batch": 16, "batch_size": 32, "buffer_size": 128}
-    return DIAYNTrainer(env, loss, total_frames=total, seed=5, save_dir=folder, **sizes)
-
-
-def make_a3c(folder: Path) -> A3CTrainer:
-    torch.manual_seed(1)
-    actor = ProbabilisticActor(
-        TensorDictModule(torch.nn.Embedding(4, 2), ["state"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=torch.distributions.Categorical,
-    )
-    loss = A3CLoss(actor, ValueOperator(torch.nn.Embedding(4, 1), in_keys=["state"]))
-    return A3CTrainer(
-        lambda: ChainEnv(length=4, batch_size=[8]),
-        loss,
-        total_frames=800,
-        segment_steps=5,
-        num_learners=0,
-        log_interval=40,
-        save_dir=folder,
-        save_interval=10**9,
-    )
-
-
 def steps(folder: Path) -> list[int]:
     return sorted(int(re.sub(r"\D", "", p.stem)) for p in folder.glob("checkpoint-*"))
 
 
-@pytest.mark.parametrize("signum", SIGNALS)
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_training_stops_after_its_batch_and_continues_as_if_it_had_not(
-    tmp_path: Path, signum: int
+    tmp_path, signum: int
 ) -> None:
-    whole = make_diayn(tmp_path / "whole")
+    whole = make_diayn(tmp_path / "whole", 96)
     whole.train()
-    stopped = make_diayn(tmp_path / "stopped")
+    stopped = make_diayn(tmp_path / "stopped", 96)
 
     def stop(batch: Any) -> None:
         if stopped.collected_frames == 48:
@@ -91,7 +53,7 @@ def test_a_training_stops_after_its_batch_and_continues_as_if_it_had_not(
         stopped.train()
     assert error.value.status == 128 + signum
     assert steps(tmp_path / "stopped") == [48]
-    again = make_diayn(tmp_path / "stopped").load(tmp_path / "stopped")
+    again = make_diayn(tmp_path / "stopped", 96).load(tmp_path / "stopped")
     again.train()
     assert again.history == whole.history
     for name, value in whole.loss_module.state_dict().items():
@@ -101,10 +63,8 @@ def test_a_training_stops_after_its_batch_and_continues_as_if_it_had_not(
 
 @pytest.mark.parametrize("make", [make_diayn, make_a3c])
 def test_a_second_signal_does_not_break_the_writing_of_a_checkpoint(
-    tmp_path: Path, make: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch, capfd: Any
+    tmp_path, make: Callable[[Path], Any], monkeypatch, capfd: Any
 ) -> None:
-    from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation
-
     save = DurableRotation.save
 
     def slowly(*args: Any, **kwargs: Any) -> Path:
@@ -125,8 +85,8 @@ def test_a_second_signal_does_not_break_the_writing_of_a_checkpoint(
     assert capfd.readouterr().err.count("saving, one moment") == 1
 
 
-def test_a_signal_in_the_middle_of_a_log_leaves_curves_of_one_length(tmp_path: Path) -> None:
-    trainer = make_a3c(tmp_path)
+def test_a_signal_in_the_middle_of_a_log_leaves_curves_of_one_length(tmp_path) -> None:
+    trainer = make_a3c(tmp_path, log_interval=40)
     log = trainer.log.log
 
     def interrupted(lr: float) -> dict[str, float]:
@@ -136,12 +96,12 @@ def test_a_signal_in_the_middle_of_a_log_leaves_curves_of_one_length(tmp_path: P
     trainer.log.log = interrupted  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
         trainer.train()
-    history = make_a3c(tmp_path).load(tmp_path).history
+    history = make_a3c(tmp_path, log_interval=40).load(tmp_path).history
     assert {len(values) for values in history.values()} == {1}
 
 
 def test_a_patient_training_is_stopped_at_once_by_a_second_ctrl_c_a_while_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path, monkeypatch
 ) -> None:
     monkeypatch.setattr(stopping, "_IMPATIENT_SECONDS", 0.0)
     trainer = make_diayn(tmp_path)
@@ -158,9 +118,7 @@ def test_a_patient_training_is_stopped_at_once_by_a_second_ctrl_c_a_while_later(
     assert not done
 
 
-def test_the_first_checkpoint_comes_early_and_the_next_ones_by_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_checkpoint_comes_early_and_the_next_ones_by_time(tmp_path, monkeypatch) -> None:
     now = [100.0]
     monkeypatch.setattr(resume.time, "monotonic", lambda: now[0])
     trainer = make_diayn(tmp_path, 160)
@@ -176,7 +134,7 @@ def test_the_first_checkpoint_comes_early_and_the_next_ones_by_time(
     assert seen == [[], [], [32], [32], [32], [32, 80], [32, 80], [80, 112], [80, 112], [112, 144]]
 
 
-def test_two_trainers_with_one_folder_of_checkpoints_are_refused(tmp_path: Path) -> None:
+def test_two_trainers_with_one_folder_of_checkpoints_are_refused(tmp_path) -> None:
     for make in (make_diayn, make_a3c):
         with folder_locked(tmp_path), pytest.raises(FolderInUse):
             make(tmp_path).train()
@@ -210,7 +168,7 @@ def test_handlers_of_the_program_stay_and_an_ignored_signal_stays_ignored() -> N
 
 @pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_run_is_recorded_and_says_how_to_continue(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, signum: int, status: int
+    tmp_path, monkeypatch, capsys, signum: int, status: int
 ) -> None:
     monkeypatch.setattr(
         "torchrl_hmcts.trainers.experiments.demo.run_demo", lambda config: send(signum)
@@ -220,9 +178,7 @@ def test_a_stopped_run_is_recorded_and_says_how_to_continue(
     assert f"Continue with: hmcts train resume={tmp_path}/run" in capsys.readouterr().err
 
 
-def test_a_process_that_the_same_signal_ended_makes_no_failed_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_that_the_same_signal_ended_makes_no_failed_run(tmp_path, monkeypatch) -> None:
     def killed(config: Any) -> None:
         with stopping.patient():
             send()
@@ -255,6 +211,7 @@ def hmcts(*words: str, until: str = "", signum: int = 0, folder: Path | None = N
         return process.stderr.read()
 
 
+LABMAZE = "train experiment=labmaze robust_mazes=2"
 WITHOUT_TIMES = re.compile(r"second|versions|checkpoint")
 
 
@@ -272,33 +229,20 @@ def figures(folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("words", "until", "signum"),
     [
-        (["demo", "train_base_steps=19968", "mazes=20"], "checkpoints/c*", signal.SIGINT),
-        (["demo", "train_base_steps=19968", "mazes=20"], "run.json", signal.SIGTERM),
-        (
-            ["train", "experiment=labmaze", "train_frames=20000", "mazes=20", "robust_mazes=2"],
-            "checkpoints/c*",
-            signal.SIGINT,
-        ),
-        (
-            ["train", "experiment=labmaze", "train_frames=8000", "mazes=20", "robust_mazes=2"],
-            "run.json",
-            signal.SIGTERM,
-        ),
-        (
-            ["train", "experiment=labmaze", "algorithm=hmcts", "train_frames=20000", "mazes=5",
-             "robust_mazes=2"],
-            "checkpoints/c*",
-            signal.SIGINT,
-        ),
+        ("demo train_base_steps=19968 mazes=20", "checkpoints/c*", signal.SIGINT),
+        ("demo train_base_steps=19968 mazes=20", "run.json", signal.SIGTERM),
+        (f"{LABMAZE} train_frames=20000 mazes=20", "checkpoints/c*", signal.SIGINT),
+        (f"{LABMAZE} train_frames=8000 mazes=20", "run.json", signal.SIGTERM),
+        (f"{LABMAZE} algorithm=hmcts train_frames=20000 mazes=5", "checkpoints/c*", signal.SIGINT),
     ],
-)  # fmt: skip
+)
 def test_the_printed_command_continues_to_the_figures_of_a_run_that_was_not_stopped(
-    tmp_path: Path, words: list[str], until: str, signum: int
+    tmp_path, words: str, until: str, signum: int
 ) -> None:
     stopped, whole = tmp_path / "my run", tmp_path / "whole"
-    said = hmcts(*words, f"out={stopped}", until=until, signum=signum, folder=stopped)
+    said = hmcts(*words.split(), f"out={stopped}", until=until, signum=signum, folder=stopped)
     (command,) = re.findall("Continue with: (hmcts .*)", said)
     assert hmcts(*shlex.split(command)[1:]).count("Traceback") == 0
-    hmcts(*words, f"out={whole}")
+    hmcts(*words.split(), f"out={whole}")
     assert figures(stopped) == figures(whole)
     assert read_run(stopped).status == "finished"

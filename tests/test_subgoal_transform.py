@@ -509,12 +509,15 @@ def test_a_search_without_a_plan_says_from_where() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"goal_met_threshold": 0.0}, "got 0.0 and 2.0"),
-        ({"goal_met_threshold": 2.0}, "got 2.0 and 2.0"),
-        ({"goal_divergence_threshold": math.nan}, "got 0.5 and nan"),
-        ({"r_tick": math.inf}, "finite r_tick; got inf"),
-        ({"r_goal_met": math.nan}, "finite r_goal_met; got nan"),
-        ({"r_goal_divergence": 1.0}, "Pass -1.0"),
+        ({"goal_met_threshold": 0.0}, "goal_met_threshold > 0.0.*; got 0.0"),
+        (
+            {"goal_met_threshold": 2.0},
+            "goal_divergence_threshold > goal_met_threshold > 2.0; got 2.0",
+        ),
+        ({"goal_divergence_threshold": math.nan}, "> 0.5; got nan"),
+        ({"r_tick": math.inf}, "r_tick finite; got inf"),
+        ({"r_goal_met": math.nan}, "r_goal_met finite; got nan"),
+        ({"r_goal_divergence": 1.0}, "r_goal_divergence <= 0.0; got 1.0"),
         ({"num_goals": 0}, "num_goals >= 1; got 0"),
         ({"max_goals": 0}, "max_goals >= 1; got 0"),
     ],

@@ -18,7 +18,6 @@ from torchrl_hmcts.planners import (
     PUCT,
     DirichletNoise,
     Gumbel,
-    MaxBackup,
     MCTSPlanner,
     ProgressiveWidening,
     RadiusNovelty,
@@ -26,7 +25,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
     Transpositions,
 )
-from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PRUNED, REWARDED, TERMINAL
+from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PRUNED, TERMINAL
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
 # A binary tree of depth 3: the children of s are 2 s + 1 and 2 s + 2 after 1 and 2 base steps, the
@@ -95,7 +94,7 @@ def walk(search: Search, b: int, n: int = 0) -> Node:
         edge_values=edges["value"].tolist(),
         closed=edges["closed"].tolist(),
         children=[
-            [walk(search, b, child) for child in search.outcomes_of(b, option, n)]
+            [walk(search, b, child) for child in search.tree.outcomes(b, option, n)]
             for option in range(len(edges))
         ],
     )
@@ -134,30 +133,13 @@ def returns_in_tree(search: Search, b: int, n: int = 0) -> list[float]:
     children = [
         value
         for option in range(search.num_options)
-        for child in search.outcomes_of(b, option, n)
+        for child in search.tree.outcomes(b, option, n)
         for value in returns_in_tree(search, b, child)
     ]
     return [float(search.tree.nodes["path_return"][b, n]), *children]
 
 
 # ---------------------------------------------------------------------- what is kept
-
-
-@pytest.mark.parametrize("expand", ["all", "one"])
-@pytest.mark.parametrize("backup", [None, MaxBackup()])
-def test_a_kept_subtree_is_what_it_was_below_its_new_root(expand: Any, backup: Any) -> None:
-    env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    budget = SearchBudget(simulations=11, until_plan=False)
-    planner = MCTSPlanner(env, gamma=0.9, expand=expand, backup=backup, budget=budget, seed=0)
-    search = planner.search(at(env, [0]))
-    (child,) = search.outcomes_of(0, 1)
-    before = walk(search, 0, child)
-    assert count(before) > 1
-    assert planner.advance(search, torch.tensor([1]), at(env, [2])).tolist() == [True]
-    # Option 1 took 2 base steps.
-    assert walk(search, 0) == rebased(before, depth=1, base_steps=2)
-    assert search.tree.num_nodes.tolist() == [count(before)]
-    np.testing.assert_allclose(returns_in_tree(search, 0), path_returns(before), rtol=1e-6)
 
 
 def test_the_best_plan_is_that_of_the_kept_subtree() -> None:
@@ -182,7 +164,7 @@ def test_the_best_plan_is_that_of_the_kept_subtree() -> None:
 def test_a_search_goes_on_below_the_kept_root_and_comes_to_the_values_of_a_new_one() -> None:
     env = CountingEnv(BINARY_TREE, terminal=LEAVES)
     budget = SearchBudget(expansions=2, until_plan=False)
-    planner = MCTSPlanner(env, gamma=0.9, backup=MaxBackup(), budget=budget, seed=0)
+    planner = MCTSPlanner(env, gamma=0.9, backup="max", budget=budget, seed=0)
     search = planner.search(at(env, [0]))  # expands 0 and one of its children
     expanded = int(search.tree.nodes["parent"][0, 3])
     option = int(search.tree.nodes["option"][0, expanded])
@@ -197,17 +179,6 @@ def test_a_search_goes_on_below_the_kept_root_and_comes_to_the_values_of_a_new_o
     new = planner.search(at(env, [child_state]))
     planner.resume(new)
     assert search.tree.nodes["value"][0, 0] == new.tree.nodes["value"][0, 0]
-
-
-def test_a_plan_that_is_kept_needs_no_further_search() -> None:
-    env = ChainEnv(6)
-    planner = MCTSPlanner(env)
-    search = planner.search(at(env, [0]))
-    planner.advance(search, torch.tensor([1]), at(env, [1]))
-    planner.resume(search)
-    assert search.num_simulations.tolist() == [0]
-    assert search.expansions_to_plan.tolist() == [0]
-    assert search.tree.options(0, int(search.best_node[0])) == [1] * 4
 
 
 # ---------------------------------------------------------------------- what is not
@@ -238,7 +209,7 @@ def test_each_root_of_a_batch_keeps_its_tree_or_gets_a_new_one() -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
     planner = MCTSPlanner(env, gamma=0.9, budget=FOREVER)
     search = planner.search(at(env, [[0, 0], [0, 0]]))
-    before = walk(search, 3, search.outcomes_of(3, 0)[0])
+    before = walk(search, 3, search.tree.outcomes(3, 0)[0])
     options = torch.tensor([[1, -1], [1, 0]])
     kept = planner.advance(search, options, at(env, [[2, 2], [1, 1]]))
     assert kept.tolist() == [[True, False], [False, True]]
@@ -270,8 +241,8 @@ def test_several_options_are_followed_at_once() -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
     planner = MCTSPlanner(env, gamma=0.9, budget=FOREVER)
     search = planner.search(at(env, [0, 0, 0]))
-    (child,) = search.outcomes_of(0, 1)
-    (grandchild,) = search.outcomes_of(0, 0, child)
+    (child,) = search.tree.outcomes(0, 1)
+    (grandchild,) = search.tree.outcomes(0, 0, child)
     before = walk(search, 0, grandchild)
     options = torch.tensor([[1, 0], [1, -1], [1, 0]])
     kept = planner.advance(search, options, at(env, [5, 2, 6]))
@@ -349,7 +320,7 @@ def test_a_root_is_never_refused() -> None:
     novelty = RadiusNovelty("state", radius=1.5, max_relaxations=0)
     planner = MCTSPlanner(env, novelty=novelty, budget=FOREVER)
     search = planner.search(at(env, [3]))
-    (right,) = search.outcomes_of(0, 1)
+    (right,) = search.tree.outcomes(0, 1)
     assert search.tree.nodes["flags"][0, right] & PRUNED  # 4 lies within 1.5 of 3
     assert search.exhausted(np.array([0])).all()
     assert planner.advance(search, torch.tensor([1]), at(env, [4])).tolist() == [True]
@@ -364,7 +335,7 @@ def test_a_state_whose_twin_is_searched_elsewhere_keeps_the_twins_subtree() -> N
     table |= {(3, 0): (4, 0.0, 1), (4, 0): (5, 1.0, 1)}
     env = TableEnv(table, terminal=[5])
     planner = MCTSPlanner(
-        env, gamma=0.5, transpositions=Transpositions("state"), backup=MaxBackup(), budget=FOREVER
+        env, gamma=0.5, transpositions=Transpositions("state"), backup="max", budget=FOREVER
     )
     for first in (0, 1):
         search = planner.search(at(env, [0]))
@@ -380,7 +351,7 @@ def test_a_subtree_that_leant_on_a_twin_outside_is_opened_again() -> None:
     table |= {(3, 0): (4, 0.0, 1), (4, 0): (5, 1.0, 1)}
     env = TableEnv(table, terminal=[5])
     planner = MCTSPlanner(
-        env, gamma=0.5, transpositions=Transpositions("state"), backup=MaxBackup(), budget=FOREVER
+        env, gamma=0.5, transpositions=Transpositions("state"), backup="max", budget=FOREVER
     )
     search = planner.search(at(env, [0]))
     leaning = int(np.flatnonzero(search.tree.nodes["twin"][0, : search.tree.num_nodes[0]] >= 0)[0])
@@ -413,7 +384,7 @@ def test_the_outcome_that_came_about_is_kept_out_of_several() -> None:
     )
     for state in (1, 3):
         search = planner.search(at(env, [2]))
-        outcomes = search.outcomes_of(0, 1)
+        outcomes = search.tree.outcomes(0, 1)
         assert len(outcomes) == 2
         assert search.tree.states is not None
         (node,) = (n for n in outcomes if search.tree.states["state"][0, n] == state)
@@ -540,7 +511,7 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
         expand=str(rng.choice(["all", "one"])),
         exhausted=exhausted,
         novelty=novelty,
-        backup=MaxBackup() if rng.random() < 0.5 else None,
+        backup="max" if rng.random() < 0.5 else "mean",
         leaves_per_wave=int(rng.integers(1, 4)),
         budget=SearchBudget(simulations=int(rng.integers(4, 40)), until_plan=False),
         seed=int(seed),
@@ -553,11 +524,11 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
         td = env.step(td.set("action", options))["next"]
         known = [
             any(int(search.tree.states["state"][b, n]) == int(td["state"][b])
-                for n in search.outcomes_of(b, int(options[b])))
+                for n in search.tree.outcomes(b, int(options[b])))
             for b in range(2)
         ]  # fmt: skip
         subtrees = [
-            walk(search, b, search.outcomes_of(b, int(options[b]))[0]) if known[b] else None
+            walk(search, b, search.tree.outcomes(b, int(options[b]))[0]) if known[b] else None
             for b in range(2)
         ]
         kept = planner.advance(search, options, td)
@@ -575,30 +546,3 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
 
 
 # ---------------------------------------------------------------------- what is behind the nodes
-
-
-def test_what_was_dropped_is_not_counted() -> None:
-    env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    planner = MCTSPlanner(env, budget=FOREVER)
-    search = planner.search(env.reset())
-    counts = search.statistics()
-    assert (counts["nodes"], counts["rewarded"]) == (15, 4)  # leaves 11 to 14 pay 1 to 4
-    # Below state 1 are 3 and 4, and their leaves 7 to 10, which pay -3 to 0.
-    assert planner.advance(search, torch.tensor([0]).reshape(()), at(env, 1)).item()
-    assert search.tree.num_nodes.tolist() == [7]
-    search.tree.nodes["flags"][0, 7:] |= REWARDED
-    counts = search.statistics()
-    assert (counts["nodes"], counts["rewarded"]) == (7, 0)
-
-
-def test_options_that_come_by_the_root_again_are_followed_through_it() -> None:
-    # 0 -> 1 -> 0 -> 1 by option 0: the second node of state 0 is the twin of the root.
-    table = {(0, 0): (1, 0.0, 1), (0, 1): (2, 0.0, 1), (1, 0): (0, 0.0, 1), (1, 1): (2, 1.0, 1)}
-    env = TableEnv(table, terminal=[2])
-    planner = MCTSPlanner(env, transpositions=Transpositions("state"), budget=FOREVER)
-    search = planner.search(env.reset())
-    below = int(search.tree.edges["child"][0, 0, 0])
-    again = int(search.tree.edges["child"][0, below, 0])
-    assert search.tree.nodes["twin"][0, again] == 0
-    assert planner.advance(search, torch.tensor([0, 0, 0]), at(env, 1)).item()
-    assert search.tree.nodes["visits"][0, 0] > 1  # it is the tree that was searched, not a new one

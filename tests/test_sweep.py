@@ -14,9 +14,9 @@ from sqlalchemy.pool import NullPool
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, Experiment
 from torchrl_hmcts.trainers.runs.config import DemoConfig, RunConfig
-from torchrl_hmcts.trainers.runs.folder import start_record
 from torchrl_hmcts.trainers.runs.sweep_space import Choice, Range, parse_space
 from torchrl_hmcts.trainers.saving.locking import folder_locked
+from torchrl_hmcts.trainers.saving.run_folder import start_record
 
 optuna = pytest.importorskip("optuna")
 

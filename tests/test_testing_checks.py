@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -49,11 +48,38 @@ from torchrl_hmcts.testing import (
 # ----------------------------------------------------------------------------------- envs
 
 
-class RandomWithoutSeed(ChainEnv):
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super()._step(tensordict)
-        noise = np.random.default_rng().random()
-        return out.set("reward", out["reward"] + noise)
+def broken(base: type, **methods: Callable[..., Any]) -> Callable[[str], type]:
+    """Return a function of a name that makes a subclass whose methods end otherwise.
+
+    What a method returns is given to the function of its name, after what it was called with.
+    """
+
+    def other(name: str, change: Callable[..., Any]) -> Callable[..., Any]:
+        def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+            return change(getattr(base, name)(self, *args, **kwargs), self, *args)
+
+        return method
+
+    changed = {name: other(name, change) for name, change in methods.items()}
+    return lambda name: type(name, (base,), changed)
+
+
+def adds_to_reward(number: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda out, env, td: out.set("reward", out["reward"] + number(env, td))
+
+
+def count(env: Any, td: TensorDictBase) -> int:
+    env.steps = getattr(env, "steps", 0) + 1
+    return env.steps
+
+
+def overwrite(out: TensorDictBase, env: Any, td: TensorDictBase) -> TensorDictBase:
+    td["state"].copy_(out["state"])
+    return out
+
+
+def unseeded(env: Any, td: TensorDictBase) -> float:
+    return np.random.default_rng().random()
 
 
 class IgnoresStep(ChainEnv):
@@ -67,31 +93,11 @@ class ForgetsItsState(ChainEnv):
         return super()._reset(tensordict)
 
 
-class HiddenClock(ChainEnv):
+class HiddenClock(broken(ChainEnv, _step=adds_to_reward(count))("Counts")):  # type: ignore[misc]
     """Its reward depends on a counter that is in no spec."""
-
-    steps = 0
 
     def _set_seed(self, seed: int | None) -> None:
         self.steps = 0
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.steps += 1
-        out = super()._step(tensordict)
-        return out.set("reward", out["reward"] + self.steps)
-
-
-class WritesIntoItsInput(ChainEnv):
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super()._step(tensordict)
-        tensordict["state"].copy_(out["state"])
-        return out
-
-
-class LooksAtItsNeighbours(ChainEnv):
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super()._step(tensordict)
-        return out.set("reward", out["reward"] + float(tensordict["state"].numel()))
 
 
 class MixesTickets(ChainEnv):
@@ -108,17 +114,18 @@ class MixesTickets(ChainEnv):
         pass
 
 
-class WrongDtype(ChainEnv):
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super()._step(tensordict)
-        return out.set("reward", out["reward"].double())
+as_double = broken(ChainEnv, _step=lambda out, *_: out.set("reward", out["reward"].double()))
+of_the_batch = adds_to_reward(lambda env, td: float(td["state"].numel()))
 
 
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        (WrongDtype(), "WrongDtype fails TorchRL's check_env_specs"),
-        (RandomWithoutSeed(), r"RandomWithoutSeed: two rollouts with seed 0 differ in .*reward"),
+        (as_double("WrongDtype")(), "WrongDtype fails TorchRL's check_env_specs"),
+        (
+            broken(ChainEnv, _step=adds_to_reward(unseeded))("Unseeded")(),
+            r"Unseeded: two rollouts with seed 0 differ in .*reward",
+        ),
         (IgnoresStep(batch_size=[4]), "IgnoresStep: 'state' changed where \"_step\" is False"),
     ],
 )
@@ -132,14 +139,14 @@ def test_an_env_that_is_broken_is_refused(env: ChainEnv, message: str) -> None:
     [
         (ForgetsItsState(), "set to a state it shows another 'state'"),
         (HiddenClock(), "HiddenClock: .*'reward'"),
-        (LooksAtItsNeighbours(), "set to a state and stepped it gives 'reward'"),
-        (WritesIntoItsInput(), "WritesIntoItsInput.*'state'"),
+        (
+            broken(ChainEnv, _step=of_the_batch)("LooksAtItsNeighbours")(),
+            "set to a state and stepped it gives 'reward'",
+        ),
+        (broken(ChainEnv, _step=overwrite)("Overwrites")(), "Overwrites.*'state'"),
         (MixesTickets(), r"MixesTickets: step 0 of \d+ under way gave .*Keep apart"),
         (PointMassEnv(continuous=True), "PointMassEnv fails as the simulator .* discrete action"),
-        (
-            TableEnv({(0, 0): (1, 0.0, 0), (1, 0): (0, 0.0, 1)}),
-            "a step took 0 base steps",
-        ),
+        (TableEnv({(0, 0): (1, 0.0, 0), (1, 0): (0, 0.0, 1)}), "a step took 0 base steps"),
     ],
 )
 def test_an_env_that_cannot_be_planned_in_is_refused(env: Any, message: str) -> None:
@@ -232,60 +239,47 @@ def transitions() -> TensorDict:
     return TensorDict(skill=torch.arange(4) % 3, next=after, batch_size=[4])
 
 
-class Good(SkillDiscriminatorLoss):
-    pass
+Good = SkillDiscriminatorLoss
 
 
-class Undetached(Good):
-    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        out = super().losses(tensordict)
-        return {**out, "discriminator_accuracy": out["loss_discriminator"] * 1.0}
+def reduce_again(loss: Tensor, self: Any, *_: Any) -> Tensor:
+    return loss / (2.0 if self.reduction == "mean" else 1.0)
 
 
-class ReducesTwice(Good):
-    def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        return super()._reduce(loss, tensordict) / (2.0 if self.reduction == "mean" else 1.0)
+def spoil(out: dict[str, Tensor], self: Any, td: TensorDictBase) -> dict[str, Tensor]:
+    td["skill"].zero_()
+    return out
 
 
-class ForgetsKeys(Good):
-    def skill_logits(self, tensordict: TensorDictBase) -> Tensor:
-        tensordict.get("skill").sum()  # by a name of its own
-        return super().skill_logits(tensordict)
+def make_late(out: dict[str, Tensor], self: Any, td: TensorDictBase) -> dict[str, Tensor]:
+    self.register_buffer("late", torch.zeros(()))
+    return out
 
 
-class Lazy(Good):
-    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        self.register_buffer("late", torch.zeros(()))
-        return super().losses(tensordict)
+def read_by_its_name(logits: Tensor, self: Any, td: TensorDictBase) -> Tensor:
+    return logits + 0 * td.get("skill").sum()
 
 
-class Detached(Good):
-    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        return {key: value.detach() for key, value in super().losses(tensordict).items()}
+def undetached(out: dict[str, Tensor], *_: Any) -> dict[str, Tensor]:
+    return {**out, "discriminator_accuracy": out["loss_discriminator"] * 1.0}
 
 
-class Spoils(Good):
-    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        out = super().losses(tensordict)
-        tensordict["skill"].zero_()
-        return out
+Undetached = broken(Good, losses=undetached)("Undetached")
+ReducesTwice = broken(Good, _reduce=reduce_again)("ReducesTwice")
+ForgetsKeys = broken(Good, skill_logits=read_by_its_name)("ForgetsKeys")
+Lazy = broken(Good, losses=make_late)("Lazy")
+Detached = broken(Good, losses=lambda out, *_: {k: v.detach() for k, v in out.items()})("Detached")
+Spoils = broken(Good, losses=spoil)("Spoils")
+AsksItsNeighbours = broken(Good, reward=lambda r, *_: r - r.mean())("AsksItsNeighbours")
+WithGradient = broken(Good, reward=lambda r, self, td: self.skill_logits(td)[..., :1])(
+    "WithGradient"
+)
 
 
 class Asks(Good):
     @property
     def next_features(self) -> list:  # type: ignore[override]
         return [*super().next_features, "velocity"]
-
-
-class AsksItsNeighbours(Good):
-    def reward(self, tensordict: TensorDictBase) -> Tensor:
-        reward = super().reward(tensordict)
-        return reward - reward.mean()
-
-
-class WithGradient(Good):
-    def reward(self, tensordict: TensorDictBase) -> Tensor:
-        return self.skill_logits(tensordict)[..., :1]
 
 
 def factory(cls: type) -> Callable[..., SkillDiscriminatorLoss]:
@@ -306,7 +300,7 @@ def factory(cls: type) -> Callable[..., SkillDiscriminatorLoss]:
         (Asks, "dispatch", r"announces the in_key \('next', 'velocity'\)"),
         (ForgetsKeys, "nested_keys", "ForgetsKeys fails with renamed keys"),
         (Lazy, "state_dict", "its first use changed the state dict by .*late"),
-        (Good, "target_networks", "SkillDiscriminatorLoss|Good has no target_actor_params"),
+        (Good, "target_networks", "SkillDiscriminatorLoss has no target_actor_params"),
     ],
 )
 def test_a_loss_that_is_broken_is_refused(cls: type, check: str, message: str) -> None:
@@ -411,7 +405,10 @@ def test_a_worker_that_is_broken_is_refused(worker: Any, message: str) -> None:
     ("termination", "message"),
     [
         (lambda td: td["duration"], r"must give bool \[3\].*torch.int64"),
-        (lambda td: (td["duration"] > 2).any().expand(td.batch_size), "element 0 among others"),
+        (
+            lambda td: (td["duration"] > 2).any().expand(td.batch_size),
+            "element 0 False alone and True among others",
+        ),
         (lambda td: td.set("end", td["duration"] > 2)["end"], "changed its input"),
         (lambda td: td["durations"] > 2, "fails asked about a batch"),
     ],
@@ -468,11 +465,6 @@ class Novelty(RadiusNovelty):
         super().__init__("x", 0.1)
 
 
-class AcceptsAll(Novelty):
-    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
-        return np.ones(len(roots), np.bool_)
-
-
 class OneMemory(Novelty):
     def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
         return super().accept(np.zeros_like(roots), features, base_steps)
@@ -483,15 +475,9 @@ class NeverForgets(Novelty):
         pass
 
 
-class RelaxesForEver(Novelty):
-    def relax(self, root: int) -> bool:
-        return True
-
-
-class MixesFeatures(Novelty):
-    def features(self, tensordict: TensorDictBase) -> np.ndarray:
-        x = super().features(tensordict)
-        return x - x.mean(0)
+AcceptsAll = broken(Novelty, accept=lambda out, *_: np.ones_like(out))("AcceptsAll")
+RelaxesForEver = broken(Novelty, relax=lambda *_: True)("RelaxesForEver")
+MixesFeatures = broken(Novelty, features=lambda x, *_: x - x.mean(0))("MixesFeatures")
 
 
 class SharesItsMemory(Novelty):
@@ -530,7 +516,7 @@ def test_novelty_tests_that_work_pass() -> None:
         (OneMemory, "what root 0 has seen counts for root 1"),
         (NeverForgets, r"restart\(0\) does not forget"),
         (RelaxesForEver, "was True 10000 times"),
-        (MixesFeatures, "features of state 0 are others alone"),
+        (MixesFeatures, "features gives state 0 .* alone"),
         (SharesItsMemory, "a copy that was started shares what it knows"),
     ],
 )
@@ -549,11 +535,11 @@ def test_what_lacks_the_members_of_a_novelty_test_is_refused() -> None:
 @pytest.mark.parametrize(
     ("evaluator", "message"),
     [
-        (lambda td: td["x"].expand(-1, 2), r"gives values \[3, 2\]"),
+        (lambda td: td["x"].expand(-1, 2), r"gives \[3, 2\] for 3 states, as value"),
         (lambda td: td["x"].log(), "which is not finite"),
-        (lambda td: td["x"] - td["x"].mean(), "gives state 0 the value"),
+        (lambda td: td["x"] - td["x"].mean(), "gives the value of state 0"),
         (lambda td: td["x"].zero_(), "changed 'x' of the states"),
-        (lambda td: 0.0, "gives float; it must give a tensor"),
+        (lambda td: 0.0, "gives float for 3 states"),
     ],
 )
 def test_an_evaluator_that_is_broken_is_refused(evaluator: Callable, message: str) -> None:
@@ -565,7 +551,7 @@ def test_an_evaluator_that_is_broken_is_refused(evaluator: Callable, message: st
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        (lambda td: td["x"], r"gives \[3, 1\] for 3 states of 2 options"),
+        (lambda td: td["x"], r"gives \[3, 1\] for 3 states, as prior"),
         (lambda td: torch.cat([td["x"], -td["x"]], -1), "probabilities are not negative"),
         (lambda td: torch.cat([td["x"], td["x"]], -1), "not all 0"),
     ],
@@ -575,44 +561,27 @@ def test_an_option_prior_that_is_broken_is_refused(prior: Callable, message: str
         check_option_prior(prior, STATES.clone(), 2)
 
 
-class NoOption(MCTSPlanner):
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return super().forward(tensordict).exclude("action")
-
-
-class WrongOption(MCTSPlanner):
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super().forward(tensordict)
-        return out.set("action", out["action"] + 9)
-
-
-class MovesTheState(MCTSPlanner):
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super().forward(tensordict)
-        return out.set("state", out["state"] + 1)
+def moved(key: str, by: int) -> Callable[..., TensorDictBase]:
+    return lambda out, *_: out.set(key, out[key] + by)
 
 
 @pytest.mark.parametrize(
-    ("cls", "message"),
+    ("change", "message"),
     [
-        (NoOption, "NoOption wrote no 'action'"),
-        (WrongOption, "WrongOption wrote 'action' .* does not fit"),
-        (MovesTheState, "MovesTheState changed 'state'"),
+        (lambda out, *_: out.exclude("action"), "Planner wrote no 'action'"),
+        (moved("action", 9), "Planner wrote 'action' .* does not fit"),
+        (moved("state", 1), "Planner changed 'state'"),
     ],
 )
-def test_a_planner_that_is_broken_is_refused(cls: type, message: str) -> None:
+def test_a_planner_that_is_broken_is_refused(change: Callable, message: str) -> None:
     env = ChainEnv(length=4)
     with pytest.raises(ContractError, match=message):
-        check_planner(cls(env), env)
+        check_planner(broken(MCTSPlanner, forward=change)("Planner")(env), env)
 
 
 def test_a_check_leaves_torchs_generator_as_it_was() -> None:
+    data = transitions()
     before = torch.get_rng_state()
     check_env(ChainEnv(length=4))
-    check_loss(factory(Good), transitions_of_one_kind(), checks=["out_keys"])
+    check_loss(factory(Good), data, checks=["out_keys"])
     assert torch.equal(before, torch.get_rng_state())
-
-
-def transitions_of_one_kind() -> TensorDict:
-    after = TensorDict(displacement=torch.ones(4, 2), batch_size=[4])
-    return copy.deepcopy(TensorDict(skill=torch.arange(4) % 3, next=after, batch_size=[4]))

@@ -20,7 +20,7 @@ from torchrl.envs import Compose, GymEnv, TransformedEnv
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.saving.resume import GeneratorStates, RunningEpisodes
+from torchrl_hmcts.trainers.saving.run_state import GeneratorStates, RunningEpisodes
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 HALF = 16 * 7  # base steps: 14 of each copy, so that episodes of 10 end on the way

@@ -11,7 +11,7 @@ from torchrl.data import Categorical
 
 from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillDiscriminator, SkillPolicy
 from torchrl_hmcts.objectives import SkillDiscriminatorLoss
-from torchrl_hmcts.transforms import DIAYNReward, SkillReward
+from torchrl_hmcts.transforms import SkillReward
 
 
 def transitions(skill: torch.Tensor | None) -> TensorDict:
@@ -36,7 +36,6 @@ READERS: dict[str, Callable[[], Callable[[TensorDictBase], object]]] = {
     "SkillDiscriminatorLoss as reward": lambda: SkillReward(
         SkillDiscriminatorLoss(discriminator())
     ),
-    "DIAYNReward": lambda: DIAYNReward(discriminator(), 4),
 }
 
 

@@ -73,11 +73,7 @@ def name_arguments(cls: T) -> T:
         except Exception as error:
             if type(self).__init__ is not checked:  # a subclass passes its own values: it explains
                 raise
-            from torchrl_hmcts.processes import no_room_for_locks
-
-            better = no_room_for_locks(cls.__name__, error) or _explain(
-                cls.__name__, init, (self, *args), kwargs, error
-            )
+            better = _explain(cls.__name__, init, (self, *args), kwargs, error)
             if better is None:
                 raise
             raise better from error

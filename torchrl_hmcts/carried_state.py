@@ -8,13 +8,12 @@ simulated steps into the env that is acted in.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase, unravel_key
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import (
@@ -33,21 +32,9 @@ from torchrl.envs import (
 from torchrl.envs.transforms import RNDTransform
 from torchrl.record import TensorDictRecorder, VideoRecorder
 
-from torchrl_hmcts.nesting import env_name, envs_below, flat_transforms
+from torchrl_hmcts.nesting import env_name, envs_below, flat_transforms, given, parts
 
-_FREEZE = "learns its statistics from every step. Freeze it first: its freeze()"
-_PER_ELEMENT = (
-    "has statistics for each element of the batch, and a wave has other states. Make it with "
-    "reduce_batch_dims=True"
-)
-_EVAL = "learns its statistics from every step. Stop that first: its eval()"
-_MAX_POOL = (
-    "keeps the last observations. Stack them by CatFrames, which a planner can set, and take the "
-    "maximum over the stack in a transform behind it"
-)
-_HORIZON = "draws a horizon for each episode and keeps it. Use StepCounter(max_steps=...)"
 _RECORDERS = (VideoRecorder, TensorDictRecorder)
-_NOOPS = "steps the env after a reset, away from the state that it was set to. Leave it out"
 
 
 class CarriedFrames(CatFrames):
@@ -64,10 +51,9 @@ class CarriedFrames(CatFrames):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        begins = any(_last(key) == "_reset" for key in tensordict.keys(True, True))
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            stack = tensordict.get(out_key, None)
-            if stack is None or begins:
+            stack = given(tensordict, out_key)
+            if stack is None:
                 frame = tensordict_reset.get(in_key)
                 older = [frame] * (self.N - 1)
                 if self.padding == "constant":
@@ -84,13 +70,12 @@ class CarriedFrames(CatFrames):
 
 
 class CarriedInit(InitTracker):
-    """InitTracker of as many states as there are, whatever the batch of the env."""
+    """InitTracker of any number of states, which need not be the batch of the env."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         for init_key in self.init_keys:
             if next_tensordict.get(init_key, None) is None:
-                path = () if isinstance(init_key, str) else init_key[:-1]
-                done = next_tensordict.get(unravel_key((*path, "done")))
+                done = next_tensordict.get((*parts(init_key)[:-1], "done"))
                 next_tensordict.set(init_key, torch.zeros_like(done))
         return next_tensordict
 
@@ -146,14 +131,11 @@ def planning_env(env: EnvBase) -> EnvBase:
     _refuse_states(env, inside=None)
     plan = apart(env, recorders=False)  # simulated steps are not to be filmed
     shown = set(map(unravel_key, plan.full_observation_spec.keys(True, True)))
-    for layer in _transformed(plan):
-        transforms = flat_transforms(layer)
-        for i, transform in enumerate(transforms):
-            if not isinstance(transform, CarriedFrames):
-                continue
-            for key in map(unravel_key, transform.out_keys):
-                behind = [t for t in transforms[i + 1 :] if key in map(unravel_key, t.out_keys)]
-                if key not in shown or behind:
+    for transforms in map(flat_transforms, _layers(plan)):
+        for i, frames in enumerate(transforms):
+            for key in frames.out_keys if isinstance(frames, CarriedFrames) else ():
+                behind = [t for t in transforms[i + 1 :] if key in t.out_keys]
+                if behind or unravel_key(key) not in shown:
                     what = f"is written again by {_name(behind[0])}" if behind else "is taken away"
                     raise ValueError(
                         f"MCTSPlanner sets the frames of CatFrames by their stack, the entry "
@@ -165,39 +147,50 @@ def planning_env(env: EnvBase) -> EnvBase:
 
 def _refuse_states(env: EnvBase, inside: str | None) -> None:
     """Raise a ValueError that names the first transform whose state cannot be set."""
-    if isinstance(env, TransformedEnv):
-        for transform in flat_transforms(env):
-            reason = None
-            if isinstance(transform, (VecNorm, VecNormV2)) and not transform.frozen:
-                reason = _FREEZE
-            elif isinstance(transform, VecNormV2) and _is_per_element(transform, env):
-                reason = _PER_ELEMENT
-            elif isinstance(transform, RNDTransform) and transform.training and _learns(transform):
-                reason = _EVAL
-            elif isinstance(transform, TimeMaxPool):
-                reason = _MAX_POOL
-            elif isinstance(transform, RandomTruncationTransform):
-                reason = _HORIZON
-            elif isinstance(transform, NoopResetEnv) and env.batch_locked:
-                reason = _NOOPS
-            elif isinstance(transform, CatFrames) and inside is not None:
-                reason = f"keeps its frames inside {inside}. Append it to that instead"
-            if reason is not None:
-                raise ValueError(
-                    f"MCTSPlanner sets {env_name(env)} to states in the tensordict, and its "
-                    f"{_name(transform)} keeps a state elsewhere: it {reason}."
-                )
+    for transform in flat_transforms(env) if isinstance(env, TransformedEnv) else ():
+        reason = _reason(transform, env, inside)
+        if reason is not None:
+            raise ValueError(
+                f"MCTSPlanner sets {env_name(env)} to states in the tensordict, and its "
+                f"{_name(transform)} keeps a state elsewhere: it {reason}."
+            )
     for below in envs_below(env):
         _refuse_states(below, inside if isinstance(env, TransformedEnv) else _name(env))
 
 
-def _transformed(env: EnvBase) -> list[TransformedEnv]:
-    """The TransformedEnvs on the way to the env below all transforms."""
-    found = []
+def _reason(transform: Transform, env: EnvBase, inside: str | None) -> str | None:
+    """Tell what a transform keeps that cannot be set, and what to do; None if nothing."""
+    if isinstance(transform, (VecNorm, VecNormV2)) and not transform.frozen:
+        return "learns its statistics from every step. Freeze it first: its freeze()"
+    if isinstance(transform, VecNormV2):
+        reduces = transform.reduce_batch_dims or not transform.stateful
+        if not (reduces or env.batch_locked) and env.batch_size.numel() != 1:
+            return (
+                "has statistics for each element of the batch, and a wave has other states. Make "
+                "it with reduce_batch_dims=True"
+            )
+    if isinstance(transform, RNDTransform) and transform.training:
+        if transform.normalize_obs or transform.normalize_reward:
+            return "learns its statistics from every step. Stop that first: its eval()"
+    if isinstance(transform, TimeMaxPool):
+        return (
+            "keeps the last observations. Stack them by CatFrames, which a planner can set, and "
+            "take the maximum over the stack in a transform behind it"
+        )
+    if isinstance(transform, RandomTruncationTransform):
+        return "draws a horizon for each episode and keeps it. Use StepCounter(max_steps=...)"
+    if isinstance(transform, NoopResetEnv) and env.batch_locked:
+        return "steps the env after a reset, away from the state that it was set to. Leave it out"
+    if isinstance(transform, CatFrames) and inside is not None:
+        return f"keeps its frames inside {inside}. Append it to that instead"
+    return None
+
+
+def _layers(env: EnvBase) -> Iterator[TransformedEnv]:
+    """Yield the TransformedEnvs on the way to the env below all transforms."""
     while isinstance(env, TransformedEnv):
-        found.append(env)
+        yield env
         env = env.base_env
-    return found
 
 
 def _is_replaced(transform: Transform, env: EnvBase) -> bool:
@@ -215,10 +208,10 @@ class ForeignStates:
     """
 
     def __init__(self, env: EnvBase) -> None:
-        self._transforms: list[Transform] = []
-        for layer in _transformed(env):
-            self._transforms += [t for t in flat_transforms(layer) if _is_foreign(t)]
-        self._transforms = [t for t in self._transforms if not isinstance(t, CatFrames)]
+        transforms = [t for layer in _layers(env) for t in flat_transforms(layer)]
+        self._transforms = [
+            t for t in transforms if _is_foreign(t) and not isinstance(t, CatFrames)
+        ]
 
     def read(self) -> list[dict[str, Any]]:
         """Return copies of all tensors, arrays and stacks of them that the transforms hold."""
@@ -237,25 +230,25 @@ class ForeignStates:
         """Write what :meth:`read` returned into the transforms."""
         for transform, old in zip(self._transforms, before, strict=True):
             for name, value in old.items():
-                buffers = transform.__dict__["_buffers"]
-                (buffers if name in buffers else transform.__dict__)[name] = value
+                setattr(transform, name, value)
 
 
 def _held(transform: Transform) -> dict[str, Any]:
+    """Return copies of the tensors and arrays of a transform, and of its stacks of tensors."""
     copies: dict[type, Callable[[Any], Any]] = {
         torch.Tensor: torch.Tensor.clone,
         np.ndarray: np.ndarray.copy,
         list: list,
         deque: lambda stack: deque(stack, stack.maxlen),
     }
-    found = {}
-    own = {**transform.__dict__, **transform.__dict__["_buffers"]}
-    for name, value in own.items():
-        if isinstance(value, (list, deque)) and not any(isinstance(x, Tensor) for x in value):
-            continue  # keys and the like
-        if type(value) in copies:
-            found[name] = copies[type(value)](value)
-    return found
+    own = {**transform.__dict__, **dict(transform.named_buffers(recurse=False))}
+    stacks = (list, deque)  # others hold keys and the like
+    return {
+        name: copies[type(value)](value)
+        for name, value in own.items()
+        if type(value) in copies
+        and (not isinstance(value, stacks) or any(isinstance(x, Tensor) for x in value))
+    }
 
 
 def _same(one: Any, two: Any) -> bool:
@@ -267,15 +260,6 @@ def _same(one: Any, two: Any) -> bool:
     return len(one) != len(two) or all(a is b for a, b in zip(one, two, strict=True))
 
 
-def _is_per_element(transform: VecNormV2, env: EnvBase) -> bool:
-    reduces = transform.reduce_batch_dims or not transform.stateful
-    return not (reduces or env.batch_locked) and env.batch_size.numel() != 1
-
-
-def _learns(transform: RNDTransform) -> bool:
-    return bool(transform.normalize_obs or transform.normalize_reward)
-
-
 def _is_foreign(transform: Transform) -> bool:
     """Whether neither TorchRL nor the transforms that run an env of their own made it."""
     package = type(transform).__module__.split(".")[0]
@@ -284,7 +268,3 @@ def _is_foreign(transform: Transform) -> bool:
 
 def _name(transform: Transform | EnvBase) -> str:
     return type(transform).__name__
-
-
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]

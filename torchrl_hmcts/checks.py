@@ -7,22 +7,18 @@ import numbers
 from typing import Any
 
 import numpy as np
+from tensordict import unravel_key
+from tensordict.utils import NestedKey
 
 NO_LIMIT = np.iinfo(np.int64).max
 
 
 def whole_number(owner: str, name: str, value: Any, *, least: int = 0) -> int:
-    """Return a count as an int; one beyond int64 is as good as no limit.
-
-    Args:
-        owner: who needs it, for messages.
-        name: of the argument.
-        value: a Python or NumPy integer.
-        least: the smallest that makes sense. Default 0.
+    """Return a count, at least ``least``, as an int; one beyond int64 is as good as no limit.
 
     Raises:
         TypeError: if it is no integer: text, a bool or a float, 1e3 included.
-        ValueError: if it is smaller than ``least``.
+        ValueError: if it is smaller.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral):
         hint = f" Write {int(value)}." if isinstance(value, float) and value.is_integer() else ""
@@ -45,20 +41,11 @@ def real_number(
     above: float = -math.inf,
     finite: bool = True,
 ) -> float:
-    """Return a number as a float.
-
-    Args:
-        owner: who needs it, for messages.
-        name: of the argument.
-        value: a Python or NumPy number, no NaN.
-        least: the smallest allowed. Default: any.
-        most: the largest allowed. Default: any.
-        above: what it must exceed. Default: nothing.
-        finite: refuse infinities. Default True.
+    """Return a number as a float: from ``least`` to ``most``, more than ``above``, no NaN.
 
     Raises:
         TypeError: if it is no number.
-        ValueError: if it is NaN or outside the bounds.
+        ValueError: if it is outside the bounds.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.number)):
         raise TypeError(
@@ -75,19 +62,24 @@ def real_number(
 
 
 def instance(owner: str, name: str, value: Any, *kinds: type) -> None:
-    """Refuse a value that is of none of the given classes.
-
-    Args:
-        owner: who needs it, for messages.
-        name: of the argument.
-        value: what was given.
-        *kinds: the classes allowed.
-
-    Raises:
-        TypeError: if it is of another class.
-    """
+    """Raise a TypeError if a value is of none of the classes."""
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise TypeError(
             f"{owner} needs a {wanted} for {name}; got {value!r}, a {type(value).__name__}."
         )
+
+
+def nested_key(owner: str, name: str, value: Any) -> NestedKey:
+    """Return a key of a tensordict in its flat form, or raise a TypeError."""
+    if not _is_key(value):
+        raise TypeError(
+            f"{owner} needs a string or a tuple of strings for {name}; got {value!r}, a "
+            f"{type(value).__name__}."
+        )
+    return unravel_key(value)
+
+
+def _is_key(value: Any) -> bool:
+    nested = isinstance(value, tuple) and bool(value) and all(map(_is_key, value))
+    return isinstance(value, str) or nested

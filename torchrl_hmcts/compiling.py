@@ -35,27 +35,12 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function and keeps the code for other processes.
+    """Return ``numba.njit(**options)`` that keeps the code for other processes.
 
-    The code is kept in the first of these folders that can be written: ``NUMBA_CACHE_DIR``,
+    It is kept in the first of these folders that can be written: ``NUMBA_CACHE_DIR``,
     ``__pycache__`` beside the source, numba's folder in the user's cache, and a folder of the
-    user's own in the temporary folder, which nobody else can write. Where there is none, or it
-    is full, the function is compiled in each process, and one line on stderr says so. A file that
-    is damaged, or of another version of the source, numba or the processor, is not used.
-
-    Args:
-        **options: of ``numba.njit``, without ``cache``.
-
-    Returns:
-        The decorator.
-
-    Example:
-        >>> from torchrl_hmcts.compiling import njit
-        >>> @njit(error_model="numpy")
-        ... def half(x):
-        ...     return x / 2
-        >>> half(3.0)
-        1.5
+    user's own in the temporary folder. Where there is none, or it is full, each process compiles,
+    and one line on stderr says so. A file that is damaged or of another source is not used.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
@@ -77,10 +62,8 @@ class _PrivateFolder(UserWideCacheLocator):
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> Any:
-        try:
+        with contextlib.suppress(OSError):
             return super().from_function(function, file)
-        except OSError:
-            return None
 
 
 class _NoFolder(UserWideCacheLocator):
@@ -215,16 +198,7 @@ def _spelled(constant: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def private_folder() -> Path:
-    """Return a folder in the temporary folder that only this user can read and write.
-
-    Example:
-        >>> from torchrl_hmcts.compiling import private_folder
-        >>> oct(private_folder().stat().st_mode & 0o777)
-        '0o700'
-
-    Raises:
-        OSError: if there is none, e.g. since somebody else has made it.
-    """
+    """Return a folder in the temporary folder that only this user can read and write."""
     user = os.geteuid() if hasattr(os, "geteuid") else "user"
     path = Path(tempfile.gettempdir(), f"torchrl_hmcts-{user}")
     with contextlib.suppress(FileExistsError):
@@ -237,11 +211,8 @@ def private_folder() -> Path:
     return path
 
 
-_said: list[str] = []
-
-
+@lru_cache(maxsize=1)
 def _say(line: str) -> None:
     """Say the first such line on stderr, unless the parent of this process says it."""
-    if not _said and multiprocessing.parent_process() is None:
+    if multiprocessing.parent_process() is None:
         print(f"torchrl_hmcts: {line}", file=sys.stderr)
-    _said.append(line)

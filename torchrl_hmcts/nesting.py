@@ -1,4 +1,4 @@
-"""The envs and transforms that an env is made of, through any nesting."""
+"""The envs and transforms that an env is made of, and the parts of a nested key."""
 
 from __future__ import annotations
 
@@ -6,10 +6,23 @@ from collections.abc import Iterator
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 _DEFAULT_GAMMA = 0.99
+
+
+def parts(key: NestedKey) -> tuple[str, ...]:
+    """Return the names of which a nested key consists."""
+    return (key,) if isinstance(key, str) else key
+
+
+def given(tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
+    """Return an entry that a reset is to keep; None where it begins episodes."""
+    begins = any(parts(k)[-1] == "_reset" for k in tensordict.keys(True, True))
+    return None if begins else tensordict.get(key, None)
 
 
 def innermost(env: EnvBase) -> EnvBase:
@@ -24,19 +37,12 @@ def env_name(env: EnvBase) -> str:
     return type(innermost(env)).__name__
 
 
-def flat_transforms(env: TransformedEnv) -> list[Transform]:
-    """Return the transforms of one TransformedEnv, first to last, those within a Compose too."""
-    found: list[Transform] = []
-
-    def collect(transform: Transform) -> None:
-        if isinstance(transform, Compose):
-            for part in transform:
-                collect(part)
-        else:
-            found.append(transform)
-
-    collect(env.transform)
-    return found
+def flat_transforms(env: TransformedEnv | Transform) -> list[Transform]:
+    """Return the transforms of one TransformedEnv or Compose, first to last, nested ones too."""
+    transform = env.transform if isinstance(env, TransformedEnv) else env
+    if not isinstance(transform, Compose):
+        return [transform]
+    return [part for inner in transform.transforms for part in flat_transforms(inner)]
 
 
 def envs_below(env: EnvBase) -> Iterator[EnvBase]:
@@ -87,10 +93,25 @@ def set_states(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
     return env.transform._reset(inner, shown)
 
 
-def complete_done(env: EnvBase, after: TensorDictBase) -> None:
-    """Write the done entries that an env left out, in place."""
-    if any(after.get(key, None) is None for key in env.done_keys):
-        env._complete_done(env.full_done_spec_unbatched, after)
+def complete_done(env: EnvBase, after: TensorDictBase, spec: Composite | None = None) -> None:
+    """Write the done entries that an env left out, as TorchRL's ``step`` does; in place.
+
+    ``spec`` is the env's ``full_done_spec_unbatched``, which takes long to ask for.
+    """
+    if all(after.get(key, None) is not None for key in env.done_keys):
+        return
+    spec = env.full_done_spec_unbatched if spec is None else spec
+    for key, leaf in spec.items(True, True):
+        if after.get(key, None) is not None:
+            continue
+        *group, last = parts(key)
+        other = {"done": "terminated", "terminated": "done"}.get(last)
+        value = after.get((*group, other), None) if other else None
+        if value is None:
+            value = leaf.zero(after.batch_size)
+        elif last == "done" and (cut := after.get((*group, "truncated"), None)) is not None:
+            value = value | cut
+        after.set(key, value)
 
 
 def known_gamma(env: EnvBase) -> float | None:

@@ -20,12 +20,16 @@ from typing import Any
 
 from torch import Tensor
 
+try:
+    import resource
+except ImportError:  # not Unix
+    resource = None  # type: ignore[assignment]
+
 _SOCKET_BYTES = 107  # of a socket's path, on Linux; 103 on macOS
 _SOCKET_NAME = len("/listener-12345678")
 _SOCKET_FOLDERS = ("", "/tmp", "/var/tmp", "/dev/shm")
 _LONGEST_LOOK_AWAY = 2.0  # seconds
 _PR_SET_PDEATHSIG = 1
-_PAGES_OF_LOCKS = 65536  # bytes
 _TO_START = 16  # files: the ends of pipes of a process that starts, two servers, what it reads
 
 
@@ -34,17 +38,6 @@ def start_context(method: str) -> Any:
 
     The forkserver listens on a socket whose path may have 107 bytes. Where ``TMPDIR`` is longer, is
     full or cannot be written, the socket is put into another temporary folder.
-
-    Args:
-        method: ``"fork"``, ``"forkserver"`` or ``"spawn"``.
-
-    Returns:
-        The context.
-
-    Example:
-        >>> from torchrl_hmcts.processes import start_context
-        >>> start_context("spawn").get_start_method()
-        'spawn'
     """
     forked = multiprocessing.parent_process() is not None  # and may have its parent's forkserver
     if method == "forkserver" and (forked or not any(map(_fits_a_socket, _SOCKET_FOLDERS))):
@@ -70,23 +63,7 @@ def _fits_a_socket(place: str) -> bool:
 
 
 def share(tensors: Iterable[Tensor], owner: str) -> None:
-    """Move tensors to shared memory, or say what the machine lacks.
-
-    Args:
-        tensors: on the CPU; those that are shared already stay as they are.
-        owner: who needs them, for the error.
-
-    Raises:
-        OSError: if there is too little shared memory, or too few file descriptors.
-
-    Example:
-        >>> import torch
-        >>> from torchrl_hmcts.processes import share
-        >>> numbers = torch.zeros(3)
-        >>> share([numbers], "the example")
-        >>> numbers.is_shared()
-        True
-    """
+    """Move tensors to shared memory, or raise an OSError that says what ``owner`` lacks."""
     tensors = list(tensors)
     size = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
     with system_errors(f"{owner} cannot have {size:,} bytes of shared memory"):
@@ -101,27 +78,13 @@ def share(tensors: Iterable[Tensor], owner: str) -> None:
 
 @contextlib.contextmanager
 def system_errors(what: str) -> Iterator[None]:
-    """Raise what the system refuses as an ``OSError`` that says what is lacking, and the fix.
-
-    Args:
-        what: what is not possible, the error's first words.
-
-    Raises:
-        OSError: instead of the system's or torch's error.
-
-    Example:
-        >>> from torchrl_hmcts.processes import system_errors
-        >>> with system_errors("the example cannot start"):
-        ...     raise OSError(24, "Too many open files")
-        Traceback (most recent call last):
-        ...
-        OSError: [Errno 24] the example cannot start: Too many open files. ...
-    """
+    """Raise what the system refuses as an OSError: ``what`` is not possible, why, and the fix."""
     try:
         yield
     except (OSError, EOFError, RuntimeError) as error:
         number = _number_of(error)
-        if number is None:
+        disk = number == errno.ENOSPC and getattr(error, "filename", None) is not None
+        if number is None or disk:  # the disk of a file that the error names
             raise
         why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise OSError(
@@ -129,57 +92,20 @@ def system_errors(what: str) -> Iterator[None]:
         ) from error
 
 
-def no_room_for_locks(owner: str, error: Exception) -> OSError | None:
-    """Return an error that names /dev/shm, if it was too full for a lock or a counter.
-
-    Args:
-        owner: what could not be built.
-        error: the system's, which names no file: no file has been opened.
-
-    Returns:
-        The error to raise instead; None if /dev/shm has room, or the error is another.
-
-    Example:
-        >>> from torchrl_hmcts.processes import no_room_for_locks
-        >>> no_room_for_locks("the example", OSError(2, "No such file")) is None
-        True
-    """
-    if not isinstance(error, OSError) or error.errno != errno.ENOSPC or error.filename is not None:
-        return None
-    with contextlib.suppress(OSError):
-        if shutil.disk_usage("/dev/shm").free < _PAGES_OF_LOCKS and "/dev/shm" not in str(error):
-            what = f"{owner} cannot have the shared memory of its locks: {error.strerror}. "
-            return OSError(errno.ENOSPC, what + _advice(errno.ENOSPC))
-    return None
-
-
 def need_descriptors(processes: int, pipes: int) -> None:
-    """Raise at once if this process may not open the files that it takes to start others.
+    """Raise an OSError at once if this process may not open the files that others take to start.
 
-    Multiprocessing keeps two ends of pipes for each process that it has started.
-
-    Args:
-        processes: number to start.
-        pipes: ends of pipes that this process keeps besides.
-
-    Raises:
-        OSError: with ``errno.EMFILE``; :func:`system_errors` says the fix.
-
-    Example:
-        >>> from torchrl_hmcts.processes import need_descriptors
-        >>> need_descriptors(2, pipes=3)
+    Multiprocessing keeps two ends of pipes for each process that it has started; ``pipes`` are
+    those that this process keeps besides.
     """
     try:
-        import resource
-
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         left = limit - len(os.listdir("/proc/self/fd"))
-    except (ImportError, OSError):  # not Linux
+    except (AttributeError, OSError):  # not Linux
         return
     number = 2 * processes + pipes + _TO_START
     if left < number:
-        why = f"it needs {number} more files, and {left} are left"
-        raise OSError(errno.EMFILE, why)
+        raise OSError(errno.EMFILE, f"it needs {number} more files, and {left} are left")
 
 
 def _number_of(error: Exception) -> int | None:
@@ -192,6 +118,14 @@ def _number_of(error: Exception) -> int | None:
     return int(found[1]) if found and "memory" in str(error) else None
 
 
+def _limit(name: str) -> str:
+    """Return a soft limit of this process, in words."""
+    with contextlib.suppress(AttributeError):
+        soft = resource.getrlimit(getattr(resource, name))[0]
+        return "any number of" if soft == resource.RLIM_INFINITY else str(soft)
+    return "a limited number of"
+
+
 def _advice(number: int) -> str:
     if number in (errno.ENOSPC, errno.ENOMEM):
         text = "Make room in it"
@@ -200,25 +134,16 @@ def _advice(number: int) -> str:
             text = f"/dev/shm has {disk.total:,} bytes, {disk.free:,} of them free: make room"
         return f"{text}, or start the container with more, e.g. `docker run --shm-size=1g`."
     if number in (errno.EMFILE, errno.ENFILE):
-        text = "The system has too few file descriptors"
-        with contextlib.suppress(ImportError):
-            import resource
-
-            soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-            text = f"This process may open {soft} files (`ulimit -n`, at most {hard})"
-        return f"{text}: raise that, e.g. `ulimit -n 4096`, or use fewer processes."
+        return (
+            f"This process may open {_limit('RLIMIT_NOFILE')} files (`ulimit -n`): raise that, "
+            "e.g. `ulimit -n 4096`, or use fewer processes."
+        )
     if number in (errno.EAGAIN, errno.ECHILD):
-        limit: int | str = "a limited number of"
-        with contextlib.suppress(ImportError, AttributeError):
-            import resource
-
-            soft = resource.getrlimit(resource.RLIMIT_NPROC)[0]
-            limit = "any number of" if soft == resource.RLIM_INFINITY else soft
         ended = "The process that starts the others has ended, with the error printed above. "
         return (
-            f"{ended if number == errno.ECHILD else ''}This user may have {limit} processes and "
-            "threads (`ulimit -u`): raise that, give the container more memory, or use fewer "
-            "processes."
+            f"{ended if number == errno.ECHILD else ''}This user may have "
+            f"{_limit('RLIMIT_NPROC')} processes and threads (`ulimit -u`): raise that, give the "
+            "container more memory, or use fewer processes."
         )
     folder = os.environ.get("TMPDIR") or tempfile.tempdir or "not set"
     return (
@@ -228,16 +153,10 @@ def _advice(number: int) -> str:
 
 
 class Silence:
-    """Measures how long nothing has moved, as far as this process was awake to see it.
+    """Measures for how long nothing has moved, as far as this process was awake to see it.
 
     A look long after the one before counts two seconds: this process was stopped too, or the
     machine slept.
-
-    Example:
-        >>> from torchrl_hmcts.processes import Silence
-        >>> silence = Silence()
-        >>> silence.look(("frames", 1)), silence.look(("frames", 2))
-        (0.0, 0.0)
     """
 
     def __init__(self) -> None:
@@ -247,11 +166,7 @@ class Silence:
         self._at = time.monotonic()
 
     def look(self, marks: Hashable) -> float:
-        """Compare with the last look; return the seconds for which nothing has moved.
-
-        Args:
-            marks: what changes while there is life, e.g. a count and :func:`cpu_ticks`.
-        """
+        """Return the seconds for which the marks, e.g. a count, have been the same."""
         now = time.monotonic()
         same = marks == self._marks
         passed = min(now - self._at, _LONGEST_LOOK_AWAY)
@@ -261,17 +176,7 @@ class Silence:
 
 
 def cpu_ticks(pid: int) -> int:
-    """Return the processor time that a process has used, in ticks; 0 where it cannot be known.
-
-    Args:
-        pid: of the process.
-
-    Example:
-        >>> import os
-        >>> from torchrl_hmcts.processes import cpu_ticks
-        >>> cpu_ticks(os.getpid()) >= 0
-        True
-    """
+    """Return the processor time that a process has used, in ticks; 0 where it cannot be known."""
     try:
         with open(f"/proc/{pid}/stat", "rb") as file:
             numbers = file.read().rpartition(b")")[2].split()
@@ -281,12 +186,7 @@ def cpu_ticks(pid: int) -> int:
 
 
 def wake_with_parent() -> None:
-    """Have a stopped process woken when its parent dies, so that it can notice and end; on Linux.
-
-    Example:
-        >>> from torchrl_hmcts.processes import wake_with_parent
-        >>> wake_with_parent()
-    """
+    """Have a stopped process woken when its parent dies, so that it notices and ends; on Linux."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)

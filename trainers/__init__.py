@@ -14,34 +14,13 @@ if TYPE_CHECKING:
     )
     from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
-    from torchrl_hmcts.trainers.experiments.atari.agent import (
-        AtariAgent,
-        AtariProgress,
-        AtariSearch,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.goals import (
-        Candidate,
-        GoalFinder,
-        GoalSearch,
-    )
+    from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch
+    from torchrl_hmcts.trainers.experiments.atari.fine_tuning import OptionGoals
     from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
-    from torchrl_hmcts.trainers.experiments.atari.learned_sources import (
-        DIAYNSource,
-        DistilledSource,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.options import Options, WorkerSource, load_options
-    from torchrl_hmcts.trainers.experiments.atari.sources import (
-        ActionSetSource,
-        ActionSource,
-        BestSource,
-        GoalSource,
-        RepeatSource,
-    )
-    from torchrl_hmcts.trainers.experiments.atari.trained_sources import (
-        FineTunedSource,
-        OptionGoals,
-        RetrainedSource,
-    )
+    from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
+    from torchrl_hmcts.trainers.experiments.atari.options import Options
+    from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
+    from torchrl_hmcts.trainers.experiments.atari.sources import TrainedSource
     from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import (
         GoalEpisodes,
         GoalTrack,
@@ -67,11 +46,8 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.runs.config import DemoConfig
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
-    from torchrl_hmcts.trainers.saving.resume import (
-        GeneratorStates,
-        ResumableTrainer,
-        RunningEpisodes,
-    )
+    from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+    from torchrl_hmcts.trainers.saving.run_state import GeneratorStates, RunningEpisodes
     from torchrl_hmcts.trainers.skills.controllability import (
         Controllability,
         probe_controllability,
@@ -90,31 +66,20 @@ if TYPE_CHECKING:
 
 __all__ = [
     "A3CTrainer",
-    "ActionSetSource",
-    "ActionSource",
     "AtariAgent",
-    "AtariProgress",
+    "AtariKit",
     "AtariSearch",
-    "BestSource",
-    "Candidate",
     "CollectorError",
     "Controllability",
-    "DIAYNSource",
     "DIAYNTrainer",
     "DemoConfig",
-    "DistilledSource",
     "DurableRotation",
     "ExpertIterationTrainer",
     "GeneratorStates",
     "GoalEpisodes",
-    "FineTunedSource",
     "OptionGoals",
-    "RetrainedSource",
     "SearchGuide",
     "FolderInUse",
-    "GoalFinder",
-    "GoalSearch",
-    "GoalSource",
     "GoalTrack",
     "GrowSkills",
     "HMCTSTrainer",
@@ -123,9 +88,9 @@ __all__ = [
     "MazeNetwork",
     "MazeView",
     "Options",
-    "RepeatSource",
     "ResumableTrainer",
     "RunningEpisodes",
+    "RuleSource",
     "ScriptedExpert",
     "SearchCollector",
     "SearchCoverage",
@@ -136,10 +101,9 @@ __all__ = [
     "TerminationConfig",
     "TerminationResult",
     "TilePlanner",
-    "WorkerSource",
+    "TrainedSource",
     "collect_option_steps",
     "learn_termination",
-    "load_options",
     "make_goal_env",
     "make_guided_planner",
     "make_skill_optimizer",
@@ -156,30 +120,19 @@ __all__ = [
 # Imported when asked for: the command line answers --help without loading torch.
 _MODULES = {
     "A3CTrainer": "a3c.trainer",
-    "ActionSetSource": "experiments.atari.sources",
-    "ActionSource": "experiments.atari.sources",
     "AtariAgent": "experiments.atari.agent",
-    "AtariProgress": "experiments.atari.agent",
+    "AtariKit": "experiments.atari.kit",
     "AtariSearch": "experiments.atari.agent",
-    "BestSource": "experiments.atari.sources",
-    "Candidate": "experiments.atari.goals",
     "CollectorError": "restarting_collector",
     "Controllability": "skills.controllability",
-    "DIAYNSource": "experiments.atari.learned_sources",
     "DIAYNTrainer": "diayn",
     "DemoConfig": "runs.config",
-    "DistilledSource": "experiments.atari.learned_sources",
     "DurableRotation": "saving.checkpoints",
     "ExpertIterationTrainer": "expert_iteration",
-    "GeneratorStates": "saving.resume",
+    "GeneratorStates": "saving.run_state",
     "GoalEpisodes": "experiments.waterworld.goal_episodes",
-    "FineTunedSource": "experiments.atari.trained_sources",
-    "OptionGoals": "experiments.atari.trained_sources",
-    "RetrainedSource": "experiments.atari.trained_sources",
+    "OptionGoals": "experiments.atari.fine_tuning",
     "SearchGuide": "experiments.atari.guide",
-    "GoalFinder": "experiments.atari.goals",
-    "GoalSearch": "experiments.atari.goals",
-    "GoalSource": "experiments.atari.sources",
     "GoalTrack": "experiments.waterworld.goal_episodes",
     "GrowSkills": "skills.growing",
     "HMCTSTrainer": "hmcts",
@@ -189,9 +142,9 @@ _MODULES = {
     "MazeNetwork": "experiments.waterworld.networks",
     "MazeView": "skills.hindsight",
     "Options": "experiments.atari.options",
-    "RepeatSource": "experiments.atari.sources",
     "ResumableTrainer": "saving.resume",
-    "RunningEpisodes": "saving.resume",
+    "RuleSource": "experiments.atari.rules",
+    "RunningEpisodes": "saving.run_state",
     "ScriptedExpert": "experiments.waterworld.scripted_expert",
     "SearchCollector": "expert_iteration",
     "SearchCoverage": "skills.growing",
@@ -202,10 +155,9 @@ _MODULES = {
     "TerminationConfig": "skills.termination",
     "TerminationResult": "skills.termination",
     "TilePlanner": "experiments.waterworld.goal_planning",
-    "WorkerSource": "experiments.atari.options",
+    "TrainedSource": "experiments.atari.sources",
     "collect_option_steps": "skills.termination",
     "learn_termination": "skills.termination",
-    "load_options": "experiments.atari.options",
     "make_goal_env": "experiments.waterworld.goal_planning",
     "make_guided_planner": "expert_iteration",
     "make_skill_optimizer": "diayn",

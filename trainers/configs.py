@@ -28,7 +28,7 @@ import re
 import textwrap
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -49,7 +49,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
     "torchrl_hmcts.objectives": {
         "loss": {
             "a3c": "A3CLoss",
-            "continuous_diayn": "ContinuousDIAYNLoss",
             "diayn": "DIAYNLoss",
             "discrete_skill_sac": "DiscreteSkillSACLoss",
             "expert_iteration": "ExpertIterationLoss",
@@ -68,7 +67,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
     },
     "torchrl_hmcts.transforms": {
         "transform": {
-            "diayn_reward": "DIAYNReward",
             "displacement": "DisplacementTransform",
             "option": "OptionTransform",
             "option_recorder": "OptionRecorder",
@@ -88,7 +86,6 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
             "uct": "UCT",
         },
         "novelty": {"radius": "RadiusNovelty", "width": "WidthNovelty"},
-        "backup": {"max": "MaxBackup", "mean": "MeanBackup"},
         "final_choice": {
             "best_plan": "BestPlan",
             "highest_value": "HighestValue",
@@ -110,12 +107,10 @@ _PACKAGES: Mapping[str, Mapping[str, Mapping[str, str]]] = {
         "control": {
             "goals": "GoalPlanner",
             "hierarchical": "HierarchicalPolicy",
-            "model_based": "ModelBasedControl",
         },
     },
     "torchrl_hmcts.modules": {
         "model": {
-            "gaussian_skill_actor": "GaussianSkillActor",
             "skill_action_critic": "SkillActionCritic",
             "skill_actor": "SkillActor",
             "skill_critic": "SkillCritic",
@@ -237,7 +232,7 @@ def build(_component_: str, **keywords: Any) -> Any:
         UCT(c=0.5)
     """
     component = named(_component_)
-    parameters = inspect.signature(component.__init__).parameters
+    parameters = _keywords(component)
     if "critic_network" not in parameters and "qvalue_network" in parameters:
         critic = keywords.pop("critic_network", None)
         if critic is not None:
@@ -289,7 +284,7 @@ def to_yaml(component: type) -> str:
 
 
 def argument_docs(component: type) -> dict[str, str]:
-    """Return the meaning of each argument from the docstring of a class.
+    """Return the meaning of each argument from the docstrings of a class and those it extends.
 
     Args:
         component: class whose docstring has a section ``Args:``.
@@ -299,13 +294,14 @@ def argument_docs(component: type) -> dict[str, str]:
         >>> argument_docs(UCT)
         {'c': 'exploration constant, in units of the return. Default ``1.0``.'}
     """
-    text = inspect.cleandoc(component.__doc__ or "")
-    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
     docs: dict[str, str] = {}
     entry = r"^(\w+(?:, \w+)*)(?: \([^\n]*?\))?: (.*?)(?=^\w|\Z)"
-    body = textwrap.dedent(section[1]) if section else ""
-    for names, meaning in re.findall(entry, body, re.MULTILINE | re.DOTALL):
-        docs.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
+    for cls in reversed(component.__mro__):
+        text = inspect.cleandoc(vars(cls).get("__doc__") or "")
+        section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+        body = textwrap.dedent(section[1]) if section else ""
+        for names, meaning in re.findall(entry, body, re.MULTILINE | re.DOTALL):
+            docs.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
     return docs
 
 
@@ -343,25 +339,46 @@ def _public_path(component: type) -> str:
     return f"{component.__module__}.{component.__qualname__}"
 
 
+_VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def _constructors(component: type) -> Iterator[Any]:
+    """The constructor of a class, and where it takes ``**keywords`` those that it hands them to."""
+    for cls in component.__mro__:
+        init = vars(cls).get("__init__")
+        if init is None:
+            continue
+        if cls is not component and not cls.__module__.startswith("torchrl_hmcts"):
+            return
+        yield init
+        kinds = [parameter.kind for parameter in inspect.signature(init).parameters.values()]
+        if inspect.Parameter.VAR_KEYWORD not in kinds:
+            return
+
+
 def _keywords(component: type) -> dict[str, inspect.Parameter]:
     """The parameters of a constructor that have a name of their own."""
-    parameters = inspect.signature(component.__init__).parameters  # type: ignore[misc]
-    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    return {n: p for n, p in parameters.items() if n != "self" and p.kind not in variable}
+    found: dict[str, inspect.Parameter] = {}
+    for init in _constructors(component):
+        for name, parameter in inspect.signature(init).parameters.items():
+            if name != "self" and parameter.kind not in _VARIABLE:
+                found.setdefault(name, parameter)
+    return found
 
 
 def _hints(component: type) -> dict[str, Any]:
     """The annotations that Hydra can check: plain types and None; others are left to the class."""
-    try:
-        hints = typing.get_type_hints(component.__init__)  # type: ignore[misc]
-    except NameError:  # a name that only type checkers import
-        return {}
     checked = {}
-    for name, hint in hints.items():
-        parts = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-        plain = [part for part in parts if part is not types.NoneType]
-        if len(plain) == 1 and plain[0] in _PLAIN:
-            checked[name] = hint
+    for init in _constructors(component):
+        try:
+            hints = typing.get_type_hints(init)
+        except NameError:  # a name that only type checkers import
+            continue
+        for name, hint in hints.items():
+            parts = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+            plain = [part for part in parts if part is not types.NoneType]
+            if len(plain) == 1 and plain[0] in _PLAIN:
+                checked.setdefault(name, hint)
     return checked
 
 

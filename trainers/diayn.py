@@ -24,6 +24,7 @@ from torchrl.trainers import (
 from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, DiscreteSkillSACLoss, SkillObjective
+from torchrl_hmcts.processes import system_errors
 from torchrl_hmcts.trainers.restarting_collector import CollectorError
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
@@ -188,9 +189,10 @@ class DIAYNTrainer(ResumableTrainer):
             return_same_td=True,  # each batch is a new one as it is
             auto_register_policy_transforms=False,
         )
-        buffer = ReplayBuffer(
-            storage=LazyTensorStorage(buffer_size), transform=reward, batch_size=batch_size
-        )
+        with system_errors("DIAYNTrainer cannot have the shared memory of its replay buffer"):
+            buffer = ReplayBuffer(
+                storage=LazyTensorStorage(buffer_size), transform=reward, batch_size=batch_size
+            )
         updater = _SoftUpdate(loss_module, tau=target_tau)
         super().__init__(
             collector=collector,

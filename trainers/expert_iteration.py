@@ -19,13 +19,13 @@ from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import (
     PUCT,
-    MaxBackup,
     MCTSPlanner,
     NoveltyTest,
     PolicyValueEvaluator,
     SearchBudget,
     search_examples,
 )
+from torchrl_hmcts.processes import system_errors
 from torchrl_hmcts.trainers.diayn import Progress
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 
@@ -77,9 +77,8 @@ def make_guided_planner(
     return MCTSPlanner(
         env,
         tree_policy=PUCT(c=c),
-        leaf_evaluator=guide.value,
-        option_prior=guide.prior,
-        backup=MaxBackup(),
+        leaf_evaluator=guide,
+        backup="max",
         novelty=novelty,
         expand=expand,
         budget=budget,
@@ -295,11 +294,10 @@ class ExpertIterationTrainer(ResumableTrainer):
             seed=seed,
             example_kwargs={"roots": False} if example_kwargs is None else example_kwargs,
         )
-        buffer = ReplayBuffer(
-            storage=LazyTensorStorage(buffer_size),
-            batch_size=batch_size,
-            generator=torch.Generator().manual_seed(index(seed)),
-        )
+        generator = torch.Generator().manual_seed(index(seed))
+        with system_errors("ExpertIterationTrainer cannot have the shared memory of its buffer"):
+            storage = LazyTensorStorage(buffer_size)
+            buffer = ReplayBuffer(storage=storage, batch_size=batch_size, generator=generator)
         optimizer = torch.optim.Adam(loss_module.parameters(), lr=lr)
         super().__init__(
             collector=collector,  # type: ignore[arg-type]

@@ -19,6 +19,7 @@ from torchrl.trainers import TargetNetUpdaterHook
 from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import UCT, MCTSPlanner, SearchBudget
+from torchrl_hmcts.processes import system_errors
 from torchrl_hmcts.trainers.diayn import Progress, make_skill_optimizer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
@@ -218,7 +219,8 @@ class HMCTSTrainer(ResumableTrainer):
             rounds=rounds - num_init_samples,
             seed=seed,
         )
-        buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size), batch_size=batch_size)
+        with system_errors("HMCTSTrainer cannot have the shared memory of its replay buffer"):
+            buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size), batch_size=batch_size)
         if optimizer is None:
             optimizer = make_skill_optimizer(loss_module)
         if reward is None:

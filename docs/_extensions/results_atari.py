@@ -5,8 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from results_tables import ATARI, table
+from results_tables import table
 
+from torchrl_hmcts.trainers.figures.atari_scores import TABLE_5_1, best_baseline
+
+
+def _baseline(game: str) -> str:
+    name, score = best_baseline(game)
+    return f"{score:.0f} ({name})" if score >= 100 else f"{score:.1f} ({name})"
+
+
+# Dissertation, table 5.1 and table A.1 (mean of the best of seven algorithms of OpenAI Baselines).
+ATARI = [
+    (game, row.score, row.num_skills, row.option_steps, _baseline(game))
+    for game, row in TABLE_5_1.items()
+]
 _HEAD = [
     "game",
     "table 5.1",
@@ -24,8 +37,9 @@ _HEAD = [
 def atari(runs: Sequence[dict[str, Any]]) -> str:
     """Return a table for each protocol."""
     text = (
-        "The source reports the highest score within 10 million time steps (40 million frames). "
-        "Here all emulated frames count: real, simulated, and those spent on finding options.\n"
+        "The dissertation reports the highest score within 10 million time steps (40 million "
+        "frames). Here all emulated frames count: real, simulated, and those spent on finding "
+        "options.\n"
     )
     for protocol in ("deterministic", "sticky"):
         rows = [
@@ -61,7 +75,7 @@ def sources(data: dict[str, Any]) -> str:
         found = [
             r for r in rows if (r["source"], r["game"], r["protocol"]) == (source, game, protocol)
         ]
-        # An episode that goes on is cut off: it might have scored more.
+        # An episode that would continue is cut off: it might have scored more.
         return ", ".join(f"{r['score']:g}{'' if r['ended'] else '+'}" for r in found) or "-"
 
     table_rows = []

@@ -9,9 +9,9 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
 
-from torchrl_hmcts.trainers.figures.dissertation import draw_figure
-
-_COLORS = ("#1d4ed8", "#e66100", "#00798c", "#5d3a9b", "#d41159", "#8c6e00", "#5a5a5a")
+from torchrl_hmcts.trainers.experiments.dissertation_figures import draw_figure
+from torchrl_hmcts.trainers.figures.curves import style
+from torchrl_hmcts.trainers.figures.pictures import COLORS
 
 
 def draw_curves(results: Path, folder: Path) -> dict[str, dict[str, str]]:
@@ -31,28 +31,25 @@ def draw_curves(results: Path, folder: Path) -> dict[str, dict[str, str]]:
     if (results / "atari/runs.json").exists():
         games = [draw_figure(f"5.{number}", [], results, folder) for number in range(1, 8)]
         drawn["atari/runs.json"] = {
-            game.path.name: f"The source's figure {game.figure.name}. {game.caption}"
-            for game in games
+            path.name: f"The dissertation's figure 5.{number}. {caption}"
+            for number, (path, caption) in enumerate(games, 1)
         }
     return drawn
 
 
 def _axes(figure: Figure, title: str, **labels: str) -> Any:
     axes = figure.subplots()
-    axes.set_title(title, loc="left", fontsize=10)
+    style(axes, title)
     axes.set(**labels)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
     return axes
 
 
 def cartpole(data: dict[str, Any], figure: Figure) -> None:
     axes = _axes(figure, "CartPole-v1, return of the policy under evaluation", xlabel="frames")
-    for color, run in zip(_COLORS, data["cartpole"], strict=False):
+    for color, run in zip(COLORS, data["cartpole"], strict=False):
         axes.plot(
             run["eval_frames"], run["eval_return"], "o-", color=color, label=f"seed {run['seed']}"
         )
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_ylim(0, 520)
     axes.legend(frameon=False)
 
@@ -60,16 +57,15 @@ def cartpole(data: dict[str, Any], figure: Figure) -> None:
 def lab_training(data: dict[str, Any], figure: Figure) -> None:
     axes = _axes(
         figure,
-        "The source's figure 4.10: frames to solve a test maze while the worker learns",
+        "Figure 4.10: frames to solve a test maze while the worker learns",
         xlabel="frames of training",
         ylabel="frames, mean",
     )
     runs = {k: v for k, v in data["results"].items() if k.endswith("training") and v.get("curve")}
-    for color, (name, run) in zip(_COLORS, runs.items(), strict=False):
+    for color, (name, run) in zip(COLORS, runs.items(), strict=False):
         label = name.removesuffix(" training").replace(" ", ", seed ")
         curve = run["curve"]
         axes.plot(curve["training_steps"], curve["frames"], "o-", color=color, label=label)
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_ylim(bottom=0)
     axes.legend(frameon=False)
@@ -82,7 +78,7 @@ def peers(data: dict[str, Any], figure: Figure) -> None:
         xlabel="roots searched side by side",
     )
     libraries = dict.fromkeys(row["library"] for row in data["figures"])
-    for color, library in zip(_COLORS, libraries, strict=False):
+    for color, library in zip(COLORS, libraries, strict=False):
         rows = [
             row
             for row in data["figures"]

@@ -12,10 +12,9 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from results_atari import atari as atari_section
-from results_atari import best, sources
+from results_atari import ATARI, atari, best, sources
 from results_reliability import RELIABILITY
-from results_tables import ATARI, SECTIONS, Section, table
+from results_tables import SECTIONS, Section, table
 
 if TYPE_CHECKING:  # the tests read this module where Sphinx is not installed
     from sphinx.application import Sphinx
@@ -29,7 +28,7 @@ stand the file it is made of and the command that made that file. Times are of t
 and vary with what else they do; counts of steps and mazes do not.
 [Commands and data](../results/README.md) lists all of them in one place.
 
-## Beside the source
+## Beside the dissertation
 
 What the dissertation reports in numbers or plain words, and what was measured here.
 
@@ -66,11 +65,7 @@ def commands(readme: str) -> dict[str, str]:
 
 _ATARI = {
     "Atari": (
-        Section(
-            "Seven games",
-            "atari/runs.json",
-            atari_section,
-        ),
+        Section("Seven games", "atari/runs.json", atari),
         Section("Where options come from", "atari/sources.json", sources),
     )
 }
@@ -183,16 +178,17 @@ def beside_the_source(results: Path = RESULTS) -> str:
                 len(found),
             ]
         )
-    text = table(["experiment", "source", "here", "seeds here"], rows)
+    text = table(["experiment", "dissertation", "here", "seeds here"], rows)
     path = results / "atari/runs.json"
     runs = load(path) if path.exists() else []
-    atari = [[*row[:2], row[4], f"{row[2]} x {row[3]}", best(runs, row[0])] for row in ATARI]
+    games = [[*row[:2], row[4], f"{row[2]} x {row[3]}", best(runs, row[0])] for row in ATARI]
     return (
         text
         + "\nAtari (table 5.1: highest score in 10 million time steps, 6 seeds; table A.1: best "
         + "mean of seven algorithms of OpenAI Baselines):\n\n"
         + table(
-            ["game", "source", "best of Baselines", "its options x base steps", "here, best"], atari
+            ["game", "dissertation", "best of Baselines", "its options x base steps", "here, best"],
+            games,
         )
     )
 

@@ -7,7 +7,7 @@ reads; files without a section of their own are listed at the end of the page.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +61,52 @@ def by_seed(values: Iterable[Any]) -> str:
     return " / ".join(number(value) for value in values)
 
 
+Columns = Mapping[str, str | Callable[[Any], Any]]
+"""Columns of a table by their heads: an entry (``mazes.solved``), two (``solved/mazes``: the first
+of the second), or a function of the row, or of the runs in it."""
+
+
+def of_rows(rows: Iterable[Any], columns: Columns) -> str:
+    """Return a table with a line for each row of data."""
+    return table(list(columns), [[_cell(row, c) for c in columns.values()] for row in rows])
+
+
+def of_groups(rows: Sequence[Any], key: str, columns: Columns) -> str:
+    """Return a table with a line for each value of ``key``, whose cells have a value a seed."""
+    lines = []
+    for name in dict.fromkeys(row[key] for row in rows):
+        runs = [row for row in rows if row[key] == name]
+        lines.append([name, *(_cells(runs, column) for column in [*columns.values()][1:])])
+    return table(list(columns), lines)
+
+
+def rounded(entry: str) -> Callable[[Any], str]:
+    """Return a column of a table of groups: an entry, rounded."""
+    return lambda runs: by_seed(round(_entry(run, entry)) for run in runs)
+
+
+def _cell(row: Any, column: str | Callable[[Any], Any]) -> Any:
+    if callable(column):
+        return column(row)
+    first, _, whole = column.partition("/")
+    value = _entry(row, first)
+    return f"{value} of {_entry(row, whole)}" if whole else value
+
+
+def _cells(runs: Sequence[Any], column: str | Callable[[Any], Any]) -> Any:
+    if callable(column):
+        return column(runs)
+    first, _, whole = column.partition("/")
+    shown = by_seed(_entry(run, first) for run in runs)
+    return f"{shown} of {_entry(runs[0], whole)}" if whole else shown
+
+
+def _entry(row: Any, path: str) -> Any:
+    for name in path.split("."):
+        row = row[name]
+    return row
+
+
 # ------------------------------------------------------------------------------ sections
 
 
@@ -87,167 +133,129 @@ def demo(rows: list[dict[str, str]]) -> str:
 
 
 def goal_agent(data: dict[str, Any]) -> str:
-    rows = []
-    for name, runs in data["agents"].items():
-        for run in runs:
-            test = run["test"]
-            rows.append(
-                [
-                    name,
-                    run["seed"],
-                    run.get("train_base_steps", 0),
-                    f"{test['solved']} of {test['mazes']}",
-                    test["base_steps_mean"],
-                    test["base_steps_median"],
-                ]
-            )
-    head = ["agent", "seed", "training base steps", "solved", "base steps, mean", "median"]
-    return table(head, rows) + (
-        "\nThe source's Figure 3.6 has no numbers in its text: with goals the mazes are solved "
-        "consistently and quickly, by plain A3C they are not.\n"
+    rows = [{**run, "agent": name} for name, runs in data["agents"].items() for run in runs]
+    columns: Columns = {
+        "agent": "agent",
+        "seed": "seed",
+        "training base steps": lambda run: run.get("train_base_steps", 0),
+        "solved": "test.solved/test.mazes",
+        "base steps, mean": "test.base_steps_mean",
+        "median": "test.base_steps_median",
+    }
+    return of_rows(rows, columns) + (
+        "\nThe dissertation's Figure 3.6 has no numbers in its text: with goals the mazes are "
+        "solved consistently and quickly, by plain A3C they are not.\n"
     )
 
 
 def labmaze(data: dict[str, Any]) -> str:
-    sizes, wrong = [], []
-    for name, result in data["results"].items():
-        learner, seed, *what = name.replace(",", "").split()
-        if what[0] == "size":
-            sizes.append(
-                [
-                    f"{result['size']} x {result['size']}",
-                    f"{learner}, seed {seed}",
-                    f"{result['solved']} of {result['mazes']}",
-                    result["frames"]["mean"],
-                    result["frames_over_script"],
-                    result["simulated_frames"]["mean"],
-                ]
-            )
-        elif "fps" in result:
-            wrong.append(
-                [
-                    f"{result['fps']} frames a second, friction {result['friction']}",
-                    f"{learner}, seed {seed}",
-                    f"{result['solved']} of {result['mazes']}",
-                    result["solved_by_the_first_plan"],
-                    result["num_plans"]["mean"],
-                ]
-            )
-    head = ["test mazes", "worker", "solved", "frames", "over the script's", "simulated frames"]
-    text = table(head, sizes)
+    def named(name: str, row: dict[str, Any]) -> dict[str, Any]:
+        learner, seed = name.replace(",", "").split()[:2]
+        return {**row, "worker": f"{learner}, seed {seed}"}
+
+    rows = {name: named(name, row) for name, row in data["results"].items()}
+    sizes: Columns = {
+        "test mazes": lambda row: f"{row['size']} x {row['size']}",
+        "worker": "worker",
+        "solved": "solved/mazes",
+        "frames": "frames.mean",
+        "over the script's": "frames_over_script",
+        "simulated frames": "simulated_frames.mean",
+    }
+    real: Columns = {
+        "real env": lambda row: f"{row['fps']} frames a second, friction {row['friction']}",
+        "worker": "worker",
+        "solved": "solved/mazes",
+        "by the first plan": "solved_by_the_first_plan",
+        "plans": "num_plans.mean",
+    }
+    wrong = [row for row in rows.values() if "fps" in row]
+    text = of_rows([row for name, row in rows.items() if name.split()[2] == "size"], sizes)
     if wrong:
         text += "\nThe real env's clock and friction differ from the model's (60, 6.0); a new plan "
-        text += "after every option:\n\n"
-        text += table(["real env", "worker", "solved", "by the first plan", "plans"], wrong)
+        text += "after every option:\n\n" + of_rows(wrong, real)
     return text + (
-        "\nThe source (Figure 4.10): the time to solve falls until about 40,000 training steps; "
-        "after that every random maze is solved at the first trial.\n"
+        "\nThe dissertation (Figure 4.10): the time to solve falls until about 40,000 training "
+        "steps; after that every random maze is solved at the first trial.\n"
     )
 
 
 def worker(data: dict[str, Any]) -> str:
-    head = ["training base steps", "seed", "solved", "simulated base steps", "(95 %)"]
-    head += ["episode", "accuracy at 25 / 50 / 100", "smallest angle"]
-    rows = [
-        [
-            row["train_base_steps"],
-            row["seed"],
-            f"{row['mazes']['solved']} of {row['mazes']['starts']}",
-            row["mazes"]["simulated_steps"]["median"],
-            row["mazes"]["simulated_steps"]["p95"],
-            row["mazes"]["episode_steps"]["median"],
-            " / ".join(f"{row['sampled'][k]['accuracy']:.2f}" for k in ("25", "50", "100")),
-            row["greedy"]["25"]["angle"],
-        ]
-        for row in data["rows"]
-    ]
-    return table(head, rows) + "\nMedians; the accuracy is of the discriminator, worker sampling.\n"
+    def accuracy(row: dict[str, Any]) -> str:
+        return " / ".join(f"{row['sampled'][k]['accuracy']:.2f}" for k in ("25", "50", "100"))
+
+    columns: Columns = {
+        "training base steps": "train_base_steps",
+        "seed": "seed",
+        "solved": "mazes.solved/mazes.starts",
+        "simulated base steps": "mazes.simulated_steps.median",
+        "(95 %)": "mazes.simulated_steps.p95",
+        "episode": "mazes.episode_steps.median",
+        "accuracy at 25 / 50 / 100": accuracy,
+        "smallest angle": "greedy.25.angle",
+    }
+    note = "\nMedians; the accuracy is of the discriminator, worker sampling.\n"
+    return of_rows(data["rows"], columns) + note
 
 
 def objectives(data: list[dict[str, Any]]) -> str:
-    rows = []
-    for name in dict.fromkeys(row["objective"] for row in data):
-        runs = [row for row in data if row["objective"] == name]
-        rows.append(
-            [
-                name,
-                by_seed(run["seed"] for run in runs),
-                by_seed(run["solved"] for run in runs) + f" of {runs[0]['starts']}",
-                by_seed(round(run["simulated_steps"]["median"]) for run in runs),
-                by_seed(run["smallest_angle"] for run in runs),
-                round(statistics.mean(run["train_seconds"] for run in runs)),
-            ]
-        )
-    head = ["objective", "seeds", "solved", "simulated base steps, median", "smallest angle"]
-    return table([*head, "training, s"], rows)
+    columns: Columns = {
+        "objective": "objective",
+        "seeds": "seed",
+        "solved": "solved/starts",
+        "simulated base steps, median": rounded("simulated_steps.median"),
+        "smallest angle": "smallest_angle",
+        "training, s": lambda runs: round(statistics.mean(run["train_seconds"] for run in runs)),
+    }
+    return of_groups(data, "objective", columns)
 
 
 def learned_manager(data: dict[str, Any]) -> str:
-    seeds = data["seeds"]
-    names = dict.fromkeys(name for run in seeds.values() for name in run["planners"])
-    rows = []
-    for name in names:
-        runs = [run["planners"][name] for run in seeds.values() if name in run["planners"]]
-        rows.append(
-            [
-                name,
-                by_seed(run["solved"] for run in runs),
-                by_seed(round(run["simulated_steps"]["median"]) for run in runs),
-                by_seed(round(run["simulated_steps"]["mean"]) for run in runs),
-            ]
-        )
-    head = ["planner", "solved of 342", "simulated base steps, median", "mean"]
-    return table(head, rows) + f"\nSeeds {', '.join(seeds)}; iterations are counted from 0.\n"
+    seeds = data["seeds"].values()
+    rows = [{**row, "planner": name} for run in seeds for name, row in run["planners"].items()]
+    columns: Columns = {
+        "planner": "planner",
+        "solved of 342": "solved",
+        "simulated base steps, median": rounded("simulated_steps.median"),
+        "mean": rounded("simulated_steps.mean"),
+    }
+    note = f"\nSeeds {', '.join(data['seeds'])}; iterations are counted from 0.\n"
+    return of_groups(rows, "planner", columns) + note
 
 
 def option_model(data: dict[str, Any]) -> str:
-    rows = []
-    for name in dict.fromkeys(row["name"] for row in data["rows"]):
-        runs = [row for row in data["rows"] if row["name"] == name]
-        rows.append(
-            [
-                name,
-                by_seed(run["seed"] for run in runs),
-                by_seed(run["solved"] for run in runs) + f" of {runs[0]['mazes']}",
-                by_seed(run["episode_steps"]["median"] for run in runs),
-            ]
-        )
-    return table(["planned in", "seeds", "solved", "base steps of an episode, median"], rows)
+    columns: Columns = {
+        "planned in": "name",
+        "seeds": "seed",
+        "solved": "solved/mazes",
+        "base steps of an episode, median": "episode_steps.median",
+    }
+    return of_groups(data["rows"], "name", columns)
 
 
 def growing(data: dict[str, Any]) -> str:
-    rows = []
-    for name in dict.fromkeys(row["skills"] for row in data["rows"]):
-        runs = [row for row in data["rows"] if row["skills"] == name]
-        mazes = [run["mazes"] for run in runs]
-        rows.append(
-            [
-                name,
-                by_seed(run["seed"] for run in runs),
-                by_seed(run["skills_at_the_end"] for run in runs),
-                by_seed(maze["solved"] for maze in mazes) + f" of {mazes[0]['starts']}",
-                by_seed(round(maze["simulated_steps"]["mean"]) for maze in mazes),
-            ]
-        )
-    return table(["skills", "seeds", "at the end", "solved", "simulated base steps, mean"], rows)
+    columns: Columns = {
+        "skills": "skills",
+        "seeds": "seed",
+        "at the end": "skills_at_the_end",
+        "solved": "mazes.solved/mazes.starts",
+        "simulated base steps, mean": rounded("mazes.simulated_steps.mean"),
+    }
+    return of_groups(data["rows"], "skills", columns)
 
 
 def rounds(data: dict[str, Any]) -> str:
-    rows = [
-        [
-            name,
-            run["seed"],
-            run["training_base_steps"],
-            run["rounds"],
-            f"{run['final']['solved']} of {run['final']['starts']}",
-            run["final"]["simulated_steps"]["median"],
-            run["final"]["episode_steps"]["median"],
-        ]
-        for name, runs in data["runs"].items()
-        for run in runs
-    ]
-    head = ["worker", "seed", "base steps of its rounds", "rounds", "solved"]
-    return table([*head, "simulated", "episode"], rows) + "\nBase steps, medians.\n"
+    rows = [{**run, "worker": name} for name, runs in data["runs"].items() for run in runs]
+    columns: Columns = {
+        "worker": "worker",
+        "seed": "seed",
+        "base steps of its rounds": "training_base_steps",
+        "rounds": "rounds",
+        "solved": "final.solved/final.starts",
+        "simulated": "final.simulated_steps.median",
+        "episode": "final.episode_steps.median",
+    }
+    return of_rows(rows, columns) + "\nBase steps, medians.\n"
 
 
 def training_speed(data: dict[str, Any]) -> str:
@@ -276,19 +284,19 @@ def peers(data: dict[str, Any]) -> str:
 
 def waterworld_plans(data: dict[str, Any]) -> str:
     rows = [
-        [
-            name.replace("_", " "),
-            f"{row['solved']} of {row['mazes']}",
-            row["simulated_base_steps"]["median"],
-            row["simulated_base_steps"]["p95"],
-            row["first_plan_base_steps"]["median"],
-        ]
+        {**row, "search": name.replace("_", " ")}
         for name, row in data.items()
         if isinstance(row, dict) and "solved" in row
     ]
-    head = ["search", "solved", "simulated base steps, median", "(95 %)", "plan, median"]
+    columns: Columns = {
+        "search": "search",
+        "solved": "solved/mazes",
+        "simulated base steps, median": "simulated_base_steps.median",
+        "(95 %)": "simulated_base_steps.p95",
+        "plan, median": "first_plan_base_steps.median",
+    }
     long = data["long_search"]
-    return table(head, rows) + (
+    return of_rows(rows, columns) + (
         f"\nOne worker, seed {data['arguments']['seed']}. First plans are "
         f"{number(long['first_plan_over_best']['median'])} times (95 %: "
         f"{number(long['first_plan_over_best']['p95'])}) the best plan that a search of "
@@ -298,27 +306,25 @@ def waterworld_plans(data: dict[str, Any]) -> str:
 
 
 def planner_costs(data: dict[str, Any]) -> str:
-    rows = [
-        [
-            name,
-            data[name]["ms_per_expansion"],
-            data[name]["planner_ms_per_expansion"],
-            f"{100 * data[name]['planner_share']:.1f} %",
-        ]
-        for name in ("waterworld", "atari")
-        if name in data
-    ]
-    return table(["simulator", "ms per expansion", "of it the planner's", "share"], rows)
+    columns: Columns = {
+        "simulator": "simulator",
+        "ms per expansion": "ms_per_expansion",
+        "of it the planner's": "planner_ms_per_expansion",
+        "share": lambda row: f"{100 * row['planner_share']:.1f} %",
+    }
+    names = [name for name in ("waterworld", "atari") if name in data]
+    return of_rows([{**data[name], "simulator": name} for name in names], columns)
 
 
 def a3c(data: dict[str, Any]) -> str:
-    rows = [
-        [run["seed"], "yes" if run["solved"] else "no", run["frames"], run["mean_return"]]
-        for run in data["cartpole"]
-    ]
-    text = table(["CartPole-v1, seed", "solved", "frames", "mean return"], rows)
-    speeds = data.get("asynchrony")
-    if speeds:
+    columns: Columns = {
+        "CartPole-v1, seed": "seed",
+        "solved": lambda run: "yes" if run["solved"] else "no",
+        "frames": "frames",
+        "mean return": "mean_return",
+    }
+    text = of_rows(data["cartpole"], columns)
+    if speeds := data.get("asynchrony"):
         text += (
             f"\nTwo learners make {speeds['ratio']} times the base steps per second of one "
             f"(median of {len(speeds['ratios'])} pairs of runs: {by_seed(speeds['ratios'])}).\n"
@@ -327,24 +333,21 @@ def a3c(data: dict[str, Any]) -> str:
 
 
 def lab_speed(data: list[dict[str, Any]]) -> str:
-    rows = [[r["how"], r["writes"], r["num_steps"], r["frames_per_second"]] for r in data]
-    return table(["how", "writes", "frames per step", "frames per second"], rows)
+    names = {"frames per step": "num_steps", "frames per second": "frames_per_second"}
+    return of_rows(data, {"how": "how", "writes": "writes", **names})
 
 
 def atari_speed(data: dict[str, Any]) -> str:
-    rows = [
-        [
-            game["game"],
-            *(
-                game[who][key]
-                for key in ("frames_per_second", "frames_per_cpu_second")
-                for who in ("agent", "bare", "ratio")
-            ),
-        ]
-        for game in data["games"]
-    ]
-    heads = ["game", "agent, frames per second", "bare emulators, as many", "ratio"]
-    return table([*heads, "agent, frames per CPU second", "bare", "ratio"], rows)
+    columns: Columns = {
+        "game": "game",
+        "agent, frames per second": "agent.frames_per_second",
+        "bare emulators, as many": "bare.frames_per_second",
+        "ratio": "ratio.frames_per_second",
+        "agent, frames per CPU second": "agent.frames_per_cpu_second",
+        "bare": "bare.frames_per_cpu_second",
+        "ratio of these": "ratio.frames_per_cpu_second",
+    }
+    return of_rows(data["games"], columns)
 
 
 def atari_waves(data: dict[str, Any]) -> str:
@@ -356,7 +359,7 @@ def atari_waves(data: dict[str, Any]) -> str:
         [
             *key,
             ", ".join(f"{run['score']:g}" for run in runs),
-            round(sum(run["simulated_per_real_step"] for run in runs) / len(runs)),
+            round(statistics.mean(run["simulated_per_real_step"] for run in runs)),
         ]
         for key, runs in groups.items()
     ]
@@ -371,10 +374,13 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             "demo/seeds.csv",
             demo,
             (
-                ("demo/episode.gif", "A test maze, the plan, and the worker that carries it out"),
+                ("demo/episode.gif", "A test maze, the plan, and the worker that executes it"),
                 ("demo/search.png", "The search for that plan: where options led, and the tree"),
                 ("demo/skills.png", "Ten mini-episodes of each skill"),
-                ("demo/losses.png", "The source's figures 4.6 to 4.9: training of the worker"),
+                (
+                    "demo/losses.png",
+                    "Figures 4.6 to 4.9: training of the worker",
+                ),
             ),
             ("demo/metrics.json",),
         ),
@@ -402,10 +408,13 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             "goals/goal_agent.json",
             goal_agent,
             (
-                ("goals/goal_agent.png", "The source's figure 3.6: test mazes while it learns"),
-                ("goals/episode.png", "The source's figure 3.5: goals over the maze"),
-                ("goals/search.png", "The source's figure 3.4: the search over tiles"),
-                ("goals/macro_env.png", "The source's figure 3.2: the macro environment"),
+                (
+                    "goals/goal_agent.png",
+                    "Figure 3.6: test mazes while it learns",
+                ),
+                ("goals/episode.png", "Figure 3.5: goals over the maze"),
+                ("goals/search.png", "Figure 3.4: the search over tiles"),
+                ("goals/macro_env.png", "Figure 3.2: the macro environment"),
                 ("goals/episode.gif", "An episode"),
             ),
         ),
@@ -418,9 +427,12 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             labmaze,
             (
                 ("lab/episode.gif", "A test maze: the plan, the player, and what it sees"),
-                ("lab/skills.png", "The source's figure 4.5: ten mini-episodes of each skill"),
-                ("lab/search.png", "The source's figure 4.4: the search"),
-                ("lab/mazes.png", "The source's figure 4.3: random mazes"),
+                (
+                    "lab/skills.png",
+                    "Figure 4.5: ten mini-episodes of each skill",
+                ),
+                ("lab/search.png", "Figure 4.4: the search"),
+                ("lab/mazes.png", "Figure 4.3: random mazes"),
             ),
         ),
     ),
@@ -435,14 +447,3 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
         Section("Atari: leaves that are simulated together", "atari/waves.json", atari_waves),
     ),
 }
-
-# Dissertation, table 5.1 and table A.1 (mean of the best of seven algorithms of OpenAI Baselines).
-ATARI = (
-    ("BeamRider", 6823, 3, 20, "2171 (acktr)"),
-    ("Breakout", 464, 3, 30, "131 (deepq)"),
-    ("Enduro", 708, 4, 20, "480 (deepq)"),
-    ("SpaceInvaders", 1343, 4, 30, "657 (acer)"),
-    ("Qbert", 19839, 5, 10, "7185 (ppo2_mpi)"),
-    ("Seaquest", 1904, 5, 10, "1383 (ppo2_mpi)"),
-    ("Pong", 20, 3, 10, "16.5 (deepq)"),
-)

@@ -62,7 +62,7 @@ plt.show()
 # what is possible, and whether the env is right, before anything is trained.
 
 from torchrl_hmcts.trainers import ScriptedExpert, run_goal_episodes
-from torchrl_hmcts.trainers.figures.goal_figures import draw_goals
+from torchrl_hmcts.trainers.figures.goals import draw_goals
 
 episodes = run_goal_episodes(tests, ScriptedExpert(), starts, record=True)
 summary = episodes.summary()

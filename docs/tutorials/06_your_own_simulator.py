@@ -20,7 +20,7 @@ import math
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import PendulumEnv, TransformedEnv
-from torchrl_hmcts.planners import UCT, HighestValue, MaxBackup, MCTSPlanner, SearchBudget
+from torchrl_hmcts.planners import UCT, HighestValue, MCTSPlanner, SearchBudget
 from torchrl_hmcts.transforms import OptionTransform
 
 torque = torch.tensor([[-2.0], [0.0], [2.0]])
@@ -44,7 +44,7 @@ start = env.reset(start, set_state=True)
 planner = MCTSPlanner(
     make_pendulum(),
     tree_policy=UCT(c=5.0),
-    backup=MaxBackup(),
+    backup="max",
     final_choice=HighestValue(),
     budget=SearchBudget(expansions=20, until_plan=False),
     leaves_per_wave=10,
@@ -137,7 +137,7 @@ planner = MCTSPlanner(
     make_acrobot(),
     tree_policy=UCT(c=10.0),
     leaf_evaluator=energy,
-    backup=MaxBackup(),
+    backup="max",
     final_choice=HighestValue(),
     budget=SearchBudget(expansions=8, until_plan=False),
     seed=0,

@@ -178,7 +178,7 @@ class DeepMindLabEnv(EnvBase):
         if kwargs.get("set_state"):
             raise RuntimeError(
                 "DeepMindLabEnv cannot be set to a state: the engine has no such call. Plan in "
-                "`env.model`, which can, and act in this env; see ModelBasedControl."
+                "`env.model`, which can, and act in this env; see HierarchicalPolicy."
             )
         draw = torch.randint(len(self.maze_seeds), (), generator=self._generator)
         self._maze = int(draw)

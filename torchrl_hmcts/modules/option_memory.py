@@ -6,7 +6,6 @@ numbers, f numbers compared.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -14,15 +13,16 @@ from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_hmcts.checks import real_number
 from torchrl_hmcts.modules.option_model import OptionModel
-from torchrl_hmcts.modules.skill_mlp import check_positive, key_list
+from torchrl_hmcts.modules.skill_mlp import check_sizes, key_list
 
 
 class OptionMemory:
     r"""Replaces a prediction by what the same option did from nearly the same state.
 
-    With :math:`\phi` the entries ``keys`` side by side and :math:`(s_i, o_i)` the options carried
-    out in the same context, a prediction for :math:`(s, o)` gives way to outcome :math:`i` if
+    With :math:`\phi` the entries ``keys`` side by side and :math:`(s_i, o_i)` the options executed
+    in the same context, a prediction for :math:`(s, o)` gives way to outcome :math:`i` if
 
     .. math:: o_i = o, \qquad i = \arg\min_j \lVert \phi(s) - \phi(s_j) \rVert, \qquad
         \lVert \phi(s) - \phi(s_i) \rVert \le r
@@ -47,8 +47,6 @@ class OptionMemory:
         Contributions to Control: The Third Way", 2007.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillMLP
         >>> model = OptionModel(lambda n: SkillMLP(1, n, num_skills=2), ["place", "option"],
         ...                     {"place": 1}, max_duration=9)
@@ -74,15 +72,10 @@ class OptionMemory:
         option_key: NestedKey = "option",
         capacity: int = 64,
     ) -> None:
-        check_positive("OptionMemory", num_contexts=num_contexts, capacity=capacity)
-        if not (math.isfinite(radius) and radius > 0.0):
-            raise ValueError(
-                f"OptionMemory needs a radius > 0, in units of {keys}; got {radius}. To trust the "
-                f"model alone use no memory."
-            )
+        check_sizes("OptionMemory", num_contexts=num_contexts, capacity=capacity)
         self.model = model
         self.keys = key_list("OptionMemory", keys)
-        self.radius = float(radius)
+        self.radius = real_number("OptionMemory", "radius", radius, above=0.0)
         self.context_key = unravel_key(context_key)
         self.option_key = unravel_key(option_key)
         self.in_keys = [*self.keys, self.context_key, self.option_key]
@@ -132,21 +125,18 @@ class OptionMemory:
             return predicted
         outcome = self._outcome[context[known], slot[known]]
         replaced: TensorDict = predicted.reshape(-1).clone()
-        size, begin = self.model.num_deltas, 0
-        for key, event in self.model.delta_keys.items():
-            end = begin + math.prod(event)
-            value = replaced.get(key)
-            change = outcome[:, begin:end].reshape((-1, *event))
-            value[known] = (td.get(key)[known] + change).to(value.dtype)
-            begin = end
-        for key, column in (
-            (self.model.reward_key, size),
-            (self.model.duration_key, size + 1),
-            (self.model.probability_key, size + 2),
-        ):
-            replaced.get(key)[known] = outcome[:, column : column + 1]
-        replaced.get(self.model.terminated_key)[known] = outcome[:, -1:] > 0.5
-        replaced.get(self.model.disagreement_key)[known] = 0.0
+        model, (reward, duration, ended) = self.model, outcome[:, -3:].split(1, -1)
+        known_values = {
+            **model.changed(td[known], outcome[:, :-3]),
+            model.reward_key: reward,
+            model.duration_key: duration,
+            model.probability_key: ended,
+            model.terminated_key: ended > 0.5,
+            model.disagreement_key: torch.zeros_like(ended),
+        }
+        for key, value in known_values.items():
+            entry = replaced.get(key)
+            entry[known] = value.to(entry.dtype)
         return replaced.reshape(predicted.batch_size)
 
     def _places(self, td: TensorDictBase) -> Tensor:

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
-from torchrl_hmcts.modules.skill_mlp import check_positive, key_list
+from torchrl_hmcts.modules.skill_mlp import check_sizes, key_list
 
 
 class OptionModel(TensorDictModuleBase):
@@ -49,13 +49,11 @@ class OptionModel(TensorDictModuleBase):
             sub-module. Default: none.
         reward_key, duration_key, terminated_key (NestedKey): names of the outcomes, under
             ``"next"``. Defaults ``"reward"``, ``"duration"``, ``"terminated"``.
-        probability_key, disagreement_key (NestedKey): names of two further outputs. Defaults
-            ``"terminated_probability"`` and ``"disagreement"``.
 
     Writes (under ``"next"``): the predicted state entries; the reward and the duration (float
-    ``[*B, 1]``, base steps); terminated (bool ``[*B, 1]``, probability above one half); the
-    probability (float ``[*B, 1]``) and the disagreement (float ``[*B, 1]``: standard deviation
-    over the members, in units of :math:`\sigma`, root of the mean square over the D numbers).
+    ``[*B, 1]``, base steps); terminated (bool ``[*B, 1]``, probability above one half);
+    ``"terminated_probability"`` and ``"disagreement"`` (float ``[*B, 1]``: standard deviation over
+    the members, in units of :math:`\sigma`, root of the mean square over the D numbers).
 
     Raises:
         ValueError: if a number is not positive, no key is given, or the members differ in their
@@ -67,8 +65,6 @@ class OptionModel(TensorDictModuleBase):
         Probabilistic Dynamics Models", 2018, arXiv 1805.12114.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import OptionModel, SkillMLP
         >>> model = OptionModel(lambda n: SkillMLP(2, n, num_skills=4), ["position", "option"],
         ...                     {"position": 2}, max_duration=25, num_models=3)
@@ -79,6 +75,7 @@ class OptionModel(TensorDictModuleBase):
         (torch.Size([5, 2]), torch.Size([5, 1]))
     """
 
+    probability_key, disagreement_key = "terminated_probability", "disagreement"
     output_mean: Tensor
     output_scale: Tensor
 
@@ -94,11 +91,9 @@ class OptionModel(TensorDictModuleBase):
         reward_key: NestedKey = "reward",
         duration_key: NestedKey = "duration",
         terminated_key: NestedKey = "terminated",
-        probability_key: NestedKey = "terminated_probability",
-        disagreement_key: NestedKey = "disagreement",
     ) -> None:
         super().__init__()
-        check_positive("OptionModel", max_duration=max_duration, num_models=num_models)
+        check_sizes("OptionModel", max_duration=max_duration, num_models=num_models)
         if num_models > 1_000:
             raise ValueError(f"OptionModel needs num_models <= 1,000; got {num_models}.")
         if not delta_keys:
@@ -117,24 +112,14 @@ class OptionModel(TensorDictModuleBase):
         self.reward_key = unravel_key(reward_key)
         self.duration_key = unravel_key(duration_key)
         self.terminated_key = unravel_key(terminated_key)
-        self.probability_key = unravel_key(probability_key)
-        self.disagreement_key = unravel_key(disagreement_key)
         self.features = features
-        read = [] if features is None else list(features.in_keys)
+        read = [] if features is None else [unravel_key(key) for key in features.in_keys]
         made = [] if features is None else [unravel_key(key) for key in features.out_keys]
         read += [key for key in self.network_keys if key not in made]
-        self.in_keys = list(dict.fromkeys([*map(unravel_key, read), *self.delta_keys]))
-        self.out_keys = [
-            ("next", *((key,) if isinstance(key, str) else key))
-            for key in (
-                *self.delta_keys,
-                self.reward_key,
-                self.duration_key,
-                self.terminated_key,
-                self.probability_key,
-                self.disagreement_key,
-            )
-        ]
+        self.in_keys = list(dict.fromkeys([*read, *self.delta_keys]))
+        outcome = [self.reward_key, self.duration_key, self.terminated_key]
+        written = [*self.delta_keys, *outcome, self.probability_key, self.disagreement_key]
+        self.out_keys = [unravel_key(("next", key)) for key in written]
         networks = [make_network(self.num_deltas + 3) for _ in range(num_models)]
         if len({id(network) for network in networks}) < num_models:
             raise ValueError(
@@ -172,11 +157,8 @@ class OptionModel(TensorDictModuleBase):
         else:
             disagreement = torch.zeros_like(probability)
         out = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
-        shape, begin = tensordict.batch_size, 0
-        for key, event in self.delta_keys.items():
-            end = begin + math.prod(event)
-            out.set(key, tensordict.get(key) + values[..., begin:end].reshape((*shape, *event)))
-            begin = end
+        for key, value in self.changed(tensordict, values[..., :size]).items():
+            out.set(key, value)
         out.set(self.reward_key, values[..., size : size + 1])
         out.set(self.duration_key, values[..., size + 1 :].clamp(1.0, float(self.max_duration)))
         out.set(self.terminated_key, probability > 0.5)
@@ -191,11 +173,9 @@ class OptionModel(TensorDictModuleBase):
         """
         td = tensordict
         if self.features is not None:
-            td = self.features(td.select(*self.features.in_keys))
-        inputs = []
-        for key in self.network_keys:
-            value = td.get(key, None)
-            inputs.append(tensordict.get(key) if value is None else value)
+            made = self.features(td.select(*self.features.in_keys))
+            td = td.copy().update(made)
+        inputs = [td.get(key) for key in self.network_keys]
         if self.num_models == 1:
             outputs: Tensor = self._run(self.network_params[0], *inputs).unsqueeze(0)
         else:
@@ -231,22 +211,28 @@ class OptionModel(TensorDictModuleBase):
 
         Args:
             tensordict: macro transitions: root entries and ``"next"``.
-            reward_key, duration_key, terminated_key: where the outcomes are, under ``"next"``.
-                Default: the model's names.
+            reward_key, duration_key, terminated_key: of the outcomes. Default: the model's names.
             normalized: subtract the mean and divide by the scale. Default ``True``.
         """
-        after, shape = tensordict.get("next"), tensordict.batch_size
-        parts = [
-            (after.get(key) - tensordict.get(key)).reshape((*shape, -1)) for key in self.delta_keys
-        ]
-        parts.append(after.get(reward_key or self.reward_key).reshape((*shape, 1)))
-        parts.append(after.get(duration_key or self.duration_key).reshape((*shape, 1)))
-        dtype = self.output_mean.dtype
-        values = torch.cat([part.to(dtype) for part in parts], -1)
+        after = tensordict.get("next")
+        parts = [after.get(key) - tensordict.get(key) for key in self.delta_keys]
+        parts.append(after.get(reward_key or self.reward_key))
+        parts.append(after.get(duration_key or self.duration_key))
+        parts.append(after.get(terminated_key or self.terminated_key))
+        rows = [part.reshape((*tensordict.batch_size, -1)).to(self.output_mean) for part in parts]
+        values, terminated = torch.cat(rows[:-1], -1), rows[-1]
         if normalized:
             values = (values - self.output_mean) / self.output_scale
-        terminated = after.get(terminated_key or self.terminated_key)
-        return torch.cat((values, terminated.reshape((*shape, 1)).to(dtype)), -1)
+        return torch.cat((values, terminated), -1)
+
+    def changed(self, tensordict: TensorDictBase, deltas: Tensor) -> dict[NestedKey, Tensor]:
+        """Return the predicted state entries after changes ``[*B, D]``."""
+        shape, begin, entries = tensordict.batch_size, 0, {}
+        for key, event in self.delta_keys.items():
+            end = begin + math.prod(event)
+            entries[key] = tensordict.get(key) + deltas[..., begin:end].reshape((*shape, *event))
+            begin = end
+        return entries
 
     @torch.no_grad()
     def fit_normalization(self, tensordict: TensorDictBase) -> OptionModel:

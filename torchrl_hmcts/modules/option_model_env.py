@@ -17,6 +17,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.model_based import ModelBasedEnvBase
 
+from torchrl_hmcts.checks import real_number
 from torchrl_hmcts.modules.option_memory import OptionMemory
 from torchrl_hmcts.modules.option_model import OptionModel
 from torchrl_hmcts.nesting import known_gamma
@@ -38,7 +39,7 @@ class OptionModelEnv(ModelBasedEnvBase):
     .. math:: r = \hat R - \lambda u, \qquad \text{truncated if } u > u_{\max}, \text{ then }
         r \le 0
 
-    so that a planner pays for, or does not go on from, what the model does not know.
+    so that a planner pays for what the model does not know, or stops there.
 
     Args:
         model (OptionModel): trained or still in training; its parameters are read live.
@@ -46,8 +47,6 @@ class OptionModelEnv(ModelBasedEnvBase):
         counter_keys (sequence of NestedKey): integer state entries that count base steps. Where
             one has a bounded spec, reaching its upper bound is ``truncated``, as a time limit is.
             Default: none.
-        threshold (float): probability of an end above which a step is ``terminated``, in (0, 1).
-            Default 0.5.
         min_reward (float): predicted rewards of smaller magnitude are 0. A regression is never
             exactly 0, and a planner that stops at the first reward would stop at noise. Default 0:
             as predicted; for a sparse reward of 1 about 0.25.
@@ -60,8 +59,6 @@ class OptionModelEnv(ModelBasedEnvBase):
             follow from the predicted ones. Default: none.
         starts (TensorDictBase, optional): recorded states ``[M]`` from which ``reset()`` draws.
             Default: drawn from the specs.
-        exclude_keys (sequence of NestedKey): entries of the env's observation that are left out.
-            Default ``("trajectory",)``, the base transitions inside an option.
         batch_size (sequence of int): of the specs and of ``reset()``; any other can be stepped.
             Default none.
         seed (int, optional): of the draws of ``reset()``. Default: from torch's global generator.
@@ -76,21 +73,15 @@ class OptionModelEnv(ModelBasedEnvBase):
         Paying for it: Yu et al., "MOPO", 2020, arXiv 2005.13239.
 
     Examples:
-        >>> import torch
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.envs import TransformedEnv
-        >>> from torchrl_hmcts.modules import OptionModel, OptionModelEnv, SkillMLP
+        >>> from torchrl_hmcts.modules import OptionModel, OptionModelEnv
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> from torchrl_hmcts.transforms import OptionTransform
         >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         >>> real = TransformedEnv(ChainEnv(length=6), OptionTransform(worker, 2, max_steps=2))
-        >>> class Net(torch.nn.Module):
-        ...     def __init__(self, out_features):
-        ...         super().__init__()
-        ...         self.table = torch.nn.Embedding(2, out_features)
-        ...     def forward(self, option):
-        ...         return self.table(option)
-        >>> model = OptionModel(Net, ["option"], {"state": ()}, max_duration=2)
+        >>> table = lambda out_features: torch.nn.Embedding(2, out_features)
+        >>> model = OptionModel(table, ["option"], {"state": ()}, max_duration=2)
         >>> env = OptionModelEnv(model, real)
         >>> env.rollout(3, break_when_any_done=False)["next", "state"].shape
         torch.Size([3])
@@ -104,29 +95,21 @@ class OptionModelEnv(ModelBasedEnvBase):
         env: EnvBase,
         *,
         counter_keys: Sequence[NestedKey] = (),
-        threshold: float = 0.5,
         min_reward: float = 0.0,
         disagreement_coeff: float = 0.0,
         max_disagreement: float | None = None,
         memory: OptionMemory | None = None,
         readout: TensorDictModuleBase | None = None,
         starts: TensorDictBase | None = None,
-        exclude_keys: Sequence[NestedKey] = ("trajectory",),
         batch_size: Sequence[int] = (),
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        if not 0.0 < threshold < 1.0:
-            raise ValueError(
-                f"OptionModelEnv needs a threshold in (0, 1), a probability; got {threshold}."
-            )
-        for name, value in (
-            ("min_reward", min_reward),
-            ("disagreement_coeff", disagreement_coeff),
-            ("max_disagreement", 0.0 if max_disagreement is None else max_disagreement),
-        ):
-            if not value >= 0.0:
-                raise ValueError(f"OptionModelEnv needs {name} >= 0; got {value}.")
+        owner = "OptionModelEnv"
+        min_reward = real_number(owner, "min_reward", min_reward, least=0.0)
+        disagreement_coeff = real_number(owner, "disagreement_coeff", disagreement_coeff, least=0.0)
+        if max_disagreement is not None:
+            real_number(owner, "max_disagreement", max_disagreement, least=0.0)
         if model.num_models == 1 and (max_disagreement is not None or disagreement_coeff):
             raise ValueError(
                 "OptionModelEnv is to heed the disagreement of the members, and the model has one "
@@ -134,7 +117,6 @@ class OptionModelEnv(ModelBasedEnvBase):
             )
         device = (env.device or "cpu") if device is None else device
         super().__init__(model, device=device, batch_size=torch.Size(batch_size))
-        self.threshold = threshold
         self.min_reward = min_reward
         self.disagreement_coeff = disagreement_coeff
         self.max_disagreement = max_disagreement
@@ -142,7 +124,7 @@ class OptionModelEnv(ModelBasedEnvBase):
         self.memory = memory
         self.readout = readout
         self.counter_keys = [unravel_key(key) for key in counter_keys]
-        self._copy_specs(env, [unravel_key(key) for key in exclude_keys])
+        self._copy_specs(env)
         self._check_entries(type(env.base_env if hasattr(env, "base_env") else env).__name__)
         self.starts = None if starts is None else starts.reshape(-1).to(self.device)
         self._generator = torch.Generator()
@@ -153,26 +135,22 @@ class OptionModelEnv(ModelBasedEnvBase):
         """The option model; TorchRL's name for it is ``world_model``."""
         return self.world_model
 
-    def _copy_specs(self, env: EnvBase, exclude_keys: list[NestedKey]) -> None:
-        def unbatched(spec: Composite) -> Composite:
+    def _copy_specs(self, env: EnvBase) -> None:
+        def own(spec: Composite) -> Composite:
             return spec.clone().to(self.device)
 
-        observation = unbatched(env.full_observation_spec_unbatched)
-        for key in exclude_keys:
-            if key in observation.keys(True):
-                del observation[key]
-        for key, spec in unbatched(env.full_state_spec_unbatched).items(True, True):
+        observation = own(env.full_observation_spec_unbatched)
+        if "trajectory" in observation.keys():  # the base transitions inside an option
+            del observation["trajectory"]
+        for key, spec in own(env.full_state_spec_unbatched).items(True, True):
             if key not in observation.keys(True, True):
                 observation[key] = spec
         # All that a step reads, and no more: a real env may declare no state, and a planner
         # stores one for every node.
-        options = {unravel_key(key) for key in env.action_keys}
-        reads = {unravel_key(key) for key in env.full_state_spec.keys(True, True)} - options
-        reads |= {*self.model.in_keys, *self.counter_keys} - options
-        if self.memory is not None:
-            reads |= set(self.memory.in_keys) - options
-        if self.readout is not None:
-            reads |= {unravel_key(key) for key in self.readout.in_keys}
+        readers = [r for r in (self.model, self.memory, self.readout) if r is not None]
+        keys = [*env.full_state_spec.keys(True, True), *self.counter_keys]
+        keys += [key for reader in readers for key in reader.in_keys]
+        reads = {unravel_key(key) for key in keys} - {unravel_key(key) for key in env.action_keys}
         state = Composite(device=self.device)
         for key, spec in observation.items(True, True):
             if unravel_key(key) in reads:
@@ -180,9 +158,9 @@ class OptionModelEnv(ModelBasedEnvBase):
         shape = self.batch_size
         self.state_spec = state.expand(shape)
         self.observation_spec = observation.expand(shape)
-        self.action_spec = unbatched(env.full_action_spec_unbatched).expand(shape)
-        self.reward_spec = unbatched(env.full_reward_spec_unbatched).expand(shape)
-        self.done_spec = unbatched(env.full_done_spec_unbatched).expand(shape)
+        self.action_spec = own(env.full_action_spec_unbatched).expand(shape)
+        self.reward_spec = own(env.full_reward_spec_unbatched).expand(shape)
+        self.done_spec = own(env.full_done_spec_unbatched).expand(shape)
 
     def _check_entries(self, name: str) -> None:
         model = self.model
@@ -204,28 +182,21 @@ class OptionModelEnv(ModelBasedEnvBase):
                     f"The option model predicts {key!r} of shape {list(shape)}; in {name} it has "
                     f"{list(entries[key].shape)}. Name that shape in delta_keys."
                 )
-        for keys, kind in ((self.reward_keys, "reward"), (self.done_keys, "done")):
-            if kind == "reward" and [unravel_key(k) for k in keys] != [model.reward_key]:
-                raise ValueError(
-                    f"The option model predicts one reward, {model.reward_key!r}; {name} has "
-                    f"{list(keys)}."
-                )
-        last = {k if isinstance(k, str) else k[-1]: unravel_key(k) for k in self.done_keys}
-        self._done_leaves = last
-        self._carried = [
-            key
-            for key in entries
-            if key not in model.delta_keys
-            and key not in self.counter_keys
-            and key != model.duration_key
-        ]
-        self._writes_duration = model.duration_key in entries
-        self._bounds = {
-            key: _bounds(entries[key]) for key in (*model.delta_keys, *self.counter_keys)
+        if [unravel_key(key) for key in self.reward_keys] != [model.reward_key]:
+            raise ValueError(
+                f"The option model predicts one reward, {model.reward_key!r}; {name} has "
+                f"{list(self.reward_keys)}."
+            )
+        self._done_leaves = {
+            key if isinstance(key, str) else key[-1]: unravel_key(key) for key in self.done_keys
         }
-        self._dtypes = {key: entries[key].dtype for key in self._bounds}
-        if self._writes_duration:
-            self._dtypes[model.duration_key] = entries[model.duration_key].dtype
+        self._predicted = {
+            key: entries[key]
+            for key in (*model.delta_keys, *self.counter_keys, model.duration_key)
+            if key in entries
+        }
+        self._bounds = {key: _bounds(spec) for key, spec in self._predicted.items()}
+        self._carried = [key for key in entries if key not in self._predicted]
         self._reward_dtype = self.full_reward_spec_unbatched[model.reward_key].dtype
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -240,9 +211,9 @@ class OptionModelEnv(ModelBasedEnvBase):
         for key in model.delta_keys:
             out.set(key, self._fit(key, predicted.get(key)))
         duration = predicted.get(model.duration_key).round().to(torch.int64)
-        if self._writes_duration:
-            out.set(model.duration_key, duration.to(self._dtypes[model.duration_key]))
-        terminated = predicted.get(model.probability_key) > self.threshold
+        if model.duration_key in self._predicted:
+            out.set(model.duration_key, duration.to(self._predicted[model.duration_key].dtype))
+        terminated = predicted.get(model.terminated_key)
         truncated = torch.zeros_like(terminated)
         for key in self.counter_keys:
             count = tensordict.get(key)
@@ -268,7 +239,7 @@ class OptionModelEnv(ModelBasedEnvBase):
 
     def _fit(self, key: NestedKey, value: Tensor) -> Tensor:
         """Bring a predicted entry into the form and the bounds of its spec."""
-        dtype, bounds = self._dtypes[key], self._bounds[key]
+        dtype, bounds = self._predicted[key].dtype, self._bounds[key]
         if not dtype.is_floating_point and value.is_floating_point():
             value = value.round()
         if bounds is not None:
@@ -277,32 +248,26 @@ class OptionModelEnv(ModelBasedEnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         keys = list(self.full_observation_spec.keys(True, True))
-        shape = self.batch_size if tensordict is None else tensordict.batch_size
+        given = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
+        shape = given.batch_size
         zero = self.full_observation_spec_unbatched.zero(shape)
         if kwargs.get("set_state"):
-            missing = [
-                key
-                for key in self.full_state_spec.keys(True, True)
-                if tensordict is None or tensordict.get(key, None) is None
-            ]
-            if tensordict is None or missing:
+            needed = self.full_state_spec.keys(True, True)
+            missing = [key for key in needed if given.get(key, None) is None]
+            if missing:
                 raise ValueError(
                     f"reset(td, set_state=True) needs the whole state in td; missing: {missing}. "
                     f'Pass a tensordict as the real env\'s reset() or step(td)["next"] gives it.'
                 )
-            return zero.update(tensordict.select(*keys, strict=False))
+            return zero.update(given.select(*keys, strict=False))
         if self.starts is not None:
             rows = torch.randint(len(self.starts), shape, generator=self._generator)
             return zero.update(self.starts[rows.to(self.device)].select(*keys, strict=False))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**31, (), generator=self._generator)))
             drawn = self.full_observation_spec_unbatched.rand(shape)
-        drawn.set(self.model.duration_key, zero.get(self.model.duration_key)) if (
-            self._writes_duration
-        ) else None
-        for key in self.counter_keys:
-            drawn.set(key, zero.get(key))
-        return drawn
+        counted = [key for key in self._predicted if key not in self.model.delta_keys]
+        return drawn.update(zero.select(*counted))
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:

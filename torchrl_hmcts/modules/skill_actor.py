@@ -7,21 +7,19 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import InteractionType, TensorDictModuleBase
+from tensordict.nn import InteractionType, NormalParamExtractor, TensorDictModuleBase
 from tensordict.nn.probabilistic import interaction_type
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.data import (
-    Binary,
-    Categorical,
-    Composite,
-    MultiCategorical,
-    MultiOneHot,
-    OneHot,
-    TensorSpec,
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
+from torchrl.modules import (
+    OneHotCategorical,
+    ProbabilisticActor,
+    ReparamGradientStrategy,
+    TanhNormal,
 )
-from torchrl.modules import OneHotCategorical, ProbabilisticActor, ReparamGradientStrategy
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, entries, key_list
 
 
@@ -64,18 +62,95 @@ def is_to_sample(deterministic: bool) -> bool:
     return not deterministic and interaction_type() in (None, InteractionType.RANDOM)
 
 
+class _Choice:
+    """One of A actions, from A logits."""
+
+    writes = ("logits",)
+    distribution_kwargs: dict[str, Any] = {}
+
+    def __init__(self, spec: TensorSpec) -> None:
+        self.size = self.num_actions = int(spec.space.n)
+        self.one_hot = isinstance(spec, OneHot)
+        self.distribution: type = _OneHotCategorical if self.one_hot else _Categorical
+        self.spec = OneHot(self.size, dtype=spec.dtype) if self.one_hot else Categorical(self.size)
+
+    def choose(
+        self, logits: Tensor, deterministic: bool, generator: torch.Generator | None
+    ) -> Tensor:
+        if not deterministic:
+            # Gumbel-max: argmax(logits - log E) with E exponential is a draw from softmax(logits).
+            noise = torch.empty_like(logits).exponential_(generator=generator)
+            logits = logits - noise.log_()
+        action = logits.argmax(-1)
+        if self.one_hot:
+            action = nn.functional.one_hot(action, self.size).to(self.spec.dtype)
+        return action
+
+
+class _Squashed:
+    """An action between bounds ``[D]``, from the 2 D raw parameters of a Gaussian."""
+
+    writes = ("loc", "scale")
+    distribution = TanhNormal
+
+    def __init__(self, spec: Bounded) -> None:
+        ends = torch.stack((spec.space.low, spec.space.high)).expand(2, *spec.shape)
+        flat = ends.reshape(2, -1, spec.shape[-1])
+        if not flat.isfinite().all() or not (flat == flat[:, :1]).all():
+            raise ValueError(
+                "SkillActor needs finite bounds of the action that are the same for the whole "
+                f"batch; got {ends.tolist()}."
+            )
+        low, high = flat[:, 0].clone()
+        self.size = 2 * low.shape[-1]
+        self.spec = Bounded(low, high, shape=low.shape, dtype=low.dtype)
+        self.distribution_kwargs = {"low": low, "high": high}
+        self.middle, self.half_range = (high + low) / 2, (high - low) / 2
+
+    def choose(
+        self, outputs: Tensor, deterministic: bool, generator: torch.Generator | None
+    ) -> Tensor:
+        loc, scale = _gaussian(outputs)
+        if not deterministic:
+            loc = loc + scale * torch.empty_like(loc).normal_(generator=generator)
+        return self.half_range.to(loc) * loc.tanh() + self.middle.to(loc)
+
+
+_gaussian = NormalParamExtractor()
+
+
+class _GaussianNetwork(SkillNetwork):
+    """Writes the location and scale that a network's outputs stand for."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        outputs = self.network(*entries(self, tensordict, self.in_keys))
+        for key, value in zip(self.out_keys, _gaussian(outputs), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+
 class SkillActor(ProbabilisticActor):
-    r"""A discrete policy pi(a | s, z) with shared layers and one head per skill.
+    r"""A policy pi(a | s, z) with shared layers and one head per skill.
 
     .. math:: \pi(a \mid s, z) = \mathrm{softmax}_a(\mathrm{SkillMLP}(s, z))
 
-    It is the actor TorchRL's discrete losses want (a ``ProbabilisticTensorDictSequential``). Inside
-    options use the lean :class:`SkillPolicy` over the same parameters.
+    for discrete actions. For continuous ones it is a squashed Gaussian, with :math:`l, h` the
+    bounds of the action:
+
+    .. math::
+
+        a = \tfrac{h - l}{2} \tanh(u) + \tfrac{h + l}{2}, \qquad
+        u \sim \mathcal{N}(\mu, \sigma^2), \qquad (\mu, \sigma) = \mathrm{SkillMLP}(s, z)
+
+    It is the actor TorchRL's losses want (a ``ProbabilisticTensorDictSequential``). Inside options
+    use the lean :class:`SkillPolicy` over the same parameters.
 
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
-        action_spec (TensorSpec): the env's action spec, a ``Categorical`` (action int64 ``[*B]``)
-            or a ``OneHot`` (action ``[*B, A]``) with ``A`` actions.
+        action_spec (TensorSpec): the env's action spec: a ``Categorical`` (action int64 ``[*B]``)
+            or ``OneHot`` (action ``[*B, A]``) with ``A`` actions, or a ``Bounded`` of floats with
+            the last dimension ``D`` (action ``[*B, D]``); leading (batch) dimensions must have the
+            same bounds.
         num_skills (int): number of skills.
         in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
         skill_key (NestedKey): entry of the skill, int64 ``[*B]``. Default ``"skill"``.
@@ -86,21 +161,23 @@ class SkillActor(ProbabilisticActor):
             :class:`SkillMLP`; e.g. :class:`ConcatSkillMLP` for a skill that is concatenated.
 
     Raises:
-        ValueError: if the action spec is neither ``Categorical`` nor ``OneHot``.
+        ValueError: if the action spec is none of these, or its bounds are not finite.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4.
+        Squashing: Haarnoja et al., "Soft Actor-Critic", 2018, arXiv 1801.01290, appendix C.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl.data import Categorical
+        >>> from torchrl.data import Bounded, Categorical
         >>> from torchrl_hmcts.modules import SkillActor
-        >>> actor = SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"])
         >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
         ...                 batch_size=[5])
-        >>> actor(td)["action"].shape
+        >>> for spec in (Categorical(4), Bounded(-1.0, 1.0, shape=(3,))):
+        ...     actor = SkillActor(2, spec, num_skills=3, in_keys=["velocity"])
+        ...     print(actor(td)["action"].shape)
         torch.Size([5])
+        torch.Size([5, 3])
     """
 
     def __init__(
@@ -116,56 +193,61 @@ class SkillActor(ProbabilisticActor):
         activation: Callable[[], nn.Module] = nn.ReLU,
         network: Callable[..., nn.Module] = SkillMLP,
     ) -> None:
-        spec, one_hot = _leaf_spec(action_spec, action_key)
-        num_actions = int(spec.space.n)
         action_key = unravel_key(action_key)
-        logits_key = "logits" if isinstance(action_key, str) else (*action_key[:-1], "logits")
-        net = network(in_features, num_actions, num_skills, hidden, activation)
+        kind = _kind_of_action(action_spec, action_key)
+        group = () if isinstance(action_key, str) else action_key[:-1]
+        written = [unravel_key((*group, name)) for name in kind.writes]
+        net = network(in_features, kind.size, num_skills, hidden, activation)
         keys = [*key_list("SkillActor", in_keys), skill_key]
+        run = (SkillNetwork if isinstance(kind, _Choice) else _GaussianNetwork)(net, keys, *written)
         super().__init__(
-            SkillNetwork(net, keys, logits_key),
-            in_keys={"logits": logits_key},
+            run,
+            in_keys=dict(zip(kind.writes, written, strict=True)),
             out_keys=[action_key],
-            spec=Composite({action_key: spec}),
-            distribution_class=_OneHotCategorical if one_hot else _Categorical,
+            spec=Composite({action_key: kind.spec}),
+            distribution_class=kind.distribution,
+            distribution_kwargs=kind.distribution_kwargs,
             return_log_prob=False,
         )
         self.num_skills = num_skills
-        self.num_actions = num_actions
-        self.one_hot = one_hot
-        self.action_dtype = spec.dtype
+        if isinstance(kind, _Choice):
+            self.num_actions = kind.num_actions
         self.skill_key = unravel_key(skill_key)
         self.action_key = action_key
+        self.choose = kind.choose  # actions for the network's outputs: the best ones, or samples
 
     @property
     def network(self) -> nn.Module:
-        """The network that computes the action logits from the features and the skill."""
+        """The network that computes the logits or the raw parameters of the Gaussian."""
         return self.module[0].network
 
-    def choose(
-        self, logits: Tensor, deterministic: bool, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """Returns actions for the network's outputs ``[*B, A]``: the best ones, or samples."""
-        if not deterministic:
-            # Gumbel-max: argmax(logits - log E) with E exponential is a draw from softmax(logits).
-            noise = torch.empty_like(logits).exponential_(generator=generator)
-            logits = logits - noise.log_()
-        action = logits.argmax(-1)
-        if self.one_hot:
-            action = nn.functional.one_hot(action, self.num_actions).to(self.action_dtype)
-        return action
+
+def _kind_of_action(spec: TensorSpec, action_key: NestedKey) -> _Choice | _Squashed:
+    """Returns how an action of a spec is made of a network's outputs."""
+    if isinstance(spec, Composite) and action_key in spec.keys(True, True):
+        spec = spec[action_key]
+    if type(spec) in (Categorical, OneHot):  # and not of several choices, which are subclasses
+        return _Choice(spec)
+    has_size = isinstance(spec, Bounded) and spec.shape and spec.shape.numel()
+    if has_size and spec.dtype.is_floating_point:
+        return _Squashed(spec)
+    raise ValueError(
+        "SkillActor chooses among a fixed number of actions or within bounds, so it needs a "
+        "Categorical or OneHot action spec, or a Bounded one of floats with a last dimension; got "
+        f"{type(spec).__name__}"
+        + (f" of {spec.dtype}, shape {tuple(spec.shape)}" if isinstance(spec, Bounded) else "")
+        + ". Pass env.action_spec."
+    )
 
 
 class SkillPolicy(TensorDictModuleBase):
     """Acts like a skill actor at a fraction of its cost, sharing its parameters.
 
-    No distribution objects, no spec checks, no gradients: it reads the features and the skill and
-    writes the action. That makes it the worker to run inside options and the collection policy of
-    the trainer, for discrete and for continuous actions.
+    No distribution objects, no spec checks, no gradients: the worker to run inside options and the
+    collection policy of the trainer.
 
     Args:
-        actor (SkillActor or GaussianSkillActor): the actor whose parameters are used; later updates
-            are seen.
+        actor (SkillActor): the actor whose parameters are used; later updates are seen.
         deterministic (bool): take the most probable action (of a Gaussian: its mean, squashed)
             instead of sampling, whatever the exploration type. Default ``False``: sample, unless
             TorchRL's ``set_exploration_type`` asks for ``DETERMINISTIC``, ``MODE`` or ``MEAN``,
@@ -177,14 +259,10 @@ class SkillPolicy(TensorDictModuleBase):
         From ``forward(tensordict)``: the same, with the action of each row: int64 ``[*B]``
         (one-hot: ``[*B, A]``; continuous: ``[*B, D]``).
 
-    Raises:
-        TypeError: if ``actor`` is none of the two.
-
     Reference:
         This project's.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical
         >>> from torchrl_hmcts.modules import SkillActor, SkillPolicy
@@ -192,24 +270,19 @@ class SkillPolicy(TensorDictModuleBase):
         >>> policy = SkillPolicy(actor, deterministic=True)
         >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
         ...                 batch_size=[5])
-        >>> policy(td)["action"].dtype
-        torch.int64
+        >>> torch.equal(policy(td)["action"], actor.get_dist(td).mode)
+        True
     """
 
     def __init__(
         self,
-        actor: ProbabilisticActor,
+        actor: SkillActor,
         *,
         deterministic: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        if not (hasattr(actor, "choose") and hasattr(actor, "network")):
-            raise TypeError(
-                "SkillPolicy runs the network of a SkillActor or GaussianSkillActor without its "
-                f"distribution; got {type(actor).__name__}. Pass one of these, or use your module "
-                "itself as policy."
-            )
+        instance("SkillPolicy", "actor", actor, SkillActor)
         self.network = actor.network
         self.num_skills = actor.num_skills
         self.in_keys = list(actor.module[0].in_keys)
@@ -226,19 +299,3 @@ class SkillPolicy(TensorDictModuleBase):
         deterministic = not is_to_sample(self.deterministic)
         action = self._choose(outputs, deterministic, self.generator)
         return tensordict.set(self.action_key, action)
-
-
-def _leaf_spec(action_spec: TensorSpec, action_key: NestedKey) -> tuple[TensorSpec, bool]:
-    """Returns the unbatched leaf spec and whether it is one-hot."""
-    if isinstance(action_spec, Composite) and action_key in action_spec.keys(True, True):
-        action_spec = action_spec[action_key]
-    several = isinstance(action_spec, (Binary, MultiCategorical, MultiOneHot))
-    if isinstance(action_spec, OneHot) and not several:
-        return OneHot(int(action_spec.space.n), dtype=action_spec.dtype), True
-    if isinstance(action_spec, Categorical) and not several:
-        return Categorical(int(action_spec.space.n)), False
-    raise ValueError(
-        "SkillActor chooses among a fixed number of actions, so it needs a Categorical or OneHot "
-        f"action spec; got {type(action_spec).__name__}. Pass env.action_spec of a discrete env; "
-        "for continuous actions use GaussianSkillActor."
-    )

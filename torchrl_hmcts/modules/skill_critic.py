@@ -7,12 +7,7 @@ from collections.abc import Callable, Sequence
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_hmcts.modules.skill_mlp import (
-    SkillMLP,
-    SkillNetwork,
-    check_positive,
-    key_list,
-)
+from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, check_sizes, key_list
 
 
 class SkillCritic(SkillNetwork):
@@ -23,30 +18,19 @@ class SkillCritic(SkillNetwork):
     Pass one to a loss; TorchRL makes the twin (and the targets) from it.
 
     Args:
-        in_features (int): summed sizes of the entries ``in_keys``.
         num_actions (int): number of actions ``A``.
-        num_skills (int): number of skills.
-        in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
-        skill_key (NestedKey): entry of the skill, int64 ``[*B]``. Default ``"skill"``.
+        in_features, num_skills, in_keys, skill_key: as :class:`SkillActor`'s.
+        hidden, activation, network: so are these.
         action_value_key (NestedKey): entry written, ``[*B, A]``. Default ``"action_value"``.
-        hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
-        activation (callable): builds the activations. Default ``torch.nn.ReLU``.
-        network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
-            :class:`SkillMLP`; e.g. :class:`ConcatSkillMLP` for a skill that is concatenated.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; heads: Bartley, 2023,
         chapter 4.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillCritic
-        >>> critic = SkillCritic(2, num_actions=4, num_skills=3, in_keys=["velocity"])
-        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
-        ...                 batch_size=[5])
-        >>> critic(td)["action_value"].shape
-        torch.Size([5, 4])
+        >>> SkillCritic(2, num_actions=4, num_skills=3, in_keys=["velocity"]).in_keys
+        ['velocity', 'skill']
     """
 
     def __init__(
@@ -62,6 +46,7 @@ class SkillCritic(SkillNetwork):
         activation: Callable[[], nn.Module] = nn.ReLU,
         network: Callable[..., nn.Module] = SkillMLP,
     ) -> None:
+        check_sizes("SkillCritic", in_features=in_features, num_actions=num_actions)
         net = network(in_features, num_actions, num_skills, hidden, activation)
         keys = [*key_list("SkillCritic", in_keys), skill_key]
         super().__init__(net, keys, action_value_key)
@@ -74,35 +59,21 @@ class SkillActionCritic(SkillNetwork):
 
     .. math:: Q(s, z, a) = \mathrm{SkillMLP}([s; a], z) \in \mathbb{R}
 
-    Pass one to a loss; TorchRL makes the twin (and the targets) from it.
-
     Args:
         in_features (int): summed sizes of the entries ``in_keys``, without the action.
         action_features (int): size of the action, ``D``.
-        num_skills (int): number of skills.
-        in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
-        skill_key (NestedKey): entry of the skill, int64 ``[*B]``. Default ``"skill"``.
+        num_skills, in_keys, skill_key, hidden, activation, network: as :class:`SkillActor`'s.
         action_key (NestedKey): entry of the action, ``[*B, D]``. Default ``"action"``.
         state_action_value_key (NestedKey): entry written, ``[*B, 1]``. Default
             ``"state_action_value"``.
-        hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
-        activation (callable): builds the activations. Default ``torch.nn.ReLU``.
-        network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
-            :class:`SkillMLP`.
 
     Reference:
-        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; heads: Bartley, 2023,
-        chapter 4.
+        As :class:`SkillCritic`.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import SkillActionCritic
-        >>> critic = SkillActionCritic(3, action_features=2, num_skills=4, in_keys=["velocity"])
-        >>> td = TensorDict(velocity=torch.randn(5, 3), action=torch.randn(5, 2),
-        ...                 skill=torch.zeros(5, dtype=torch.int64), batch_size=[5])
-        >>> critic(td)["state_action_value"].shape
-        torch.Size([5, 1])
+        >>> SkillActionCritic(3, action_features=2, num_skills=4, in_keys=["velocity"]).in_keys
+        ['velocity', 'action', 'skill']
     """
 
     def __init__(
@@ -119,9 +90,7 @@ class SkillActionCritic(SkillNetwork):
         activation: Callable[[], nn.Module] = nn.ReLU,
         network: Callable[..., nn.Module] = SkillMLP,
     ) -> None:
-        check_positive(
-            "SkillActionCritic", in_features=in_features, action_features=action_features
-        )
+        check_sizes("SkillActionCritic", in_features=in_features, action_features=action_features)
         net = network(in_features + action_features, 1, num_skills, hidden, activation)
         keys = [*key_list("SkillActionCritic", in_keys), action_key, skill_key]
         super().__init__(net, keys, state_action_value_key)

@@ -1,4 +1,8 @@
-"""A multi-layer perceptron with shared layers and one output head per skill."""
+"""Networks of a skill: shared layers with a head per skill, or with the skill as an input.
+
+They run their layers by hand: calling a small module costs as much as what it computes, and the
+weights may be those of N copies, stacked, as losses hold those of twin critics.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_hmcts.checks import whole_number
+
 
 class SkillMLP(nn.Module):
     r"""Maps features and a skill to outputs through shared layers and one head per skill.
@@ -19,22 +25,21 @@ class SkillMLP(nn.Module):
 
     Letters: ``*B`` any batch shape, ``F`` ``in_features``, ``Z`` ``num_skills``, ``O``
     ``out_features``. All heads are computed in one matrix product and the skill's own is gathered:
-    for the usual handful of skills that is faster than picking weights per element, and it can be
-    vmapped, as TorchRL's losses do with an ensemble of critics.
+    for the usual handful of skills that is faster than picking weights per element.
 
     Args:
         in_features (int): number of input features ``F``, after concatenation.
         out_features (int): number of outputs ``O`` of each head.
         num_skills (int): number of skills ``Z``, one head each.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``: two layers, as
-            in the source.
+            in the dissertation.
         activation (callable): builds the activation after each shared layer. Default
             ``torch.nn.ReLU``.
 
     Returns:
         From ``forward(*features, skill)``: Tensor ``[*B, O]``. ``features`` are one or more tensors
         ``[*B, f_i]`` with ``sum f_i = F``; ``skill`` is int64 ``[*B]``. With the parameters of N
-        copies stacked in place of its own, as losses hold those of twin critics, ``[N, *B, O]``.
+        copies stacked in place of its own, ``[N, *B, O]``.
 
     Raises:
         ValueError: if a size is not positive or there is no shared layer.
@@ -44,7 +49,6 @@ class SkillMLP(nn.Module):
         Rewards", 2023, chapter 4.
 
     Examples:
-        >>> import torch
         >>> from torchrl_hmcts.modules import SkillMLP
         >>> net = SkillMLP(in_features=3, out_features=2, num_skills=4)
         >>> net(torch.randn(5, 3), torch.tensor([0, 1, 2, 3, 0])).shape
@@ -60,26 +64,28 @@ class SkillMLP(nn.Module):
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
         super().__init__()
-        check_positive(
-            "SkillMLP",
-            in_features=in_features,
-            out_features=out_features,
-            num_skills=num_skills,
+        owner = type(self).__name__
+        check_sizes(
+            owner, in_features=in_features, out_features=out_features, num_skills=num_skills
         )
+        self.in_features, self.out_features = in_features, out_features
+        self.num_skills = num_skills
+        self._build(owner, tuple(hidden), activation)
+
+    def _build(
+        self, owner: str, hidden: tuple[int, ...], activation: Callable[[], nn.Module]
+    ) -> None:
         if not hidden:
             raise ValueError(
-                "SkillMLP needs at least one shared layer, which the heads read; got hidden=(). "
+                f"{owner} needs at least one shared layer, which the heads read; got hidden=(). "
                 "Pass e.g. hidden=(64, 64)."
             )
-        self.in_features = int(in_features)
-        self.out_features = int(out_features)
-        self.num_skills = int(num_skills)
-        self.trunk = shared_layers("SkillMLP", in_features, hidden, activation)
-        self.heads = nn.Linear(hidden[-1], num_skills * out_features)
+        self.trunk = hidden_layers(owner, self.in_features, hidden, activation)
+        self.heads = nn.Linear(hidden[-1], self.num_skills * self.out_features)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Returns the outputs of each element's own skill, ``[*B, O]``; see the class."""
-        return self.run(own_weights(self.trunk, self.heads), *inputs)
+        return self.run(self._weights(), *inputs)
 
     def run(self, weights: Sequence[Tensor], *inputs: Tensor) -> Tensor:
         """Does what ``forward`` does, with weights in place of the network's own.
@@ -94,12 +100,17 @@ class SkillMLP(nn.Module):
 
     def all_skills(self, *features: Tensor) -> Tensor:
         """Returns the outputs for every skill, ``[*B, Z, O]``."""
-        return self._all_skills(own_weights(self.trunk, self.heads), features)
+        return self._all_skills(self._weights(), features)
 
     def _all_skills(self, weights: Sequence[Tensor], features: Sequence[Tensor]) -> Tensor:
-        x = _concatenate(features)
-        y = run_layers(self.trunk._modules.values(), weights, x)
+        y = run_layers(self.trunk, weights, concatenate(features))
         return y.view(*y.shape[:-1], self.num_skills, self.out_features)
+
+    def _weights(self) -> list[Tensor]:
+        """Returns the network's own weights and biases, in the order of ``parameters()``."""
+        *_, last = self.children()
+        linear = [layer for layer in self.trunk if type(layer) is nn.Linear]
+        return [tensor for layer in (*linear, last) for tensor in (layer.weight, layer.bias)]
 
     @property
     def stackable(self) -> bool:
@@ -111,117 +122,57 @@ class SkillMLP(nn.Module):
         return f"num_skills={self.num_skills}, out_features={self.out_features}"
 
 
-class ConcatSkillMLP(nn.Module):
+class ConcatSkillMLP(SkillMLP):
     r"""Maps features and a skill to outputs by a network that reads the skill beside the features.
 
     .. math:: y = B h(x, e_z) + b, \qquad h = \sigma(A_2 \sigma(A_1 [x; e_z] + a_1) + a_2)
 
-    with :math:`e_z` the one-hot skill. A drop-in replacement of :class:`SkillMLP`: pass it as
+    with :math:`e_z` the one-hot skill. It is built and called as :class:`SkillMLP` is: pass it as
     ``network=ConcatSkillMLP`` to an actor or critic. All layers are shared by all skills, as in the
-    paper on DIAYN; its number of weights hardly grows with the number of skills.
-
-    Args:
-        in_features (int): number of input features ``F``, after concatenation, without the skill.
-        out_features (int): number of outputs ``O``.
-        num_skills (int): number of skills ``Z``.
-        hidden (sequence of int): widths of the hidden layers. Default ``(64, 64)``.
-        activation (callable): builds the activation after each hidden layer. Default
-            ``torch.nn.ReLU``.
+    paper on DIAYN; its number of weights hardly grows with the number of skills. There may be no
+    hidden layer.
 
     Returns:
-        From ``forward(*features, skill)``: Tensor ``[*B, O]``, as :class:`SkillMLP`.
-
-    Raises:
-        ValueError: if a size is not positive.
+        From ``forward(*features, skill)``: Tensor ``[*B, O]``.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070.
 
     Examples:
-        >>> import torch
         >>> from torchrl.data import Categorical
         >>> from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor
-        >>> net = ConcatSkillMLP(in_features=3, out_features=2, num_skills=4)
-        >>> net(torch.randn(5, 3), torch.tensor([0, 1, 2, 3, 0])).shape
-        torch.Size([5, 2])
         >>> actor = SkillActor(3, Categorical(2), 4, in_keys=["velocity"], network=ConcatSkillMLP)
-        >>> type(actor.network).__name__
-        'ConcatSkillMLP'
+        >>> actor.network.trunk[0].in_features
+        7
     """
 
-    def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        num_skills: int,
-        hidden: Sequence[int] = (64, 64),
-        activation: Callable[[], nn.Module] = nn.ReLU,
+    def _build(
+        self, owner: str, hidden: tuple[int, ...], activation: Callable[[], nn.Module]
     ) -> None:
-        super().__init__()
-        name = "ConcatSkillMLP"
-        check_positive(
-            name, in_features=in_features, out_features=out_features, num_skills=num_skills
-        )
-        self.in_features = int(in_features)
-        self.out_features = int(out_features)
-        self.num_skills = int(num_skills)
         width = self.in_features + self.num_skills
-        self.trunk = shared_layers(name, width, hidden, activation)
-        self.last = nn.Linear((width, *hidden)[-1], out_features)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Returns the outputs of each element's own skill, ``[*B, O]``; see the class."""
-        return self.run(own_weights(self.trunk, self.last), *inputs)
+        self.trunk = hidden_layers(owner, width, hidden, activation)
+        self.last = nn.Linear((width, *hidden)[-1], self.out_features)
 
     def run(self, weights: Sequence[Tensor], *inputs: Tensor) -> Tensor:
-        """Does what ``forward`` does, with weights in place of the network's own.
-
-        They are in the order of ``parameters()``; of N copies, stacked.
-        """
         *features, skill = inputs
         check_skill(skill, features[0])
         x = torch.cat((*features, self._one_hot(skill, features[0])), -1)
-        return run_layers(self.trunk._modules.values(), weights, x)
+        return run_layers(self.trunk, weights, x)
 
     def all_skills(self, *features: Tensor) -> Tensor:
-        """Returns the outputs for every skill, ``[*B, Z, O]``."""
         x = torch.cat(features, -1).unsqueeze(-2)
         x = x.expand(*x.shape[:-2], self.num_skills, -1)
         skill = torch.arange(self.num_skills, device=x.device)
         one_hot = self._one_hot(skill, x).expand(*x.shape[:-1], -1)
-        weights = own_weights(self.trunk, self.last)
-        return run_layers(self.trunk, weights, torch.cat((x, one_hot), -1))
+        return run_layers(self.trunk, self._weights(), torch.cat((x, one_hot), -1))
 
     def _one_hot(self, skill: Tensor, like: Tensor) -> Tensor:
         skills = torch.arange(self.num_skills, device=like.device)
         return (skill.unsqueeze(-1) == skills).to(like.dtype)
 
-    @property
-    def stackable(self) -> bool:
-        """Whether the parameters of N copies may be put in stacked, to run all copies at once."""
-        return can_stack(self.trunk)
-
-    def extra_repr(self) -> str:
-        """Returns the sizes that ``print`` shows."""
-        return f"num_skills={self.num_skills}, out_features={self.out_features}"
-
 
 class FeatureMLP(nn.Sequential):
-    """A multi-layer perceptron that concatenates its inputs first; its layers are its items.
-
-    Args:
-        owner (str): who builds it, for errors.
-        sizes (sequence of int): of input, hidden layers and output.
-        activation (callable): builds the activation after each hidden layer. Default
-            ``torch.nn.ReLU``.
-        linear (callable): builds a linear layer from its two sizes. Default ``torch.nn.Linear``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_hmcts.modules.skill_mlp import FeatureMLP
-        >>> FeatureMLP("Example", [3, 8, 4])(torch.zeros(5, 2), torch.zeros(5, 1)).shape
-        torch.Size([5, 4])
-    """
+    """A multi-layer perceptron without a skill; it concatenates its inputs first."""
 
     def __init__(
         self,
@@ -230,33 +181,73 @@ class FeatureMLP(nn.Sequential):
         activation: Callable[[], nn.Module] = nn.ReLU,
         linear: Callable[[int, int], nn.Module] = nn.Linear,
     ) -> None:
-        hidden = shared_layers(owner, sizes[0], sizes[1:-1], activation, linear)
+        hidden = hidden_layers(owner, sizes[0], sizes[1:-1], activation, linear)
         super().__init__(*hidden, linear(sizes[-2], sizes[-1]))
 
     def forward(self, *features: Tensor) -> Tensor:
-        x = _concatenate(features)
+        x = concatenate(features)
         check_features(x, next(self.parameters()))
         return super().forward(x)
 
     def run(self, weights: Sequence[Tensor], *features: Tensor) -> Tensor:
         """Does what ``forward`` does, with weights in place of its own, as :meth:`SkillMLP.run`."""
-        return run_layers(list(self)[:-1], weights, _concatenate(features))
+        return run_layers(list(self)[:-1], weights, concatenate(features))
 
     @property
     def stackable(self) -> bool:
-        """Whether :meth:`run` can be used: only plain linear layers have parameters."""
+        """Whether :meth:`run` can be used."""
         return can_stack(self)
 
 
-def _concatenate(features: Sequence[Tensor]) -> Tensor:
+class SkillNetwork(TensorDictModuleBase):
+    """Runs a network on the entries ``in_keys`` of a tensordict and writes its output.
+
+    ``tensordict.nn.TensorDictModule`` does the same for any signature and costs about 200 us a
+    call; this one costs what its network costs.
+    """
+
+    network: nn.Module
+
+    def __init__(
+        self, network: nn.Module, in_keys: Sequence[NestedKey], *out_keys: NestedKey
+    ) -> None:
+        super().__init__()
+        self.in_keys = key_list(type(self).__name__, in_keys)
+        self.out_keys = [unravel_key(key) for key in out_keys]
+        self.out_key = self.out_keys[0]
+        self.network = network
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the network's output, of the shape the network gives."""
+        inputs = entries(self, tensordict, self.in_keys)
+        return tensordict.set(self.out_key, self.network(*inputs))
+
+
+def concatenate(features: Sequence[Tensor]) -> Tensor:
+    """Returns features side by side, without a copy of a single one."""
     return features[0] if len(features) == 1 else torch.cat(tuple(features), -1)
+
+
+def hidden_layers(
+    owner: str,
+    in_features: int,
+    hidden: Sequence[int],
+    activation: Callable[[], nn.Module],
+    linear: Callable[[int, int], nn.Module] = nn.Linear,
+) -> nn.Sequential:
+    """Builds the hidden layers of a network, each a linear map and an activation."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        whole_number(owner, f"each width in hidden={tuple(hidden)}", width, least=1)
+        layers += [linear(in_features, width), activation()]
+        in_features = width
+    return nn.Sequential(*layers)
 
 
 def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor) -> Tensor:
     """Runs x ``[*B, F]`` through hidden layers and a last one; of N stacked copies, ``[N, *B, O]``.
 
-    Layers are applied here, not called as modules: their weights may be stacked, and calling a
-    small module costs as much as what it computes.
+    Layers are applied here, not called as modules, with ``weights`` in the order of parameters.
     """
     check_features(x, weights[0])
     num_nets = weights[-1].shape[:-1]  # () or, stacked, (N,)
@@ -272,6 +263,20 @@ def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor
             x = x.relu() if type(layer) is nn.ReLU else layer(x)
     y = _linear(weights[i], weights[i + 1], x)
     return y.view(*num_nets, *batch, y.shape[-1]) if num_nets else y
+
+
+def _linear(weight: Tensor, bias: Tensor, x: Tensor) -> Tensor:
+    """Applies a linear layer, or N stacked ones (weight ``[N, O, I]``) to x ``[N, b, I]``."""
+    if weight.ndim == 2:
+        return F.linear(x, weight, bias)
+    return torch.baddbmm(bias.unsqueeze(-2), x, weight.transpose(-2, -1))
+
+
+def can_stack(layers: Iterable[nn.Module]) -> bool:
+    """Returns whether stacked parameters can be run: none but linear layers may have any."""
+    others = [layer for layer in layers if type(layer) is not nn.Linear]
+    # Not by their state dicts, which torch.compile cannot trace.
+    return not any(True for layer in others for _ in (*layer.parameters(), *layer.buffers()))
 
 
 def check_features(x: Tensor, weight: Tensor) -> None:
@@ -296,86 +301,10 @@ def check_skill(skill: Tensor, features: Tensor) -> None:
         )
 
 
-def own_weights(hidden: nn.Sequential, last: nn.Linear) -> list[Tensor]:
-    """Returns the weights and biases that :func:`run_layers` takes."""
-    layers = [layer for layer in hidden._modules.values() if type(layer) is nn.Linear]
-    return [tensor for layer in (*layers, last) for tensor in (layer.weight, layer.bias)]
-
-
-def can_stack(layers: Iterable[nn.Module]) -> bool:
-    """Returns whether stacked parameters can be run: none but linear layers may have any."""
-    others = [layer for layer in layers if type(layer) is not nn.Linear]
-    # Not by their state dicts, which torch.compile cannot trace.
-    return not any(True for layer in others for _ in (*layer.parameters(), *layer.buffers()))
-
-
-def _linear(weight: Tensor, bias: Tensor, x: Tensor) -> Tensor:
-    """Applies a linear layer, or N stacked ones (weight ``[N, O, I]``) to x ``[N, b, I]``."""
-    if weight.ndim == 2:
-        return F.linear(x, weight, bias)
-    return torch.baddbmm(bias.unsqueeze(-2), x, weight.transpose(-2, -1))
-
-
-class SkillNetwork(TensorDictModuleBase):
-    """Runs a network on entries of a tensordict: reads the keys, calls it, writes one key.
-
-    ``tensordict.nn.TensorDictModule`` does the same for any signature and costs about 200 us a
-    call; this one has a fixed signature and costs what its network costs.
-
-    Args:
-        network (nn.Module): called with the entries of ``in_keys`` in order.
-        in_keys (sequence of NestedKey): entries to read.
-        out_key (NestedKey): entry to write.
-
-    Reference:
-        This project's; the interface is that of ``tensordict.nn.TensorDictModule``.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_hmcts.modules import SkillMLP, SkillNetwork
-        >>> net = SkillNetwork(SkillMLP(2, 3, num_skills=4), ["velocity", "skill"], "logits")
-        >>> td = TensorDict(velocity=torch.zeros(6, 2), skill=torch.zeros(6, dtype=torch.int64),
-        ...                 batch_size=[6])
-        >>> net(td)["logits"].shape
-        torch.Size([6, 3])
-    """
-
-    network: nn.Module
-
-    def __init__(
-        self, network: nn.Module, in_keys: Sequence[NestedKey], out_key: NestedKey
-    ) -> None:
-        super().__init__()
-        self.in_keys = key_list(type(self).__name__, in_keys)
-        self.out_keys = [unravel_key(out_key)]
-        self.out_key = self.out_keys[0]
-        self.network = network
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the network's output under ``out_key``, of the shape the network gives."""
-        inputs = entries(self, tensordict, self.in_keys)
-        return tensordict.set(self.out_key, self.network(*inputs))
-
-
-def shared_layers(
-    owner: str,
-    in_features: int,
-    hidden: Sequence[int],
-    activation: Callable[[], nn.Module],
-    linear: Callable[[int, int], nn.Module] = nn.Linear,
-) -> nn.Sequential:
-    """Builds the hidden layers of a network, each a linear map and an activation."""
-    hidden = tuple(hidden)
-    if any(width < 1 for width in hidden):
-        raise ValueError(
-            f"{owner} needs hidden layers of positive width; got hidden={hidden}. "
-            "Pass e.g. hidden=(64, 64)."
-        )
-    layers: list[nn.Module] = []
-    for fan_in, fan_out in zip((in_features, *hidden), hidden, strict=False):
-        layers += [linear(fan_in, fan_out), activation()]
-    return nn.Sequential(*layers)
+def check_sizes(owner: str, **sizes: int) -> None:
+    """Raises an error that names the first size that is no positive whole number."""
+    for name, size in sizes.items():
+        whole_number(owner, name, size, least=1)
 
 
 def entries(owner: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> list[Tensor]:
@@ -391,21 +320,12 @@ def entries(owner: object, tensordict: TensorDictBase, keys: Iterable[NestedKey]
     return found
 
 
-def check_positive(owner: str, **sizes: int) -> None:
-    """Raises ValueError naming the first size that is not a positive int."""
-    for name, size in sizes.items():
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-            raise ValueError(
-                f"{owner} needs {name} to be a positive int, the size of a layer; got {size!r}."
-            )
-
-
 def key_list(owner: str, keys: Sequence[NestedKey] | NestedKey) -> list[NestedKey]:
     """Returns the keys as a list of unravelled keys; a lone string is one key."""
     listed = [keys] if isinstance(keys, str) else list(keys)
     if not listed:
         raise ValueError(
-            f"{owner} needs at least one in_key to read its features from; got none. "
+            f"{owner} needs at least one in_key to read its features from; got {keys!r}. "
             "Pass e.g. in_keys=['velocity']."
         )
     return [unravel_key(key) for key in listed]

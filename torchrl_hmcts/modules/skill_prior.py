@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torchrl_hmcts.checks import whole_number
+
 
 class SkillPrior(nn.Module, ABC):
     r"""A distribution p(z) over skills, read live by whatever samples, rewards or plans with them.
@@ -21,16 +23,11 @@ class SkillPrior(nn.Module, ABC):
     Args:
         num_skills (int): number of skills ``Z``, those that are switched off included.
 
-    Raises:
-        ValueError: if there is not at least one skill.
-
     Reference:
-        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, section 3 (a fixed
-        p(z)); Gregor et al., "Variational Intrinsic Control", 2016, arXiv 1611.07507 (a learned
-        one).
+        Fixed: Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, section 3.
+        Learned: Gregor et al., "Variational Intrinsic Control", 2016, arXiv 1611.07507.
 
     Examples:
-        >>> import torch
         >>> from torchrl_hmcts.modules import SkillPrior
         >>> class OnlyEvenSkills(SkillPrior):
         ...     def probs(self):
@@ -44,12 +41,7 @@ class SkillPrior(nn.Module, ABC):
 
     def __init__(self, num_skills: int) -> None:
         super().__init__()
-        if isinstance(num_skills, bool) or not isinstance(num_skills, int) or num_skills < 1:
-            raise ValueError(
-                f"{type(self).__name__} is a distribution over at least one skill; got "
-                f"num_skills={num_skills!r}."
-            )
-        self.num_skills = num_skills
+        self.num_skills = whole_number(type(self).__name__, "num_skills", num_skills, least=1)
 
     @abstractmethod
     def probs(self) -> Tensor:
@@ -62,10 +54,6 @@ class SkillPrior(nn.Module, ABC):
     def active(self) -> Tensor:
         """Returns which skills are switched on, bool ``[Z]``."""
         return self.probs() > 0
-
-    def entropy(self) -> Tensor:
-        """Returns the entropy of p(z) in nats, a scalar."""
-        return torch.special.entr(self.probs()).sum()
 
     def forward(self) -> Tensor:
         """Returns the probabilities of the skills, ``[Z]``."""
@@ -85,11 +73,10 @@ class FixedSkillPrior(SkillPrior):
             switches a skill off. Default ``None``: uniform. Kept as the buffer ``p``.
 
     Raises:
-        ValueError: if the weights are no distribution over the skills.
+        ValueError: if the weights are no distribution over the skills, at least one.
 
     Reference:
-        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, section 3: a fixed
-        prior of the highest entropy.
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, section 3.
 
     Examples:
         >>> from torchrl_hmcts.modules import FixedSkillPrior
@@ -103,18 +90,11 @@ class FixedSkillPrior(SkillPrior):
 
     def __init__(self, num_skills: int, weights: Sequence[float] | Tensor | None = None) -> None:
         super().__init__(num_skills)
-        if weights is None:
-            weights = [1.0] * num_skills
-        p = torch.as_tensor(weights, dtype=torch.get_default_dtype()).detach().clone()
-        if p.shape != (num_skills,):
+        p = _per_skill("FixedSkillPrior", "weights", weights, num_skills, default=1.0)
+        if not ((p >= 0).all() and (p > 0).any()):
             raise ValueError(
-                f"FixedSkillPrior needs one weight per skill, shape ({num_skills},); got shape "
-                f"{tuple(p.shape)}."
-            )
-        if not (torch.isfinite(p).all() and (p >= 0).all() and (p > 0).any()):
-            raise ValueError(
-                "FixedSkillPrior needs finite weights, none negative and one positive at least; "
-                f"got {p.tolist()}."
+                "FixedSkillPrior needs weights of which none is negative and one is positive at "
+                f"least; got weights={p.tolist()}."
             )
         self.register_buffer("p", p / p.sum())
 
@@ -136,9 +116,6 @@ class GrowingSkillPrior(SkillPrior):
         num_skills (int): number of skills there is room for, ``Z``.
         num_active (int): number of skills switched on at first. Default ``2``, the fewest that can
             be told apart.
-
-    Raises:
-        ValueError: if more skills are to be switched on than there is room for, or none.
 
     Reference:
         This project's.
@@ -167,10 +144,10 @@ class GrowingSkillPrior(SkillPrior):
 
     def set_num_active(self, num_active: int) -> None:
         """Switches on the first ``num_active`` skills, also dropped ones, and the others off."""
-        if not 1 <= num_active <= self.num_skills:
+        if whole_number("GrowingSkillPrior", "num_active", num_active, least=1) > self.num_skills:
             raise ValueError(
-                f"GrowingSkillPrior has room for {self.num_skills} skills, of which at least one "
-                f"is on; got num_active={num_active}."
+                f"GrowingSkillPrior has room for {self.num_skills} skills; got "
+                f"num_active={num_active}."
             )
         self.num_active.fill_(num_active)
         self.dropped.zero_()
@@ -208,9 +185,6 @@ class LearnedSkillPrior(SkillPrior):
         logits (sequence of float or Tensor, optional): :math:`\ell` at first, ``[Z]``. Default
             ``None``: zeros, a uniform prior.
 
-    Raises:
-        ValueError: if the logits do not fit the number of skills or are not finite.
-
     Reference:
         Gregor et al., "Variational Intrinsic Control", 2016, arXiv 1611.07507.
 
@@ -223,14 +197,7 @@ class LearnedSkillPrior(SkillPrior):
 
     def __init__(self, num_skills: int, logits: Sequence[float] | Tensor | None = None) -> None:
         super().__init__(num_skills)
-        if logits is None:
-            logits = [0.0] * num_skills
-        start = torch.as_tensor(logits, dtype=torch.get_default_dtype()).detach().clone()
-        if start.shape != (num_skills,) or not torch.isfinite(start).all():
-            raise ValueError(
-                f"LearnedSkillPrior needs one finite logit per skill, shape ({num_skills},); got "
-                f"{start.tolist()}."
-            )
+        start = _per_skill("LearnedSkillPrior", "logits", logits, num_skills, default=0.0)
         self.logits = nn.Parameter(start)
 
     def probs(self) -> Tensor:
@@ -238,6 +205,26 @@ class LearnedSkillPrior(SkillPrior):
 
     def log_probs(self) -> Tensor:
         return self.logits.log_softmax(-1)
+
+
+def _per_skill(
+    owner: str,
+    name: str,
+    values: Sequence[float] | Tensor | None,
+    num_skills: int,
+    *,
+    default: float,
+) -> Tensor:
+    """Returns one finite number for each skill, ``[Z]``."""
+    if values is None:
+        return torch.full((num_skills,), default)
+    made = torch.as_tensor(values, dtype=torch.get_default_dtype()).detach().clone()
+    if made.shape != (num_skills,) or not torch.isfinite(made).all():
+        raise ValueError(
+            f"{owner} needs one finite number per skill, shape ({num_skills},); got "
+            f"{name}={values!r}."
+        )
+    return made
 
 
 def as_skill_prior(

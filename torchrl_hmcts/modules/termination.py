@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.modules.skill_actor import is_to_sample
 from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
 
@@ -22,7 +23,7 @@ Condition = Callable[[TensorDictBase], Tensor]
 
 
 class StallTermination:
-    r"""Ends an option in which nothing has changed for some base steps.
+    r"""Ends an option in which nothing has changed for some base steps; a call gives bool ``[*B]``.
 
     .. math:: \text{ends} \iff \min(n, k) \ge N
 
@@ -34,19 +35,15 @@ class StallTermination:
         stalled_key (NestedKey): the count, int64 ``[*B, 1]``. Default ``"stalled_steps"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
 
-    Returns:
-        From a call: bool ``[*B]``.
-
     Raises:
         ValueError: if ``num_steps`` is below 1; when an ``OptionTransform`` is attached to an env
             that writes no such count.
 
     Reference:
-        This project's; options end in states, as in Sutton, Precup and Singh, "Between MDPs and
+        This project's; options that end in states: Sutton, Precup and Singh, "Between MDPs and
         semi-MDPs", 1999.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import StallTermination
         >>> td = TensorDict(stalled_steps=torch.tensor([[1], [3], [3]]),
@@ -61,12 +58,7 @@ class StallTermination:
         stalled_key: NestedKey = "stalled_steps",
         duration_key: NestedKey = "duration",
     ) -> None:
-        if isinstance(num_steps, bool) or not isinstance(num_steps, int) or num_steps < 1:
-            raise ValueError(
-                f"StallTermination ends an option after num_steps base steps without a change, an "
-                f"int >= 1; got {num_steps!r}."
-            )
-        self.num_steps = num_steps
+        self.num_steps = whole_number("StallTermination", "num_steps", num_steps, least=1)
         self.stalled_key = unravel_key(stalled_key)
         self.duration_key = unravel_key(duration_key)
         self.in_keys: list[NestedKey] = [self.stalled_key, self.duration_key]
@@ -80,7 +72,7 @@ class StallTermination:
 
 
 class AnyTermination:
-    r"""Ends an option as soon as one of several conditions does.
+    r"""Ends an option as soon as one of several conditions does; a call gives bool ``[*B]``.
 
     .. math:: \text{ends} \iff c_1 \lor c_2 \lor \dots
 
@@ -90,18 +82,13 @@ class AnyTermination:
     Args:
         *conditions: callables ``condition(td) -> bool [*B]`` or ``[*B, 1]``, at least one.
 
-    Returns:
-        From a call: bool ``[*B]``.
-
     Raises:
-        ValueError: if there is no condition, or one cannot be called.
+        TypeError: if there is no condition, or one cannot be called.
 
     Reference:
-        This project's; options end in states, as in Sutton, Precup and Singh, "Between MDPs and
-        semi-MDPs", 1999.
+        As :class:`StallTermination`.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import AnyTermination, StallTermination
         >>> late = lambda td: td["duration"] >= 9
@@ -113,7 +100,7 @@ class AnyTermination:
 
     def __init__(self, *conditions: Condition) -> None:
         if not conditions or not all(callable(condition) for condition in conditions):
-            raise ValueError(
+            raise TypeError(
                 f"AnyTermination needs one or more callables condition(td) -> bool [*B]; got "
                 f"{conditions!r}."
             )
@@ -139,14 +126,10 @@ class TerminationNetwork(SkillNetwork):
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
         num_options (int): number of options.
-        in_keys (sequence of NestedKey): float entries ``[*B, f_i]``, concatenated in order.
-        skill_key (NestedKey): the option, int64 ``[*B]``. Default ``"skill"``, as
-            ``OptionTransform`` names it inside an option.
+        in_keys, skill_key, hidden, activation: as :class:`SkillActor`'s.
         termination_logits_key (NestedKey): entry written, ``[*B, 1]``. Default
             ``"termination_logits"``.
-        initial_probability (float): where :math:`\beta` begins, about, in ``(0, 1)``. Default 0.5.
-        hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
-        activation (callable): builds the activations. Default ``torch.nn.ReLU``.
+        initial_probability (float): where :math:`\beta` begins, about, 0.001 to 0.999. Default 0.5.
 
     Raises:
         ValueError: if a size is not positive or the probability is out of its range.
@@ -155,12 +138,10 @@ class TerminationNetwork(SkillNetwork):
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import TerminationNetwork
         >>> network = TerminationNetwork(2, num_options=4, in_keys=["velocity"])
-        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5, dtype=torch.int64),
-        ...                 batch_size=[5])
+        >>> td = TensorDict(velocity=torch.randn(5, 2), skill=torch.zeros(5).long(), batch_size=[5])
         >>> network(td)["termination_logits"].shape
         torch.Size([5, 1])
     """
@@ -177,14 +158,15 @@ class TerminationNetwork(SkillNetwork):
         hidden: Sequence[int] = (64, 64),
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
-        if not 0.0 < initial_probability < 1.0:
-            raise ValueError(
-                f"TerminationNetwork begins with a probability in (0, 1), of which there is a "
-                f"logit; got initial_probability={initial_probability}."
-            )
+        beta = real_number(
+            "TerminationNetwork",
+            "initial_probability",
+            initial_probability,
+            least=0.001,
+            most=0.999,
+        )
         network = SkillMLP(in_features, 1, num_options, hidden, activation)
-        odds = initial_probability / (1.0 - initial_probability)
-        nn.init.constant_(network.heads.bias, math.log(odds))
+        nn.init.constant_(network.heads.bias, math.log(beta / (1.0 - beta)))
         keys = [*key_list("TerminationNetwork", in_keys), skill_key]
         super().__init__(network, keys, termination_logits_key)
         self.num_options = num_options
@@ -194,26 +176,24 @@ class TerminationNetwork(SkillNetwork):
 class LearnedTermination:
     r"""Ends an option with the probability a network says, or where it says at least one half.
 
+    A call gives bool ``[*B]``.
+
     .. math:: \text{ends} \sim \mathrm{Bernoulli}(\beta(s, o)), \qquad
         \text{or, deterministic,} \quad \text{ends} \iff \beta(s, o) \ge 1/2
 
-    Deterministic is the choice for planning: a plan is carried out as it was simulated. The network
-    is called in the mode it is in, without gradients, and never becomes part of an env.
+    Deterministic is the choice for planning: a plan is executed as it was simulated. The network
+    is called as it is, without gradients, and never becomes part of an env.
 
     Args:
         network (TensorDictModuleBase): writes logits ``[*B, 1]``, e.g. a
             :class:`TerminationNetwork`, or a ``TensorDictSequential`` of what computes its
             features and one.
-        deterministic (bool): do not sample. Default ``True``. With ``False`` it samples, unless
-            TorchRL's ``set_exploration_type`` asks for anything but ``RANDOM``.
-        generator (torch.Generator, optional): source of the samples. Default: torch's global one.
+        deterministic (bool): do not sample, as :class:`SkillPolicy`. Default ``True``.
+        generator (torch.Generator, optional): as :class:`SkillPolicy`'s.
         every (int): base steps between two questions, so that an option may end after that many,
             twice that many and so on; asking costs a call of the network. Default 1.
         termination_logits_key (NestedKey): Default ``"termination_logits"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
-
-    Returns:
-        From a call: bool ``[*B]``.
 
     Raises:
         ValueError: if ``every`` is below 1, or the network does not write the logits.
@@ -222,7 +202,6 @@ class LearnedTermination:
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import LearnedTermination, TerminationNetwork
         >>> network = TerminationNetwork(2, num_options=4, in_keys=["velocity"])
@@ -243,10 +222,7 @@ class LearnedTermination:
         termination_logits_key: NestedKey = "termination_logits",
         duration_key: NestedKey = "duration",
     ) -> None:
-        if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-            raise ValueError(
-                f"LearnedTermination asks every so many base steps, an int >= 1; got {every!r}."
-            )
+        self.every = whole_number("LearnedTermination", "every", every, least=1)
         self.termination_logits_key = unravel_key(termination_logits_key)
         written = [unravel_key(key) for key in getattr(network, "out_keys", ())]
         if self.termination_logits_key not in written:
@@ -258,7 +234,6 @@ class LearnedTermination:
         self.network = network
         self.deterministic = bool(deterministic)
         self.generator = generator
-        self.every = every
         self.duration_key = unravel_key(duration_key)
         keys = [unravel_key(key) for key in network.in_keys]
         self.in_keys: list[NestedKey] = list(dict.fromkeys([*keys, self.duration_key]))

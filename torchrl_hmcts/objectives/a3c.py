@@ -5,7 +5,6 @@ Letters: *B batch of environments, T steps of a segment, F features of a reward 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,37 +18,16 @@ from torchrl.objectives import A2CLoss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import TD1Estimator
 
-from torchrl_hmcts.objectives.skill_objective import check_reduction
+from torchrl_hmcts.checks import real_number
+from torchrl_hmcts.objectives.loss import DISTANCES, REDUCTIONS, one_of
 
 
 def n_step_returns(
     reward: Tensor, discount: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor
 ) -> Tensor:
-    r"""Returns the discounted rewards until the segment or the episode ends, and the value there.
+    """Returns the targets of :class:`NStepReturn`; all tensors are ``[*B, T, F]``.
 
-    .. math::
-
-        G_t = r_t + \gamma_t \begin{cases}
-            0 & \text{after step } t \text{ the episode is terminated} \\
-            V(s'_t) & \text{it is truncated, or the segment ends} \\
-            G_{t+1} & \text{otherwise}
-        \end{cases}
-
-    Args:
-        reward (Tensor): float ``[*B, T, F]``.
-        discount (Tensor): float ``[*B, T, F]``, of what follows each step: gamma to the power of
-            its duration.
-        next_value (Tensor): float ``[*B, T, F]``, V(s'), read where a step is truncated or the
-            last, and otherwise of no account.
-        done (Tensor): bool ``[*B, T, F]``, the episode ends with this step.
-        terminated (Tensor): bool ``[*B, T, F]``, it ends in a state whose value is 0.
-
-    Returns:
-        Tensor: float ``[*B, T, F]``.
-
-    Reference:
-        Mnih et al., "Asynchronous methods for deep reinforcement learning", 2016, arXiv 1602.01783,
-        algorithm S3.
+    The value V(s') is read where a step is truncated or the last, and otherwise of no account.
 
     Examples:
         >>> one, no = torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.bool)
@@ -72,11 +50,19 @@ def n_step_returns(
 class NStepReturn(TD1Estimator):
     r"""TorchRL's TD(1), with the critic called only where its value is used.
 
-    The targets of :func:`n_step_returns`, with :math:`\gamma_t = \gamma^{k_t}` for steps that take
-    :math:`k_t` base steps, and the advantage :math:`G_t - V(s_t)`, both without gradients.
-    TorchRL's ``TD1Estimator`` computes the same from the values of all next states; here it is
-    those where an episode is truncated or the segment ends. What else a ``TD1Estimator`` can do
-    (critics with a memory, ``differentiable``, ``average_rewards``, ``shifted``) is left to it.
+    .. math::
+
+        G_t = r_t + \gamma^{k_t} \begin{cases}
+            0 & \text{after step } t \text{ the episode is terminated} \\
+            V(s'_t) & \text{it is truncated, or the segment ends} \\
+            G_{t+1} & \text{otherwise}
+        \end{cases}
+
+    for steps that take :math:`k_t` base steps, and the advantage :math:`G_t - V(s_t)`, both without
+    gradients.
+    TorchRL's ``TD1Estimator`` computes the same from the values of all next states. What else it
+    can do (critics with a memory, ``differentiable``, ``average_rewards``, ``shifted``) is left to
+    it.
 
     In an ``OnPolicyTrainer``, which shuffles steps before the loss sees them, it goes where GAE
     goes: ``A2CTrainer(..., gae=NStepReturn(gamma=0.99, value_network=critic))``.
@@ -95,16 +81,13 @@ class NStepReturn(TD1Estimator):
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from torchrl.modules import ValueOperator
-        >>> critic = ValueOperator(torch.nn.Linear(2, 1), in_keys=["observation"])
-        >>> torch.nn.init.zeros_(critic.module.weight); torch.nn.init.ones_(critic.module.bias)
-        Parameter containing: ...
-        >>> no = torch.zeros(3, 1, dtype=torch.bool)
-        >>> after = TensorDict(observation=torch.rand(3, 2), done=no, terminated=no,
-        ...                    reward=torch.tensor([[0.], [0.], [3.]]),
+        >>> from tensordict.nn import TensorDictModule
+        >>> ones = TensorDictModule(lambda x: torch.ones_like(x), ["x"], ["state_value"])
+        >>> x, no = torch.rand(3, 1), torch.zeros(3, 1, dtype=torch.bool)
+        >>> after = TensorDict(x=x, done=no, terminated=no, reward=torch.tensor([[0.], [0.], [3.]]),
         ...                    duration=torch.tensor([[2], [1], [1]]))
-        >>> segment = TensorDict(observation=torch.rand(3, 2), next=after, batch_size=[3])
-        >>> out = NStepReturn(gamma=0.5, value_network=critic)(segment)
+        >>> segment = TensorDict(x=x, next=after, batch_size=[3])
+        >>> out = NStepReturn(gamma=0.5, value_network=ones)(segment)
         >>> out["value_target"].flatten().tolist()
         [0.4375, 1.75, 3.5]
     """
@@ -166,9 +149,9 @@ class NStepReturn(TD1Estimator):
     @property
     def _usual(self) -> bool:
         """Whether nothing is asked for that only TorchRL's own estimator does."""
-        network = self.value_network
         asked = self.shifted, self.differentiable, self.average_rewards, self.skip_existing
-        memory = network is None or any("is_init" in _flat(key) for key in network.in_keys)
+        read = getattr(self.value_network, "in_keys", ["is_init"])
+        memory = any(key == "is_init" or "is_init" in tuple(key) for key in read)
         return not (any(asked) or memory)
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
@@ -188,7 +171,7 @@ class A3CLoss(A2CLoss):
         L = -\log \pi(a_t \mid s_t)\,\bigl(G_t - V(s_t)\bigr) + c_v \bigl(G_t - V(s_t)\bigr)^2
             - c_H\, \mathcal{H}\bigl(\pi(\cdot \mid s_t)\bigr)
 
-    with :math:`G_t` of :func:`n_step_returns`, and :math:`G_t - V(s_t)` constant in the first term.
+    with :math:`G_t` of :class:`NStepReturn`, and :math:`G_t - V(s_t)` constant in the first term.
     It is TorchRL's ``A2CLoss`` with another default value estimator, :class:`NStepReturn`, which is
     built with it and knows durations: on a macro env a step of k base steps discounts what follows
     by gamma to the power of k. It takes segments ``[*B, T]``, within which episodes may end; an
@@ -221,22 +204,15 @@ class A3CLoss(A2CLoss):
         Bartley, dissertation, 2023, Algorithm 2.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.modules import ProbabilisticActor, ValueOperator
         >>> from torchrl_hmcts.objectives import A3CLoss
         >>> actor = ProbabilisticActor(
         ...     TensorDictModule(torch.nn.Linear(3, 2), ["observation"], ["logits"]),
         ...     in_keys=["logits"], distribution_class=torch.distributions.Categorical)
-        >>> loss = A3CLoss(actor, ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"]))
-        >>> no = torch.zeros(4, 5, 1, dtype=torch.bool)
-        >>> after = TensorDict(observation=torch.randn(4, 5, 3), reward=torch.randn(4, 5, 1),
-        ...                    done=no, terminated=no, batch_size=[4, 5])
-        >>> segment = TensorDict(observation=torch.randn(4, 5, 3), next=after,
-        ...                      action=torch.zeros(4, 5, dtype=torch.int64), batch_size=[4, 5])
-        >>> sorted(loss(segment).keys())
-        ['entropy', 'loss_critic', 'loss_entropy', 'loss_objective']
+        >>> A3CLoss(actor, ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])).in_keys
+        ['action', 'observation', ('next', 'reward'), ('next', 'done'), ('next', 'terminated'),
+         ('next', 'observation'), ('next', 'duration')]
     """
 
     @dataclass
@@ -259,18 +235,11 @@ class A3CLoss(A2CLoss):
         loss_critic_type: str = "l2",
         **kwargs: Any,
     ) -> None:
-        if not 0.0 < gamma <= 1.0:
-            raise ValueError(f"A3CLoss needs a gamma in (0, 1], per base step; got {gamma}.")
-        if not (math.isfinite(entropy_coeff) and entropy_coeff >= 0.0):
-            raise ValueError(
-                f"A3CLoss needs an entropy_coeff >= 0, which rewards entropy; got {entropy_coeff}."
-            )
-        if not (math.isfinite(critic_coeff) and critic_coeff > 0.0):
-            raise ValueError(
-                f"A3CLoss needs a critic_coeff > 0, since its returns rest on the critic; got "
-                f"{critic_coeff}."
-            )
-        check_reduction("A3CLoss", reduction)
+        gamma = real_number("A3CLoss", "gamma", gamma, above=0.0, most=1.0)
+        real_number("A3CLoss", "entropy_coeff", entropy_coeff, least=0.0)
+        real_number("A3CLoss", "critic_coeff", critic_coeff, above=0.0)  # the returns rest on it
+        one_of("A3CLoss", "reduction", reduction, REDUCTIONS)
+        one_of("A3CLoss", "loss_critic_type", loss_critic_type, DISTANCES)
         super().__init__(
             actor_network,
             critic_network,
@@ -281,8 +250,9 @@ class A3CLoss(A2CLoss):
             **kwargs,
         )
         self._discount = gamma
-        if self.tensor_keys.value not in map(unravel_key, critic_network.out_keys):
-            self.tensor_keys.value = unravel_key(critic_network.out_keys[0])
+        written = [unravel_key(key) for key in critic_network.out_keys]
+        if self.tensor_keys.value not in written:
+            self.tensor_keys.value = written[0]
         # Built at once: built lazily it would add entries to the state dict of a run under way.
         self.make_value_estimator()
 
@@ -310,7 +280,3 @@ class A3CLoss(A2CLoss):
         super()._forward_value_estimator_keys(**kwargs)
         if self._value_estimator is not None:
             self._value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)
-
-
-def _flat(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else tuple(key)

@@ -8,6 +8,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
+from torchrl_hmcts.checks import instance, real_number
+
 Discounting = TypeVar("Discounting", LossModule, ValueEstimatorBase)
 
 
@@ -54,25 +56,16 @@ def use_durations(
         >>> gae.tensor_keys.steps_to_next_obs
         ('next', 'duration')
     """
-    if gamma is not None and not 0.0 < gamma <= 1.0:
-        raise ValueError(
-            f"use_durations needs a discount gamma in (0, 1] per base step; got {gamma}."
-        )
-    if isinstance(module, ValueEstimatorBase):
-        if gamma is not None:
+    instance("use_durations", "module", module, LossModule, ValueEstimatorBase)
+    if gamma is not None:
+        real_number("use_durations", "gamma", gamma, above=0.0, most=1.0)
+        if isinstance(module, ValueEstimatorBase):
             raise ValueError(
                 f"use_durations got gamma={gamma} for a {type(module).__name__}, which has its "
                 f"own. Pass gamma where you make it."
             )
-        estimator = module
-    elif isinstance(module, LossModule):
-        if gamma is not None:
-            module.make_value_estimator(gamma=gamma)
-        estimator = module.value_estimator  # made with the loss's defaults where there is none
-    else:
-        raise TypeError(
-            f"use_durations sets a TorchRL loss or value estimator; got {type(module).__name__}. "
-            f"Pass e.g. the loss of a trainer, or GAE(...)."
-        )
+        module.make_value_estimator(gamma=gamma)
+    # A loss makes one with its defaults where there is none.
+    estimator = module if isinstance(module, ValueEstimatorBase) else module.value_estimator
     estimator.set_keys(steps_to_next_obs=unravel_key(("next", duration_key)))
     return module

@@ -2,27 +2,64 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_hmcts.objectives.functional import without_terminal_entries
-from torchrl_hmcts.objectives.priority import PriorityWeights
-from torchrl_hmcts.objectives.skill_objective import check_reduction
+from torchrl_hmcts.checks import real_number
+from torchrl_hmcts.objectives.loss import (
+    DISTANCES,
+    Loss,
+    one_of,
+    run_module,
+    without_terminal_entries,
+)
 
 OptionPolicy = Callable[[TensorDictBase], Tensor]
 
 
-class OptionTerminationLoss(PriorityWeights, LossModule):
+class _OptionLoss(Loss):
+    """The common part of both losses: transitions of an option, and its values where they lead."""
+
+    @dataclass
+    class _AcceptedKeys(Loss._AcceptedKeys):
+        skill: NestedKey = "skill"
+        termination_logits: NestedKey = "termination_logits"
+        action_value: NestedKey = "action_value"
+        terminated: NestedKey = "terminated"
+
+    def _features(self, *modules: Any) -> list[NestedKey]:
+        """Returns what modules read besides the option."""
+        keys = [unravel_key(key) for module in modules for key in getattr(module, "in_keys", ())]
+        return [key for key in keys if key != unravel_key(self.tensor_keys.skill)]
+
+    def _next_with_option(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns what follows, with the option that led there; zeros where it terminated."""
+        keys, after = self.tensor_keys, tensordict.get("next")
+        reward = unravel_key(getattr(keys, "reward", ""))
+        read = [key for key in after.keys(True, True) if key != reward]
+        after = without_terminal_entries(after, after.get(keys.terminated), read)
+        return after.set(keys.skill, tensordict.get(keys.skill))
+
+    def _of_option(self, values: Tensor, option: Tensor) -> Tensor:
+        """Returns the value of each option ``[*B]`` among those of all ``[*B, A]``."""
+        if values.shape[:-1] != option.shape:
+            raise ValueError(
+                f"{type(self).__name__} needs action values [*B, A] and options [*B]; got "
+                f"{list(values.shape)} and {list(option.shape)}. One-hot options become indices by "
+                "option.long().argmax(-1)."
+            )
+        return values.gather(-1, option.unsqueeze(-1)).squeeze(-1)
+
+
+class OptionTerminationLoss(_OptionLoss):
     r"""The termination gradient: end an option where another one promises more.
 
     .. math::
@@ -33,8 +70,8 @@ class OptionTerminationLoss(PriorityWeights, LossModule):
     with the advantage detached, so that :math:`-\nabla L` is the gradient of the expected return by
     the termination's parameters (theorem 2 of the paper, for states :math:`s'` met while options
     run). :math:`V_\Omega(s') = \max_o Q_\Omega(s', o)`, or the mean over a policy's options. Where
-    o is the best option the advantage is 0: the deliberation cost :math:`\xi` makes it go on there,
-    and end only where going on costs more than :math:`\xi`.
+    o is the best option the advantage is 0: the deliberation cost :math:`\xi` makes it continue
+    there, and end only where continuing costs more than :math:`\xi`.
 
     Each transition is one base step (or several) of an option: root and ``"next"``, with the option
     that runs at the root. Where the option values come from is not this loss's business: TorchRL's
@@ -69,36 +106,17 @@ class OptionTerminationLoss(PriorityWeights, LossModule):
         Harb et al., "When waiting is not an option", 2018, arXiv 1709.04571 (deliberation cost).
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import TerminationNetwork
         >>> from torchrl_hmcts.objectives import OptionTerminationLoss
-        >>> loss = OptionTerminationLoss(TerminationNetwork(2, 3, in_keys=["velocity"]))
-        >>> td = TensorDict(
-        ...     skill=torch.tensor([0, 1]),
-        ...     next=TensorDict(velocity=torch.zeros(2, 2), action_value=torch.eye(3)[:2],
-        ...                     terminated=torch.zeros(2, 1, dtype=torch.bool), batch_size=[2]),
-        ...     batch_size=[2])
-        >>> sorted(loss(td).keys())
-        ['loss_termination', 'option_advantage', 'termination_probability']
+        >>> OptionTerminationLoss(TerminationNetwork(2, 3, in_keys=["velocity"])).in_keys
+        ['skill', ('next', 'velocity'), ('next', 'action_value'), ('next', 'terminated')]
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        skill: NestedKey = "skill"
-        termination_logits: NestedKey = "termination_logits"
-        action_value: NestedKey = "action_value"
-        terminated: NestedKey = "terminated"
-        priority_weight: NestedKey = "priority_weight"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = ["loss_termination", "termination_probability", "option_advantage"]
 
     termination_network: TensorDictModuleBase
     termination_network_params: TensorDictParams
     target_termination_network_params: TensorDictParams
-    _in_keys: Any  # list of keys, or None until it is known
 
     def __init__(
         self,
@@ -109,97 +127,55 @@ class OptionTerminationLoss(PriorityWeights, LossModule):
         option_policy: OptionPolicy | None = None,
         reduction: str = "mean",
     ) -> None:
-        self._in_keys = None
-        super().__init__()
-        check_reduction(type(self).__name__, reduction)
-        if not (math.isfinite(deliberation_cost) and deliberation_cost >= 0.0):
-            raise ValueError(
-                f"OptionTerminationLoss needs a deliberation_cost >= 0, what ending an option "
-                f"costs in units of return; got {deliberation_cost}."
-            )
+        super().__init__(reduction)
+        cost = real_number(type(self).__name__, "deliberation_cost", deliberation_cost, least=0.0)
         self.convert_to_functional(
             termination_network, "termination_network", create_target_params=False
         )
         # Not sub-modules: they are read, and belong to whoever trains them.
         self.__dict__["qvalue_network"] = qvalue_network
         self.__dict__["option_policy"] = option_policy
-        self.register_buffer("deliberation_cost", torch.tensor(float(deliberation_cost)))
-        self.reduction = reduction
+        self.register_buffer("deliberation_cost", torch.tensor(cost))
 
-    def _set_in_keys(self) -> None:
+    def _reads(self) -> Iterable[NestedKey]:
         keys = self.tensor_keys
-        own = {unravel_key(keys.skill)}
-        read = [key for key in self.termination_network.in_keys if unravel_key(key) not in own]
+        read = self._features(self.termination_network, self.qvalue_network)
         if self.qvalue_network is None:
             read.append(keys.action_value)
-        else:
-            read += [key for key in self.qvalue_network.in_keys if unravel_key(key) not in own]
         read += [keys.terminated, *getattr(self.option_policy, "in_keys", ())]
-        in_next = [unravel_key(("next", key)) for key in read]
-        self._in_keys = list(dict.fromkeys([unravel_key(keys.skill), *in_next]))
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that ``forward`` reads."""
-        if self._in_keys is None:
-            self._set_in_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        self._in_keys = None
+        return [keys.skill, *(("next", key) for key in read)]
 
     @torch.no_grad()
     def advantage(self, tensordict: TensorDictBase) -> Tensor:
         """Returns A(s', o) of transitions ``[*B]``: how much worse than V(s') going on is."""
-        next_td = _next_with_option(tensordict, self.tensor_keys)
+        next_td = self._next_with_option(tensordict)
         if self.qvalue_network is not None:
             self.qvalue_network(next_td)
         values = next_td.get(self.tensor_keys.action_value)  # [*B, A]
-        option = tensordict.get(self.tensor_keys.skill)  # [*B]
-        _check_values("OptionTerminationLoss", values, option)
+        own = self._of_option(values, tensordict.get(self.tensor_keys.skill))
         if self.option_policy is None:
-            value = values.amax(-1)
-        else:
-            value = (self.option_policy(next_td) * values).sum(-1)
-        return values.gather(-1, option.unsqueeze(-1)).squeeze(-1) - value
+            return own - values.amax(-1)
+        return own - (self.option_policy(next_td) * values).sum(-1)
 
     def termination_probability(self, tensordict: TensorDictBase) -> Tensor:
         """Returns beta(s', o) of transitions ``[*B]``, with gradients."""
-        next_td = _next_with_option(tensordict, self.tensor_keys)
-        network = self.termination_network
-        with self.termination_network_params.to_module(network, preserve_module_state=False):
-            logits = network(next_td).get(self.tensor_keys.termination_logits)
-        return logits.sigmoid().reshape(tensordict.batch_size)
+        network, params = self.termination_network, self.termination_network_params
+        out = run_module(network, params, self._next_with_option(tensordict))
+        return out.get(self.tensor_keys.termination_logits).sigmoid().reshape(tensordict.batch_size)
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         advantage = self.advantage(tensordict)
         probability = self.termination_probability(tensordict)
         runs = ~tensordict.get(unravel_key(("next", self.tensor_keys.terminated)))
-        runs = runs.reshape(tensordict.batch_size)
-        loss = probability * (advantage + self.deliberation_cost) * runs
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(loss, tensordict=tensordict, weights=weights)
-        probability = probability.detach()
-        if self.reduction != "none":
-            probability, advantage = probability.mean(), advantage.mean()
-        out = TensorDict(
-            {
-                "loss_termination": loss,
-                "termination_probability": probability,
-                "option_advantage": advantage,
-            },
-            batch_size=tensordict.batch_size if self.reduction == "none" else [],
-        )
-        self._clear_weakrefs(tensordict, out, "termination_network_params")
-        return out
+        loss = probability * (advantage + self.deliberation_cost) * runs.reshape(advantage.shape)
+        return {
+            "loss_termination": self._reduce(loss, tensordict),
+            "termination_probability": self._average(probability),
+            "option_advantage": self._average(advantage),
+        }
 
 
-class IntraOptionQLoss(PriorityWeights, LossModule):
+class IntraOptionQLoss(_OptionLoss):
     r"""Values of options that end with a learned probability, from parts of their way.
 
     .. math::
@@ -238,40 +214,27 @@ class IntraOptionQLoss(PriorityWeights, LossModule):
         Precup, "The option-critic architecture", 2017, arXiv 1609.05140, algorithm 1.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.objectives import IntraOptionQLoss
-        >>> network = TensorDictModule(torch.nn.Linear(2, 3), ["velocity"], ["action_value"])
-        >>> loss = IntraOptionQLoss(network, delay_value=False)
-        >>> td = TensorDict(
-        ...     velocity=torch.zeros(2, 2), skill=torch.tensor([0, 1]),
-        ...     next=TensorDict(velocity=torch.zeros(2, 2), reward=torch.ones(2, 1),
-        ...                     duration=torch.full((2, 1), 5),
-        ...                     terminated=torch.zeros(2, 1, dtype=torch.bool), batch_size=[2]),
-        ...     batch_size=[2])
-        >>> sorted(loss(td).keys())
-        ['loss_qvalue', 'td_error']
+        >>> values = TensorDictModule(lambda x: x, ["x"], ["action_value"])
+        >>> after = TensorDict(x=torch.tensor([[1.0, 8.0]]), reward=torch.ones(1, 1),
+        ...                    duration=torch.full((1, 1), 3), terminated=torch.zeros(1, 1).bool())
+        >>> td = TensorDict(skill=torch.tensor([0]), next=after, batch_size=[1])
+        >>> IntraOptionQLoss(values, gamma=0.5, delay_value=False).target(td)  # 1 + 0.5 ** 3 * 8
+        tensor([2.])
     """
 
     @dataclass
-    class _AcceptedKeys:
-        skill: NestedKey = "skill"
-        termination_logits: NestedKey = "termination_logits"
-        action_value: NestedKey = "action_value"
+    class _AcceptedKeys(_OptionLoss._AcceptedKeys):
         reward: NestedKey = "reward"
-        terminated: NestedKey = "terminated"
         duration: NestedKey = "duration"
-        priority_weight: NestedKey = "priority_weight"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = ["loss_qvalue", "td_error"]
 
     qvalue_network: TensorDictModuleBase
     qvalue_network_params: TensorDictParams
     target_qvalue_network_params: TensorDictParams
-    _in_keys: Any  # list of keys, or None until it is known
 
     def __init__(
         self,
@@ -283,105 +246,44 @@ class IntraOptionQLoss(PriorityWeights, LossModule):
         delay_value: bool = True,
         reduction: str = "mean",
     ) -> None:
-        self._in_keys = None
-        super().__init__()
-        check_reduction(type(self).__name__, reduction)
-        if not 0.0 < gamma <= 1.0:
-            raise ValueError(
-                f"IntraOptionQLoss needs a discount gamma in (0, 1] per base step; got {gamma}."
-            )
+        super().__init__(reduction)
+        owner = type(self).__name__
+        gamma = real_number(owner, "gamma", gamma, above=0.0, most=1.0)
+        self.loss_function = one_of(owner, "loss_function", loss_function, DISTANCES)
         self.delay_value = delay_value
         self.convert_to_functional(
             qvalue_network, "qvalue_network", create_target_params=delay_value
         )
         self.__dict__["termination_network"] = termination_network  # read only: its owner's
-        self.register_buffer("gamma", torch.tensor(float(gamma)))
-        self.loss_function = loss_function
-        self.reduction = reduction
+        self.register_buffer("gamma", torch.tensor(gamma))
 
-    def _set_in_keys(self) -> None:
-        keys = self.tensor_keys
-        own = {unravel_key(keys.skill)}
-        root = [key for key in self.qvalue_network.in_keys if unravel_key(key) not in own]
-        read = [*root, *getattr(self.termination_network, "in_keys", ())]
-        read = [key for key in read if unravel_key(key) not in own]
+    def _reads(self) -> Iterable[NestedKey]:
+        keys, root = self.tensor_keys, self._features(self.qvalue_network)
+        read = [*root, *self._features(self.termination_network)]
         in_next = [("next", key) for key in (*read, keys.reward, keys.terminated, keys.duration)]
-        found = [unravel_key(key) for key in (keys.skill, *root, *in_next)]
-        self._in_keys = list(dict.fromkeys(found))
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that ``forward`` reads."""
-        if self._in_keys is None:
-            self._set_in_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        self._in_keys = None
+        return [keys.skill, *root, *in_next]
 
     @torch.no_grad()
     def target(self, tensordict: TensorDictBase) -> Tensor:
         """Returns what Q(s, o) should be, ``[*B]``."""
-        keys = self.tensor_keys
-        option = tensordict.get(keys.skill)
-        next_td = _next_with_option(tensordict, keys)
-        params = self.target_qvalue_network_params if self.delay_value else None
-        params = self.qvalue_network_params.detach() if params is None else params
-        with params.to_module(self.qvalue_network, preserve_module_state=False):
-            values = self.qvalue_network(next_td).get(keys.action_value)
-        _check_values("IntraOptionQLoss", values, option)
-        value = values.amax(-1)
+        keys, option = self.tensor_keys, tensordict.get(self.tensor_keys.skill)
+        next_td = self._next_with_option(tensordict)
+        params = self.target_qvalue_network_params  # without a delay those of now, detached
+        values = run_module(self.qvalue_network, params, next_td).get(keys.action_value)
+        same, value = self._of_option(values, option), values.amax(-1)
         if self.termination_network is not None:
             logits = self.termination_network(next_td).get(keys.termination_logits)
-            same = values.gather(-1, option.unsqueeze(-1)).squeeze(-1)
             value = torch.lerp(same, value, logits.sigmoid().reshape(value.shape))
-        reward, terminated = (next_td.get(k).reshape(value.shape) for k in _pair(keys))
+        reward = next_td.get(keys.reward).reshape(value.shape)
+        runs = ~next_td.get(keys.terminated).reshape(value.shape)
         duration = next_td.get(keys.duration, None)
         discount = self.gamma if duration is None else self.gamma ** duration.reshape(value.shape)
-        return reward + discount * value * ~terminated
+        return reward + discount * value * runs
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        keys = self.tensor_keys
-        target = self.target(tensordict)
-        read = tensordict.select(*self.qvalue_network.in_keys)
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            values = self.qvalue_network(read).get(keys.action_value)
-        chosen = values.gather(-1, tensordict.get(keys.skill).unsqueeze(-1)).squeeze(-1)
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        keys, target = self.tensor_keys, self.target(tensordict)
+        out = run_module(self.qvalue_network, self.qvalue_network_params, tensordict)
+        chosen = self._of_option(out.get(keys.action_value), tensordict.get(keys.skill))
         loss = distance_loss(chosen, target, self.loss_function)
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(loss, tensordict=tensordict, weights=weights)
         error = (chosen.detach() - target).abs()
-        if self.reduction != "none":
-            error = error.mean()
-        batch_size = tensordict.batch_size if self.reduction == "none" else []
-        out = TensorDict({"loss_qvalue": loss, "td_error": error}, batch_size=batch_size)
-        names = ["qvalue_network_params"]
-        names += ["target_qvalue_network_params"] if self.delay_value else []
-        self._clear_weakrefs(tensordict, out, *names)
-        return out
-
-
-def _next_with_option(tensordict: TensorDictBase, keys: Any) -> TensorDictBase:
-    """The entries after the step, with the option that led there; zeros where it terminated."""
-    after = tensordict.get("next")
-    reward = unravel_key(getattr(keys, "reward", ""))
-    read = [key for key in after.keys(True, True) if key != reward]
-    after = without_terminal_entries(after, after.get(keys.terminated), read)
-    return after.set(keys.skill, tensordict.get(keys.skill))
-
-
-def _pair(keys: Any) -> tuple[NestedKey, NestedKey]:
-    return keys.reward, keys.terminated
-
-
-def _check_values(owner: str, values: Tensor, option: Tensor) -> None:
-    if values.shape[:-1] != option.shape:
-        raise ValueError(
-            f"{owner} needs action values [*B, A] and options [*B]; got {list(values.shape)} and "
-            f"{list(option.shape)}. One-hot options become indices by option.long().argmax(-1)."
-        )
+        return {"loss_qvalue": self._reduce(loss, tensordict), "td_error": self._average(error)}

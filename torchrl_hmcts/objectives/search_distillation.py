@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.objectives import LossModule
 
-from torchrl_hmcts.objectives.priority import PriorityWeights
-from torchrl_hmcts.objectives.skill_objective import check_reduction
+from torchrl_hmcts.checks import real_number
+from torchrl_hmcts.objectives.loss import Loss, one_of, run_module
 
+_VALUE_LOSSES = ("l2", "smooth_l1", "log", "cross_entropy")
 _SMALLEST = 1e-30  # whose logarithm is still a number in float32
 
 
-class ExpertIterationLoss(PriorityWeights, LossModule):
+class ExpertIterationLoss(Loss):
     r"""Cross-entropy to the options a search preferred, and the error of the values it found.
 
     .. math::
@@ -66,25 +66,19 @@ class ExpertIterationLoss(PriorityWeights, LossModule):
         arXiv 1705.08439; Silver et al., "Mastering the game of Go without human knowledge", 2017.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.objectives import ExpertIterationLoss
-        >>> class TwoHeads(torch.nn.Linear):
-        ...     def forward(self, x):
-        ...         out = super().forward(x)
-        ...         return out[..., :3], out[..., 3:]
-        >>> net = TensorDictModule(
-        ...     TwoHeads(2, 4), in_keys=["observation"], out_keys=["logits", "state_value"])
-        >>> loss = ExpertIterationLoss(net)
-        >>> td = TensorDict(observation=torch.randn(5, 2), policy_target=torch.full((5, 3), 1 / 3),
-        ...                 value_target=torch.rand(5, 1), batch_size=[5])
-        >>> [key for key in loss(td).keys() if key.startswith("loss")]
-        ['loss_policy', 'loss_value']
+        >>> copies = TensorDictModule(lambda x, v: (x, v), ["x", "v"], ["logits", "state_value"])
+        >>> td = TensorDict(x=torch.zeros(1, 2), v=torch.zeros(1, 1), batch_size=[1],
+        ...                 policy_target=torch.tensor([[1.0, 0.0]]), value_target=torch.ones(1, 1))
+        >>> out = ExpertIterationLoss(copies)(td)  # ln 2, and 1 squared
+        >>> round(out["loss_policy"].item(), 4), out["loss_value"].item()
+        (0.6931, 1.0)
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(Loss._AcceptedKeys):
         logits: NestedKey = "logits"
         state_value: NestedKey = "state_value"
         policy_target: NestedKey = "policy_target"
@@ -92,16 +86,10 @@ class ExpertIterationLoss(PriorityWeights, LossModule):
         value_target: NestedKey = "value_target"
         value_weight: NestedKey = "value_weight"
         action_mask: NestedKey = "action_mask"
-        priority_weight: NestedKey = "priority_weight"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = [
-        "loss_policy",
-        "loss_value",
-        "policy_accuracy",
-        "policy_divergence",
-        "value_error",
+        *("loss_policy", "loss_value"),
+        *("policy_accuracy", "policy_divergence", "value_error"),
     ]
 
     network: TensorDictModuleBase
@@ -117,50 +105,20 @@ class ExpertIterationLoss(PriorityWeights, LossModule):
         value_loss: Literal["l2", "smooth_l1", "log", "cross_entropy"] = "l2",
         reduction: str = "mean",
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-        check_reduction(type(self).__name__, reduction)
-        if value_loss not in ("l2", "smooth_l1", "log", "cross_entropy"):
-            raise ValueError(
-                f"ExpertIterationLoss: value_loss is 'l2', 'smooth_l1', 'log' or 'cross_entropy'; "
-                f"got {value_loss!r}."
-            )
-        if not (math.isfinite(value_coeff) and value_coeff >= 0.0):
-            raise ValueError(
-                f"ExpertIterationLoss needs value_coeff >= 0 that is finite; got {value_coeff}."
-            )
+        super().__init__(reduction)
+        owner = type(self).__name__
+        self.value_loss_name = one_of(owner, "value_loss", value_loss, _VALUE_LOSSES)
+        value_coeff = real_number(owner, "value_coeff", value_coeff, least=0.0)
         self.convert_to_functional(network, "network", create_target_params=False)
         self.register_coeff_buffer("value_coeff", value_coeff)
-        self.value_loss_name = value_loss
-        self.reduction = reduction
 
-    _in_keys: Any  # list of keys, or None until it is known
-
-    def _set_in_keys(self) -> None:
-        keys = [unravel_key(key) for key in self.network.in_keys]
-        self._in_keys = [*keys, self.tensor_keys.policy_target, self.tensor_keys.value_target]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that ``forward`` reads."""
-        if self._in_keys is None:
-            self._set_in_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        self._in_keys = None
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return both losses and the diagnostics of examples ``[*B]``."""
+    def _reads(self) -> Iterable[NestedKey]:
         keys = self.tensor_keys
-        read = tensordict.select(*self.network.in_keys)
-        with self.network_params.to_module(self.network, preserve_module_state=False):
-            read = self.network(read)
+        return [*self.network.in_keys, keys.policy_target, keys.value_target]
+
+    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        keys = self.tensor_keys
+        read = run_module(self.network, self.network_params, tensordict)
         logits, value = read.get(keys.logits), read.get(keys.state_value)
         mask = tensordict.get(keys.action_mask, None)
         if mask is not None:
@@ -173,41 +131,24 @@ class ExpertIterationLoss(PriorityWeights, LossModule):
         error = self._error(value, goal).reshape(cross_entropy.shape)
         policy_weight = self._weight(tensordict, keys.policy_weight, cross_entropy)
         value_weight = self._weight(tensordict, keys.value_weight, cross_entropy)
-        priority = self._maybe_get_priority_weight(tensordict)
-
-        def reduce(loss: Tensor) -> Tensor:
-            return self._reduce_loss(loss, tensordict=tensordict, weights=priority)
-
         hit = (logits.argmax(-1) == target.argmax(-1)).to(logits.dtype)
         off = (value - goal).abs().reshape(cross_entropy.shape)
-        diagnostics = {
+        return {
+            "loss_policy": self._reduce(policy_weight * cross_entropy, tensordict),
+            "loss_value": self._reduce(self.value_coeff * value_weight * error, tensordict),
             "policy_accuracy": self._mean(hit, policy_weight),
             "policy_divergence": self._mean(cross_entropy - entropy, policy_weight),
             "value_error": self._mean(off, value_weight),
         }
-        out = TensorDict(
-            {
-                "loss_policy": reduce(policy_weight * cross_entropy),
-                "loss_value": reduce(self.value_coeff * value_weight * error),
-                **{key: value.detach() for key, value in diagnostics.items()},
-            },
-            batch_size=tensordict.batch_size if self.reduction == "none" else [],
-        )
-        self._clear_weakrefs(tensordict, out, "network_params")
-        return out
 
     def _error(self, value: Tensor, goal: Tensor) -> Tensor:
-        name = self.value_loss_name
-        if name == "l2":
+        if self.value_loss_name == "l2":
             return (value - goal) ** 2
-        if name == "smooth_l1":
-            return F.smooth_l1_loss(value, goal, reduction="none")
-        if name == "cross_entropy":
+        if self.value_loss_name == "cross_entropy":
             return F.binary_cross_entropy(value, goal, reduction="none")
-        smallest = _SMALLEST
-        return F.smooth_l1_loss(
-            value.clamp_min(smallest).log(), goal.clamp_min(smallest).log(), reduction="none"
-        )
+        if self.value_loss_name == "log":
+            value, goal = value.clamp_min(_SMALLEST).log(), goal.clamp_min(_SMALLEST).log()
+        return F.smooth_l1_loss(value, goal, reduction="none")
 
     def _required(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         entry = tensordict.get(key, None)
@@ -224,6 +165,8 @@ class ExpertIterationLoss(PriorityWeights, LossModule):
         return torch.ones_like(like) if weight is None else weight.reshape(like.shape)
 
     def _mean(self, figure: Tensor, weight: Tensor) -> Tensor:
+        """Returns the mean over examples that have a weight, detached."""
+        figure = figure.detach()
         if self.reduction == "none":
             return figure
         has = (weight > 0).to(figure.dtype)

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
-from torchrl_hmcts.objectives.priority import PriorityWeights
+from torchrl_hmcts.objectives.loss import Loss
 
 _EMPTY = "_empty_state"  # bool [*B]
 
 
-class SkillObjective(PriorityWeights, LossModule):
+class SkillObjective(Loss):
     r"""Base class of skill objectives: the loss of a representation and the reward it gives.
 
     .. math:: L(\phi; s, z, s'), \qquad r_\phi(s, z, s')
@@ -35,21 +33,23 @@ class SkillObjective(PriorityWeights, LossModule):
     ``out_keys``. Gradients of the losses stay within the objective's own parameters.
 
     Args:
-        num_skills (int): number of skills ``Z``.
+        num_skills (int, optional): number of skills ``Z``. Default ``None``: what the network says.
         prior (SkillPrior, sequence of float or Tensor, optional): p(z), ``[Z]``, normalised; 0
             switches a skill off. Default ``None``: uniform. A
             :class:`~torchrl_hmcts.modules.SkillPrior` is read at every use and stays its owner's.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
+        **network (TensorDictModuleBase): what is trained, under the name of its attribute.
 
     Returns:
         TensorDict with the entries ``loss_*`` of the objective and detached diagnostics; with
         ``reduction="none"`` all are ``[*B]``.
 
     Raises:
-        ValueError: if the reduction is unknown or the prior is not over ``num_skills`` skills.
+        ValueError: if the reduction is unknown, or the number of skills is unknown or contradicts
+            that of the network or prior.
 
     A terminal state may hold anything; where the entries that are read of one are not finite, its
-    transition teaches nothing and is worth 0.
+    transition teaches nothing and is worth 0. So does one of a skill that the prior switches off.
 
     Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``terminated`` (read under
     ``"next"`` if it is there, default ``"terminated"``), ``priority_weight`` (default
@@ -59,7 +59,6 @@ class SkillObjective(PriorityWeights, LossModule):
         This project's: the common form of DIAYN, DADS, METRA and LSD.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.objectives import SkillObjective
         >>> class GoWhereTheSkillSays(SkillObjective):
@@ -80,13 +79,9 @@ class SkillObjective(PriorityWeights, LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(Loss._AcceptedKeys):
         skill: NestedKey = "skill"
         terminated: NestedKey = "terminated"
-        priority_weight: NestedKey = "priority_weight"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
 
     #: Names of the entries that :meth:`losses` returns, in order.
     out_keys: list[str]
@@ -95,27 +90,26 @@ class SkillObjective(PriorityWeights, LossModule):
     #: Entries that are read of the state after a transition, without ``"next"``.
     next_features: Sequence[NestedKey]
 
+    prior: SkillPrior
+
     def __init__(
         self,
-        num_skills: int,
+        num_skills: int | None = None,
         *,
         prior: SkillPrior | Sequence[float] | Tensor | None = None,
         reduction: str = "mean",
+        **network: TensorDictModuleBase,
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-        name = type(self).__name__
-        check_reduction(name, reduction)
-        self.reduction = reduction
-        self.num_skills = int(num_skills)
+        super().__init__(reduction)
+        owner = type(self).__name__
+        self.num_skills = _known_num_skills(owner, num_skills, *network.values())
         # Past nn.Module.__setattr__: a prior is saved and trained by its owner.
-        self.__dict__["prior"] = as_skill_prior(name, prior, num_skills)
+        self.__dict__["prior"] = as_skill_prior(owner, prior, self.num_skills)
         # A fixed prior that switches nothing off costs nothing below.
         fixed = not isinstance(prior, SkillPrior)
         self._always_all_active = fixed and bool(self.prior.active().all())
-
-    prior: SkillPrior
-    _in_keys: Any  # list of keys, or None until it is known
+        for name, module in network.items():
+            self.convert_to_functional(module, name, create_target_params=False)
 
     def log_prior(self, like: Tensor) -> Tensor:
         """Returns log p(z) as it is now, ``[Z]``, detached, of the type and device of ``like``."""
@@ -124,11 +118,6 @@ class SkillObjective(PriorityWeights, LossModule):
     def inactive(self) -> Tensor | None:
         """Returns which skills are switched off, bool ``[Z]``; None if all are on for good."""
         return None if self._always_all_active else ~self.prior.active()
-
-    @abstractmethod
-    def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        """Returns the reduced ``loss_*`` entries and detached diagnostics of transitions."""
-        raise NotImplementedError
 
     @abstractmethod
     def reward(self, tensordict: TensorDictBase) -> Tensor:
@@ -148,13 +137,12 @@ class SkillObjective(PriorityWeights, LossModule):
         if terminated is None:
             return tensordict
         after = tensordict.get("next").copy()
+        read = dict(zip(self.next_features, entries(self, after, self.next_features), strict=True))
         empty = torch.zeros(tensordict.batch_size, dtype=torch.bool, device=terminated.device)
-        for key in self.next_features:
-            (entry,) = entries(self, after, [key])
+        for entry in read.values():
             finite = entry.isfinite().reshape(*empty.shape, -1).all(-1)
             empty = empty | (terminated.reshape(empty.shape) & ~finite)
-        for key in self.next_features:
-            entry = after.get(key)
+        for key, entry in read.items():
             after.set(key, entry.masked_fill(expand_as_right(empty, entry), 0))
         return tensordict.copy().set("next", after).set(_EMPTY, empty)
 
@@ -165,65 +153,38 @@ class SkillObjective(PriorityWeights, LossModule):
         empty = tensordict.get(_EMPTY, None)
         return reward if empty is None else reward.masked_fill(empty.unsqueeze(-1), 0.0)
 
+    def _of_active(self, value: Tensor, skill: Tensor) -> Tensor:
+        """Returns values, and 0 where the skill, of the same shape, is switched off."""
+        off = self.inactive()
+        return value if off is None else value.masked_fill(off[skill], 0.0)
+
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         empty = tensordict.get(_EMPTY, None)
-        if empty is not None:
-            loss = loss.masked_fill(empty, 0.0)
-        weights = self._maybe_get_priority_weight(tensordict)
-        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+        return super()._reduce(loss if empty is None else loss.masked_fill(empty, 0.0), tensordict)
 
-    def _average(self, diagnostic: Tensor) -> Tensor:
-        diagnostic = diagnostic.detach()
-        return diagnostic if self.reduction == "none" else diagnostic.mean()
-
-    def _set_in_keys(self) -> None:
+    def _reads(self) -> Iterable[NestedKey]:
         after = [("next", key) for key in self.next_features]
-        keys = [self.tensor_keys.skill, *self.root_features, *after]
-        self._in_keys = [unravel_key(key) for key in keys]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that ``forward`` reads."""
-        if self._in_keys is None:
-            self._set_in_keys()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        return [self.tensor_keys.skill, *self.root_features, *after]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        batch_size = tensordict.batch_size if self.reduction == "none" else torch.Size([])
         losses = self.losses(self.without_empty_states(tensordict))
-        out = TensorDict(losses, batch_size=batch_size)
-        own = [key for key in self._modules if key.endswith("_params")]
-        self._clear_weakrefs(tensordict, out, *own)
-        return out
+        return self._output(tensordict, losses)
 
 
-def check_reduction(owner: str, reduction: str) -> None:
-    """Raises ValueError unless the reduction is one TorchRL knows."""
-    if reduction not in ("none", "mean", "sum"):
+def _known_num_skills(
+    owner: str, num_skills: int | None, network: TensorDictModuleBase | None = None
+) -> int:
+    """Returns the number of skills that a network distinguishes, or the given one."""
+    known = getattr(network, "num_skills", None)
+    if known is None and num_skills is None:
         raise ValueError(
-            f"{owner} reduces its losses over the batch by 'mean', 'sum' or 'none'; got "
-            f"reduction={reduction!r}."
-        )
-
-
-def known_num_skills(owner: str, module: torch.nn.Module, num_skills: int | None) -> int:
-    """Returns the number of skills of a module, or the given one where it does not say."""
-    known = getattr(module, "num_skills", None)
-    if num_skills is None:
-        num_skills = known
-    if num_skills is None:
-        raise ValueError(
-            f"{owner} cannot tell how many skills {type(module).__name__} distinguishes, since it "
+            f"{owner} cannot tell how many skills {type(network).__name__} distinguishes, since it "
             "has no attribute num_skills. Pass num_skills=."
         )
-    if known is not None and known != num_skills:
+    if None not in (known, num_skills) and known != num_skills:
         raise ValueError(
-            f"{owner} was told of {num_skills} skills, but its {type(module).__name__} "
-            f"distinguishes {known}. Give both the same num_skills."
+            f"{owner} was told of num_skills={num_skills}, but its {type(network).__name__} "
+            f"distinguishes {known}. Give both the same."
         )
-    return num_skills
+    return known if num_skills is None else num_skills

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
 
+from torchrl_hmcts.checks import instance, real_number
 from torchrl_hmcts.modules.skill_prior import SkillPrior
-from torchrl_hmcts.objectives.skill_objective import check_reduction
+from torchrl_hmcts.objectives.loss import Loss
 
 
-class SkillPriorLoss(LossModule):
+class SkillPriorLoss(Loss):
     r"""Moves p(z) to the skills whose intrinsic reward is high, held apart by an entropy bonus.
 
     .. math::
@@ -25,16 +25,13 @@ class SkillPriorLoss(LossModule):
         \bar r(z) = \mathbb{E}\bigl[\log q(z \mid s') \,\big|\, z\bigr]
 
     With :math:`\beta = 1` that is minus the mutual information of skill and state, the objective of
-    variational intrinsic control. The gradient is exact: skills are few, so the sum over them is
-    written out, and :math:`\bar r(z)` is a running mean over the transitions of each skill. (It is
-    the expectation of the score-function gradient of that paper, without its variance, and
-    right as well for transitions whose skill an earlier p(z) drew.) The minimum is
+    variational intrinsic control. The gradient is exact: the sum over the few skills is written
+    out, and :math:`\bar r(z)` is a running mean over the transitions of each skill. The minimum is
+    :math:`p(z) \propto \exp(\bar r(z) / \beta)`.
 
-    .. math:: p(z) \propto \exp\bigl(\bar r(z) / \beta\bigr)
-
-    Why not always learn it: a skill that is drawn more often is trained more, becomes easier to
-    tell and is drawn more often still, until one or a few are left. The authors of DIAYN fix p(z)
-    for that reason. :math:`\beta > 1` pulls towards uniform; :math:`\beta \to \infty` is DIAYN.
+    A skill that is drawn more often is trained more, becomes easier to tell and is drawn more often
+    still, until one or a few are left; so the authors of DIAYN fix p(z). :math:`\beta > 1` pulls
+    towards uniform; :math:`\beta \to \infty` is DIAYN.
 
     Args:
         prior (SkillPrior): the prior to train, e.g. a
@@ -45,7 +42,7 @@ class SkillPriorLoss(LossModule):
         prior_in_reward (bool): the reward that is read contains ``-log p(z)``, as DIAYN's and VIC's
             do; it is taken out, since the entropy stands for it. Pass ``False`` for a reward
             without it, e.g. METRA's. Default ``True``.
-        decay (float): share of the old running mean that a batch keeps, in ``[0, 1)``. Default
+        decay (float): share of the old running mean that a batch keeps, in ``[0, 1]``. Default
             ``0.9``; 0 looks at the latest batch only. In eval mode the mean stays.
         reduction (str): over skills: ``"sum"`` (default) is L above; ``"none"`` gives its terms,
             ``[Z]``; ``"mean"`` is L / Z.
@@ -62,12 +59,9 @@ class SkillPriorLoss(LossModule):
 
     Reference:
         Gregor, Rezende and Wierstra, "Variational Intrinsic Control", 2016, arXiv 1611.07507,
-        algorithm 1; Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070 (why p(z)
-        is fixed there).
+        algorithm 1. Why p(z) is fixed: Eysenbach et al., "Diversity is All You Need", 2018.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.modules import LearnedSkillPrior
         >>> from torchrl_hmcts.objectives import SkillPriorLoss
         >>> prior = LearnedSkillPrior(2)
@@ -89,8 +83,6 @@ class SkillPriorLoss(LossModule):
         skill: NestedKey = "skill"
         reward: NestedKey = "reward"
 
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     out_keys = ["loss_skill_prior", "skill_prior_entropy", "num_effective_skills"]
 
     mean_reward: Tensor  # [Z] running mean of the reward, without -log p(z)
@@ -105,48 +97,24 @@ class SkillPriorLoss(LossModule):
         decay: float = 0.9,
         reduction: str = "sum",
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-        check_reduction("SkillPriorLoss", reduction)
+        super().__init__(reduction)
+        instance("SkillPriorLoss", "prior", prior, SkillPrior)
         if not any(p.requires_grad for p in prior.parameters()):
             raise ValueError(
                 f"SkillPriorLoss trains the parameters of a prior; {type(prior).__name__} has none "
                 "to train. Pass a LearnedSkillPrior."
             )
-        if not entropy_coeff >= 0.0:
-            raise ValueError(
-                "SkillPriorLoss rewards entropy, so entropy_coeff must not be negative; got "
-                f"{entropy_coeff}."
-            )
-        if not 0.0 <= decay < 1.0:
-            raise ValueError(
-                f"SkillPriorLoss keeps a share decay in [0, 1) of its running mean; got {decay}."
-            )
         self.prior = prior
         self.num_skills = prior.num_skills
-        self.entropy_coeff = float(entropy_coeff)
+        owner = "SkillPriorLoss"
+        self.entropy_coeff = real_number(owner, "entropy_coeff", entropy_coeff, least=0.0)
         self.prior_in_reward = bool(prior_in_reward)
-        self.decay = float(decay)
-        self.reduction = reduction
+        self.decay = real_number(owner, "decay", decay, least=0.0, most=1.0)
         self.register_buffer("mean_reward", torch.zeros(self.num_skills))
         self.register_buffer("seen", torch.zeros(self.num_skills, dtype=torch.bool))
 
-    _in_keys: Any  # list of keys, or None until it is known
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that ``forward`` reads."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            self._in_keys = [unravel_key(keys.skill), unravel_key(("next", keys.reward))]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        self._in_keys = None  # set_keys was called
+    def _reads(self) -> Iterable[NestedKey]:
+        return [self.tensor_keys.skill, ("next", self.tensor_keys.reward)]
 
     @torch.no_grad()
     def _remember(self, tensordict: TensorDictBase) -> None:

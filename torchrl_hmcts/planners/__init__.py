@@ -1,48 +1,47 @@
 """The manager: Monte Carlo tree search over the options of a macro environment."""
 
-from torchrl_hmcts.arguments import name_all_arguments
 from torchrl_hmcts.planners.array_search import Root, Transition, tree_search
-from torchrl_hmcts.planners.backups import MaxBackup, MeanBackup
-from torchrl_hmcts.planners.budget import SearchBudget
-from torchrl_hmcts.planners.chance import ProgressiveWidening
-from torchrl_hmcts.planners.choices import BestPlan, HighestValue, MostVisited, SampledVisits
-from torchrl_hmcts.planners.control import HierarchicalPolicy
+from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
+from torchrl_hmcts.planners.control import GoalPlanner, HierarchicalPolicy
+from torchrl_hmcts.planners.evaluation import Evaluation
 from torchrl_hmcts.planners.evaluators import (
     MixedEvaluator,
     ModulePrior,
+    PolicyValueEvaluator,
     RolloutEvaluator,
     ValueEvaluator,
 )
-from torchrl_hmcts.planners.goals import GoalPlanner
-from torchrl_hmcts.planners.growth import SearchProgress
 from torchrl_hmcts.planners.mcts import MCTSPlanner
-from torchrl_hmcts.planners.model_control import ModelBasedControl
-from torchrl_hmcts.planners.noise import DirichletNoise
 from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.policy_value import PolicyValueEvaluator
+from torchrl_hmcts.planners.reference import ReferenceSearch
+from torchrl_hmcts.planners.root_options import (
+    BestPlan,
+    DirichletNoise,
+    HighestValue,
+    MostVisited,
+    SampledVisits,
+)
 from torchrl_hmcts.planners.search import Search
-from torchrl_hmcts.planners.search_data import best_plans_below, search_examples
-from torchrl_hmcts.planners.torchrl_scores import TorchRLScore
+from torchrl_hmcts.planners.search_data import search_examples
+from torchrl_hmcts.planners.search_loop import SearchProgress
+from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.transpositions import Transpositions
-from torchrl_hmcts.planners.tree import SearchTree, TreeView
-from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, NodeStatistics
-from torchrl_hmcts.planners.tree_rollout import TreeRollout
+from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, NodeStatistics, TorchRLScore
+from torchrl_hmcts.planners.tree_view import SearchTree, TreeView
 
 __all__ = [
     "PUCT",
     "UCT",
     "BestPlan",
     "DirichletNoise",
+    "Evaluation",
     "GoalPlanner",
     "Gumbel",
     "HierarchicalPolicy",
     "HighestValue",
     "MCTSPlanner",
-    "MaxBackup",
-    "MeanBackup",
     "MixedEvaluator",
-    "ModelBasedControl",
     "ModulePrior",
     "MostVisited",
     "NodeStatistics",
@@ -51,12 +50,14 @@ __all__ = [
     "PolicyValueEvaluator",
     "ProgressiveWidening",
     "RadiusNovelty",
+    "ReferenceSearch",
     "RolloutEvaluator",
     "Root",
     "SampledVisits",
     "Search",
     "SearchBudget",
     "SearchProgress",
+    "SearchSettings",
     "SearchTree",
     "TorchRLScore",
     "Transition",
@@ -65,10 +66,7 @@ __all__ = [
     "TreeView",
     "ValueEvaluator",
     "WidthNovelty",
-    "best_plans_below",
     "extract_plans",
     "search_examples",
     "tree_search",
 ]
-
-name_all_arguments(globals(), __all__)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -15,16 +14,11 @@ import torch
 from torch import Tensor
 
 from torchrl_hmcts.checks import whole_number
-from torchrl_hmcts.planners.backups import Backup, MeanBackup
-from torchrl_hmcts.planners.search import (
-    Outcomes,
-    RootStates,
-    Search,
-    check_search,
-    root_seeds,
-)
+from torchrl_hmcts.planners.root_options import halve
+from torchrl_hmcts.planners.search import Outcomes, RootStates, Search
+from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.tree import LARGEST, MOST_NODES
-from torchrl_hmcts.planners.tree_policies import PUCT, Gumbel, TreePolicy
+from torchrl_hmcts.planners.tree_policies import PUCT, CompiledPolicy, TreePolicy
 
 Array = np.ndarray | Tensor
 
@@ -96,7 +90,7 @@ def tree_search(
     num_simulations: int,
     *,
     tree_policy: TreePolicy | None = None,
-    backup: Backup | None = None,
+    backup: Literal["mean", "max"] = "mean",
     mask: Array | None = None,
     leaves_per_wave: int = 1,
     exhausted: Literal["skip", "revisit"] = "revisit",
@@ -116,11 +110,9 @@ def tree_search(
         transition: ``transition(embedding [m, ...], option [m] int64) -> Transition`` of
             contiguous float32 arrays. The arrays it is given are copies, reused by the next call.
         num_simulations: per root.
-        tree_policy: Default ``PUCT()``.
-        backup: Default ``MeanBackup()``.
+        tree_policy, backup, leaves_per_wave, exhausted: as in :class:`SearchSettings`, but by
+            default ``PUCT()`` and ``"revisit"``.
         mask: bool ``[B, A]``, options that may be taken in the roots. Default: all.
-        leaves_per_wave: leaves of each root in one call. Default 1.
-        exhausted: as in :class:`~torchrl_hmcts.planners.MCTSPlanner`. Default ``"revisit"``.
         seed: of the Gumbel noise; root ``b`` draws from ``seed + b``.
 
     Returns:
@@ -151,8 +143,13 @@ def tree_search(
         >>> search.tree.view().children_visits[:, 0].argmax(-1)
         tensor([1])
     """
-    tree_policy = PUCT() if tree_policy is None else tree_policy
-    backup = MeanBackup() if backup is None else backup
+    settings = SearchSettings(
+        tree_policy=PUCT() if tree_policy is None else tree_policy,
+        backup=backup,
+        expand="one",
+        leaves_per_wave=leaves_per_wave,
+        exhausted=exhausted,
+    )
     prior, value = _check_root(root)
     num_roots, num_options = prior.shape
     num_simulations = whole_number("tree_search", "num_simulations", num_simulations, least=1)
@@ -161,24 +158,8 @@ def tree_search(
             f"tree_search makes room for a node per simulation, fewer than {MOST_NODES:,}; got "
             f"num_simulations={num_simulations}."
         )
-    check_search(
-        "tree_search",
-        tree_policy=tree_policy,
-        num_simulations=num_simulations,
-        expand="one",
-        leaves_per_wave=leaves_per_wave,
-        exhausted=exhausted,
-    )
-    search = Search(
-        num_roots,
-        num_options,
-        tree_policy=tree_policy,
-        backup=backup,
-        expand="one",
-        leaves_per_wave=leaves_per_wave,
-        exhausted=exhausted,
-        capacity=num_simulations + 1,
-    )
+    settings.check_simulations(num_simulations)
+    search = Search(num_roots, num_options, settings, capacity=num_simulations + 1)
     no_masks = np.zeros((0, num_options), np.bool_)
     masks = no_masks if mask is None else np.ascontiguousarray(np.asarray(mask, np.bool_))
     if mask is not None and masks.shape != (num_roots, num_options):
@@ -188,13 +169,13 @@ def tree_search(
             f"Root {int(np.flatnonzero(~masks.any(-1))[0])} has no option that may be taken: its "
             f"mask is all False. Leave it out of the batch."
         )
-    search.start(RootStates(value, np.zeros(num_roots, np.bool_), prior, masks))
-    search.begin(num_simulations)
-    search.seed(root_seeds("tree_search", seed, num_roots))
-    if isinstance(tree_policy, Gumbel):
-        search.halve(num_simulations)
+    search.plant(RootStates(value, np.zeros(num_roots, np.bool_), prior, masks))
+    search.limit(num_simulations)
+    search.seed(seed)
+    if settings.is_gumbel:
+        halve(search, num_simulations)
     loop = _Loop(search, root.embedding, transition, no_masks)
-    if search._scores is None:
+    if isinstance(settings.tree_policy, CompiledPolicy):
         loop.run()
     else:
         loop.run_in_python()
@@ -225,33 +206,35 @@ class _Loop:
             self.states, self.options = map(torch.from_numpy, (self.states, self.options))
 
     def run(self) -> None:
+        from torchrl_hmcts.planners import batch_kernels
+
         search, tree = self.search, self.search.tree
         transition: Callable[..., Any] = self.transition
         states, options, size = self.states, self.options, len(self.states)
-        kernels = search._kernels
         arrays = (
             tree.nodes,
             tree.edges,
             tree.roots,
-            search.settings,
-            search._gumbel,
+            search.record,
+            search.gumbel,
             search._wave,
             self.masks,
             self.stored,
             self.buffer,
             self.given,
         )
-        advance: Any
-        if kernels.COMPILED:
-            advance = partial(kernels.advance_at, kernels.handle(*arrays))
-        else:
-            advance = partial(kernels.advance, *arrays)
+        at, advance = batch_kernels.handle(*arrays), batch_kernels.advance_at
+        if not batch_kernels.COMPILED:
+
+            def advance(at: Any, *outcomes: Any) -> Any:
+                return batch_kernels.advance(*arrays, *outcomes)
+
         # As bytes, any dtype and shape runs the same code; indices are spared the conversion.
-        as_bytes = not kernels.COMPILED or self.dtype != np.int64 or self.shape != ()
+        as_bytes = not batch_kernels.COMPILED or self.dtype != np.int64 or self.shape != ()
         none, no_prior = np.zeros(0, np.float32), np.zeros((0, search.num_options), np.float32)
         nothing = _bytes(self.nothing) if as_bytes else self.nothing
-        count = advance(0, none, none, none, no_prior, nothing)
-        dtype, shape, first = self.dtype, self.shape, True
+        count = advance(at, 0, none, none, none, no_prior, nothing)
+        dtype, shape, is_tensor, first = self.dtype, self.shape, self.is_tensor, True
         while count:
             if count == size:
                 answer = transition(states, options)
@@ -262,7 +245,7 @@ class _Loop:
                     self._check(answer, count)
                     first = False
                 reward, discount, prior, value, embedding = answer
-                if self.is_tensor:
+                if is_tensor:
                     reward, discount, prior, value, embedding = (
                         x.detach().numpy() for x in (reward, discount, prior, value, embedding)
                     )
@@ -272,7 +255,7 @@ class _Loop:
                     if embedding.shape[1:] != shape:
                         self._check(answer, count)
                     embedding = _bytes(embedding)
-                count = advance(count, reward, discount, value, prior, embedding)
+                count = advance(at, count, reward, discount, value, prior, embedding)
             except Exception:
                 self._check(answer, count)
                 raise
@@ -328,13 +311,14 @@ class _Loop:
                     f"The transition function returned {name} as {type(array).__name__}; return "
                     f"what the embedding is, a {'tensor' if self.is_tensor else 'NumPy array'}."
                 )
-            got = str(array.dtype).removeprefix("torch.")  # NumPy has no bfloat16
             if isinstance(array, Tensor):
                 contiguous = array.is_contiguous() and not array.is_neg()
+                same = array.dtype == torch.from_numpy(np.empty(0, dtype)).dtype
             else:
-                contiguous = array.flags.c_contiguous
-            if tuple(array.shape) != shape or got != str(dtype) or not contiguous:
+                contiguous, same = array.flags.c_contiguous, array.dtype == dtype
+            if tuple(array.shape) != shape or not same or not contiguous:
                 order = "" if contiguous else " (not contiguous)"
+                got = str(array.dtype).removeprefix("torch.")  # NumPy has no bfloat16
                 raise ValueError(
                     f"The transition function returned {name} as {got} {list(array.shape)}"
                     f"{order}; it must be {dtype} {list(shape)} and contiguous."
@@ -347,10 +331,9 @@ class _Loop:
 def _check_range(found: str, name: str, array: np.ndarray) -> None:
     """Refuse numbers that no search can use; ``found`` says of which array, with its {number}."""
     low, high, rule = _RANGES[name]
-    exact = array.astype(np.float64)
-    good = (exact >= low) & (exact <= high)
-    if not good.all():
-        raise ValueError(f"{found.format(number=array[~good][0])}; {rule}.")
+    if array.size and not (low <= float(array.min()) and float(array.max()) <= high):
+        bad = array[~((array >= np.float64(low)) & (array <= np.float64(high)))][0]
+        raise ValueError(f"{found.format(number=bad)}; {rule}.")
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:

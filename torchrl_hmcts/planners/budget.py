@@ -1,10 +1,10 @@
-"""How much a search may spend."""
+"""How much a search may spend, how often it asks again, and how far it looks beyond a leaf."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.checks import instance, real_number, whole_number
 
 _DEFAULT_EXPANSIONS = 1000
 
@@ -53,14 +53,92 @@ class SearchBudget:
         limits = ("expansions", "simulations", "base_steps", "seconds", "nodes")
         for name in limits:
             value = getattr(self, name)
-            if value is not None and not value > 0:
+            if value is None:
+                continue
+            real_number("SearchBudget", name, value, finite=False)
+            if value <= 0:
                 raise ValueError(
                     f"SearchBudget needs {name} > 0: a search of nothing has no plan; got {value}. "
                     f"Use None for no limit."
                 )
-            if value is not None and name != "seconds":
+            if name != "seconds":
                 object.__setattr__(self, name, whole_number("SearchBudget", name, value))
         if all(getattr(self, name) is None for name in limits):
             object.__setattr__(self, "expansions", _DEFAULT_EXPANSIONS)
+        instance("SearchBudget", "until_plan", self.until_plan, bool)
         more = whole_number("SearchBudget", "improve_expansions", self.improve_expansions)
         object.__setattr__(self, "improve_expansions", more)
+
+
+@dataclass(frozen=True)
+class ProgressiveWidening:
+    r"""Draws another outcome of an option as its visits grow.
+
+    An option visited :math:`N(s,o)` times has been simulated at most
+
+    .. math:: \lceil k\, N(s,o)^\alpha \rceil
+
+    times. Equal next states are one outcome, counted twice; the option's value is the mean over
+    the outcomes drawn, and descents go to them in proportion. A planner without it simulates each
+    option of a node once, which is right for a deterministic simulator only.
+
+    Args:
+        k: Default 1.
+        alpha: 0 for ``k`` outcomes at most, 1 for a new draw at every visit. Default 0.5.
+
+    Raises:
+        ValueError: if ``k`` is not positive, or ``alpha`` is not in [0, 1].
+
+    Reference:
+        Couetoux et al., "Continuous upper confidence trees", 2011 (double progressive widening).
+
+    Example:
+        >>> ProgressiveWidening(k=2.0)
+        ProgressiveWidening(k=2.0, alpha=0.5)
+    """
+
+    k: float = 1.0
+    alpha: float = 0.5
+
+    def __post_init__(self) -> None:
+        real_number("ProgressiveWidening", "k", self.k, above=0.0)
+        real_number("ProgressiveWidening", "alpha", self.alpha, least=0.0, most=1.0)
+
+
+@dataclass(frozen=True)
+class TreeRollout:
+    r"""Continues from every new leaf with options drawn from the prior, and keeps all that is met.
+
+    .. math:: o_{i+1} \sim P(\cdot \mid s_i), \qquad i < n
+
+    The simulation step of the textbook, except that every state on the way becomes a node: nothing
+    that was simulated is thrown away, and a reward far ahead is found by a path that can be
+    executed. Uniform without an ``option_prior``. A rollout ends where the episode does, where the
+    novelty test refuses the state, and where the budget of simulations is spent; the other limits
+    are looked at between rollouts. Its steps count in the budget, as all of a tree's do.
+
+    Args:
+        max_options: n, options of a rollout at most. Default 10.
+
+    Raises:
+        ValueError: if ``max_options`` is below 1.
+
+    Reference:
+        Bandres, Bonet and Geffner, "Planning with pixels in (almost) real time", 2018, arXiv
+        1801.03354: rollouts in the tree, there with a novelty test.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner, SearchBudget, TreeRollout
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> planner = MCTSPlanner(
+        ...     ChainEnv(length=30), expand="one", rollout=TreeRollout(max_options=5),
+        ...     budget=SearchBudget(simulations=12, until_plan=False), seed=0)
+        >>> search = planner.search(ChainEnv(length=30).reset())
+        >>> search.num_simulations.tolist(), int(search.tree.nodes["depth"].max()) >= 6
+        ([12], True)
+    """
+
+    max_options: int = 10
+
+    def __post_init__(self) -> None:
+        whole_number("TreeRollout", "max_options", self.max_options, least=1)

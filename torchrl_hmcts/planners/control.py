@@ -1,12 +1,12 @@
-"""Carrying plans out: a policy over options that plans, follows its plan and plans again.
+"""Executing plans: a policy that plans, follows its plan and plans again; goals for a worker.
 
-Letters: *B batch of the tensordict, L ``max_plan_length``, f numbers of the divergence entries.
+Letters: *B batch of the tensordict, L ``max_plan_length`` or goals, f numbers of the divergence
+entries, m states, D coordinates of a goal.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -14,8 +14,12 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
 
-from torchrl_hmcts.planners.episodes import EpisodeStarts
+from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts.nesting import env_name
+from torchrl_hmcts.planners.keys import entry_key, entry_keys
 from torchrl_hmcts.planners.mcts import MCTSPlanner
 from torchrl_hmcts.planners.plan import Plan, extract_plans
 from torchrl_hmcts.planners.search import Search
@@ -31,7 +35,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
     .. math:: \lVert \phi(s_i) - \phi(\hat s_i) \rVert > \text{divergence}
 
     with :math:`\phi` the entries ``divergence_key`` side by side. Where no plan is found, the
-    planner's choice is taken and planning starts anew after it.
+    planner's choice is taken, and a new plan is made after it.
 
     The plan lives in the tensordict, as a recurrent policy's state does: ``"plan"`` (int64
     ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made so far, or
@@ -41,7 +45,13 @@ class HierarchicalPolicy(TensorDictModuleBase):
     is to act in, the plan is out of date. Where it cannot see that, as in a tensordict that was
     copied before the step, append TorchRL's ``InitTracker`` or ``StepCounter`` to the env.
 
-    With ``reuse`` the trees are kept from one decision to the next: where the options carried out
+    The env to act in need not be the planner's. With ``state_map`` the state to plan from is made
+    from what that env shows, :math:`\hat s = \mathrm{map}(o)`: so one acts in an env that cannot be
+    set to a state by planning in a model that can. The real env is under an
+    :class:`~torchrl_hmcts.transforms.OptionTransform` with the same worker; plan again after every
+    option (``replan_every=1``), since it ends elsewhere than the model predicted.
+
+    With ``reuse`` the trees are kept from one decision to the next: where the options executed
     led to a state that the tree holds, its subtree is searched further
     (:meth:`MCTSPlanner.advance`), elsewhere a new tree is planted. The trees live in the policy,
     so it serves one rollout at a time; another rollout gets right plans too, but nothing to reuse.
@@ -49,22 +59,30 @@ class HierarchicalPolicy(TensorDictModuleBase):
     Args:
         planner (MCTSPlanner): the manager.
         max_plan_length (int): options of a plan that are kept, L. Default 64.
-        replan_every (int, optional): options after which to plan again though the plan goes on; 1
+        replan_every (int, optional): options after which to plan again though the plan continues; 1
             for every option. Default: at the plan's end.
         divergence (float, optional): distance from the predicted state, in units of the entries,
             above which to plan again. Default: the prediction is not looked at.
         divergence_key (NestedKey or sequence of them, optional): entries of the simulator's state
             or observation that are compared, e.g. ``"position"``.
         reuse (bool): keep the trees between decisions. Default ``False``.
+        state_map (callable, optional): ``state_map(td) -> TensorDict [*B]`` of what the planner
+            reads (its ``in_keys``), from the entries of the env that is acted in. Default: that env
+            writes them itself, and they are taken as they are.
+        env (EnvBase, optional): the macro env to act in, checked once against the planner's.
 
     Raises:
         ValueError: if a number is out of range, ``divergence`` comes without ``divergence_key`` or
-            the other way round, or the planner's env has no such entry.
+            the other way round, the planner's env has no such entry, or ``env`` has other options;
+            at a call if the mapped state lacks an entry or has another batch size.
+        TypeError: if an argument is of another kind.
 
     Reference:
-        Dissertation, sections 3.2.1 and 4.2: the worker carries the manager's plan out.
+        Dissertation, sections 3.2.1 and 4.2: plan in a simulation, execute in the environment.
 
     Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
         >>> from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> env = ChainEnv(length=4)
@@ -74,6 +92,10 @@ class HierarchicalPolicy(TensorDictModuleBase):
         >>> policy = HierarchicalPolicy(MCTSPlanner(env), replan_every=1, reuse=True)
         >>> env.rollout(10, policy=policy)["num_plans"].flatten().tolist()
         [1, 2, 3]
+        >>> policy = HierarchicalPolicy(  # a model that has another name for its state
+        ...     MCTSPlanner(env), state_map=lambda td: TensorDict({"state": td["place"]}, []))
+        >>> policy(TensorDict({"place": torch.tensor(2)}, []))["action"]
+        tensor(1)
     """
 
     def __init__(
@@ -85,46 +107,68 @@ class HierarchicalPolicy(TensorDictModuleBase):
         divergence: float | None = None,
         divergence_key: NestedKey | Sequence[NestedKey] | None = None,
         reuse: bool = False,
+        state_map: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        env: EnvBase | None = None,
     ) -> None:
         super().__init__()
-        if max_plan_length < 1:
-            raise ValueError(
-                f"HierarchicalPolicy needs max_plan_length >= 1; got {max_plan_length}."
-            )
-        if replan_every is not None and replan_every < 1:
-            raise ValueError(
-                f"HierarchicalPolicy needs replan_every >= 1, in options; got {replan_every}. Use "
-                f"None to plan again at the plan's end only."
-            )
+        instance("HierarchicalPolicy", "planner", planner, MCTSPlanner)
+        owner = "HierarchicalPolicy"
+        self.max_plan_length = whole_number(owner, "max_plan_length", max_plan_length, least=1)
+        if replan_every is not None:
+            whole_number(owner, "replan_every", replan_every, least=1)
         if (divergence is None) != (divergence_key is None):
             raise ValueError(
                 f"HierarchicalPolicy compares divergence_key with the plan and plans again above "
                 f"divergence; got divergence={divergence} and divergence_key={divergence_key!r}. "
                 f"Pass both or neither."
             )
-        if divergence is not None and not (math.isfinite(divergence) and divergence >= 0.0):
-            raise ValueError(
-                f"HierarchicalPolicy needs a divergence >= 0, a distance; got {divergence}."
-            )
-        self.planner = planner
-        self.max_plan_length = max_plan_length
-        self.replan_every = replan_every
-        self.divergence = divergence
-        self.reuse = reuse
-        keys: list[NestedKey] = []
-        if isinstance(divergence_key, (str, tuple)):
-            keys = [divergence_key]
-        elif divergence_key is not None:
-            keys = list(divergence_key)
-        self.divergence_keys = [unravel_key(k) for k in keys]
+        self.divergence_keys: list[NestedKey] = []
+        if divergence is not None and divergence_key is not None:
+            real_number(owner, "divergence", divergence, least=0.0)
+            self.divergence_keys = entry_keys(owner, "divergence_key", divergence_key)
+        self.planner, self.replan_every = planner, replan_every
+        instance(owner, "reuse", reuse, bool)
+        self.divergence, self.reuse = divergence, reuse
         planner.simulator.keep(self.divergence_keys)
-        self.in_keys = list(dict.fromkeys([*planner.in_keys, *self.divergence_keys]))
+        self._state_keys = list(dict.fromkeys([*planner.in_keys, *self.divergence_keys]))
+        read = self._state_keys
+        if state_map is not None:
+            if not callable(state_map):
+                raise TypeError(f"state_map must be callable on a tensordict; got {state_map!r}.")
+            read = list(getattr(state_map, "in_keys", []))
+        self.in_keys = [unravel_key(key) for key in read]
+        self.__dict__["state_map"] = state_map  # its owner trains and moves it
+        if env is not None:
+            instance(owner, "env", env, EnvBase)
+            self._check_env(env)
         self._plan_keys = ["plan", "plan_length", "plan_step", "num_plans"]
         if divergence is not None:
             self._plan_keys.append("plan_states")
         self.out_keys = [planner.option_key, *self._plan_keys]
         self._starts = EpisodeStarts(self.in_keys, self._plan_keys[:4])
         self.reset()
+
+    def _check_env(self, env: EnvBase) -> None:
+        name, key = env_name(env), self.planner.option_key
+        model = self.planner.simulator.env
+        theirs: TensorSpec | None = env.full_action_spec.get(key, None)
+        ours = model.full_action_spec[key]
+        spaces = [getattr(spec, "space", None) for spec in (theirs, ours)]
+        if theirs is None or type(theirs) is not type(ours) or spaces[0] != spaces[1]:
+            raise ValueError(
+                f"The options of the real env and of the model must be the same; {name} has "
+                f"{theirs} under {key!r}, the model {ours}. Put both under an OptionTransform with "
+                f"the same worker."
+            )
+        available = {unravel_key(k) for k in env.full_observation_spec.keys(True, True)}
+        available |= {unravel_key(k) for k in env.full_state_spec.keys(True, True)}
+        missing = [k for k in self.in_keys if k not in available]
+        if missing:
+            raise ValueError(
+                f"HierarchicalPolicy reads {missing}, which {name} does not write: it writes "
+                f"{sorted(map(str, available))}. Pass a state_map that makes the model's state "
+                f"from those."
+            )
 
     def reset(self) -> None:
         """Forget the last step, and the trees that ``reuse`` keeps; the next call plants others."""
@@ -133,12 +177,12 @@ class HierarchicalPolicy(TensorDictModuleBase):
         self._shape: torch.Size | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the next option of each row's plan, after planning where one is due."""
-        shape = tensordict.batch_size
+        """Write the next option of each row's plan, after planning where one is due."""
+        shape, state = tensordict.batch_size, self._state(tensordict)
         done, stepped = tensordict.get("done", None), tensordict.get("_step", None)
         kept = {key: tensordict.get(key, None) for key in self._plan_keys}
         if any(value is None for value in kept.values()):
-            kept = self._no_plans(tensordict)
+            kept = self._no_plans(state)
         else:
             kept = {key: value.clone() for key, value in kept.items()}
             begins, is_init = self._starts.seen(tensordict), tensordict.get("is_init", None)
@@ -151,14 +195,14 @@ class HierarchicalPolicy(TensorDictModuleBase):
         if self.replan_every is not None:
             needs = needs | (step >= self.replan_every).squeeze(-1)
         if self.divergence is not None:
-            needs = needs | self._diverged(tensordict, kept["plan_states"], step)
+            needs = needs | self._diverged(state, kept["plan_states"], step)
         if done is not None:
             needs = needs & ~done.reshape(shape)
-        if stepped is not None:  # False where a rollout goes on without the element
+        if stepped is not None:  # False where a rollout continues without the element
             needs = needs & stepped.reshape(shape)
         if needs.any():
             behind = torch.arange(self.max_plan_length, device=plan.device) >= step
-            self._plan(tensordict, needs, plan.masked_fill(behind, -1), kept)
+            self._plan(state, needs, plan.masked_fill(behind, -1), kept)
         option = plan.gather(-1, step.clamp_max(self.max_plan_length - 1)).squeeze(-1)
         tensordict.set(self.planner.option_key, self.planner.simulator.encode(option))
         step += 1
@@ -166,6 +210,23 @@ class HierarchicalPolicy(TensorDictModuleBase):
             tensordict.set(key, value)
         self._starts.remember(tensordict)
         return tensordict
+
+    def _state(self, td: TensorDictBase) -> TensorDictBase:
+        """The state to plan from."""
+        if self.state_map is None:
+            return td
+        state = self.state_map(td)
+        missing = [key for key in self._state_keys if key not in state.keys(True, True)]
+        if missing or state.batch_size != td.batch_size:
+            raise ValueError(
+                f"state_map must return the model's state {list(map(str, self._state_keys))} of "
+                f"batch size {list(td.batch_size)}; got batch size {list(state.batch_size)}, "
+                f"without {missing}."
+            )
+        for key in ("_step", "done"):
+            if td.get(key, None) is not None:  # who needs no plan
+                state = state.copy().set(key, td.get(key))
+        return state
 
     def __getstate__(self) -> dict[str, Any]:
         starts = EpisodeStarts(self.in_keys, self._plan_keys[:4])  # what was seen stays here
@@ -231,3 +292,145 @@ class HierarchicalPolicy(TensorDictModuleBase):
         self._search, self._shape = search, td.batch_size
         rows = needs.reshape(-1).cpu()
         return extract_plans(search)[rows], torch.from_numpy(planner.choose(search))[rows]
+
+
+class GoalPlanner:
+    r"""Searches a macro environment and returns the states along the best plan as goals.
+
+    .. math:: G = g_0, g_1, \dots, g_n, \qquad g_i = \phi(s_{i + 1})
+
+    with :math:`s_0` the state planned from, :math:`s_1, \dots, s_{n + 1}` the states the plan's
+    options lead to and :math:`\phi` the entry ``goal_key``. The state planned from is no goal.
+
+    Args:
+        planner (MCTSPlanner): the manager, over the macro environment.
+        to_macro (callable): ``to_macro(td [m]) -> td [m]``, the macro environment's state for a
+            state of the worker's environment.
+        goal_key (NestedKey): entry ``[m, D]`` or ``[m]`` of the macro environment's state or
+            observation that is the goal. Default ``"position"``.
+        in_keys (sequence of NestedKey, optional): entries that ``to_macro`` reads. Default: all.
+
+    Raises:
+        ValueError: if the macro environment has no entry ``goal_key``; when planning, if a search
+            ends without a plan.
+        TypeError: if ``to_macro`` cannot be called.
+
+    Reference:
+        Dissertation, section 3.2.1 and figure 3.3.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_hmcts.planners import GoalPlanner, MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> chain = ChainEnv(length=5)
+        >>> def to_macro(td):  # the worker's position is a real number, the chain's an integer
+        ...     return TensorDict({"state": td["x"].round().long()}, td.batch_size)
+        >>> manager = GoalPlanner(MCTSPlanner(chain), to_macro, goal_key="state")
+        >>> goals, lengths = manager.plan_goals(TensorDict({"x": torch.tensor([1.8])}, [1]))
+        >>> goals.tolist(), lengths.tolist()
+        ([[[3], [4]]], [2])
+    """
+
+    def __init__(
+        self,
+        planner: MCTSPlanner,
+        to_macro: Callable[[TensorDictBase], TensorDictBase],
+        *,
+        goal_key: NestedKey = "position",
+        in_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        instance("GoalPlanner", "planner", planner, MCTSPlanner)
+        if not callable(to_macro):
+            raise TypeError(f"to_macro must be callable on a tensordict; got {to_macro!r}.")
+        self.planner, self.to_macro = planner, to_macro
+        self.goal_key = entry_key("GoalPlanner", "goal_key", goal_key)
+        planner.simulator.keep([self.goal_key])
+        if in_keys is not None:
+            self.in_keys = entry_keys("GoalPlanner", "in_keys", in_keys)
+
+    def plan_goals(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Plan from states.
+
+        Args:
+            tensordict (TensorDictBase): states of the worker's environment, batch ``[m]``.
+
+        Returns:
+            the goals ``[m, L, D]``, the last one repeated, and the lengths, int64 ``[m]``.
+        """
+        macro = self.to_macro(tensordict)
+        plan = self.planner.plan(macro)
+        if not plan.found.all():
+            bad = int((~plan.found).nonzero()[0])
+            state = {key: macro.get(key)[bad].tolist() for key in self.planner.simulator.root_keys}
+            raise ValueError(
+                f"The search found no plan from {state} within {self.planner.budget}. Allow it "
+                f"more expansions, or check that the target can be reached."
+            )
+        goals = plan.states.get(self.goal_key)[:, 1:]
+        goals = goals.unsqueeze(-1) if goals.ndim == 2 else goals.flatten(2)
+        return goals, plan.lengths
+
+    def __repr__(self) -> str:
+        return f"GoalPlanner({self.planner}, goal_key={self.goal_key!r})"
+
+
+class EpisodeStarts:
+    """Tells in which elements an episode began since the policy acted last.
+
+    TorchRL's env writes what a step led to under ``"next"`` of the tensordict that the policy has
+    written to. Where that was the end, or another state than the one to act in now, the env was
+    reset or set to a state in between. ``"is_init"`` and a ``"step_count"`` of 0 say so by
+    themselves.
+
+    Args:
+        state_keys: entries that are compared; empty for all that a step wrote.
+        plan_keys: what the policy carries in the tensordict. Elements in which they are not what it
+            wrote last belong to another rollout.
+    """
+
+    def __init__(self, state_keys: Sequence[NestedKey], plan_keys: Sequence[NestedKey]) -> None:
+        self.state_keys, self.plan_keys = list(state_keys), list(plan_keys)
+        self.forget()
+
+    def forget(self) -> None:
+        """Take the next call for that of another rollout."""
+        self._acted: TensorDictBase | None = None
+        self._stale: TensorDictBase | None = None  # what was under "next" already
+        self._wrote: dict[NestedKey, Tensor] = {}
+
+    def remember(self, td: TensorDictBase) -> None:
+        """Keep the tensordict that the policy has written to, for what a step makes of it."""
+        self._acted, self._stale = td, td.get("next", None)
+        self._wrote = {key: td.get(key) for key in self.plan_keys}
+
+    def seen(self, td: TensorDictBase) -> Tensor:
+        """Return where an episode began, bool ``[*B]``."""
+        shape = td.batch_size
+        begins = torch.zeros(shape, dtype=torch.bool, device=td.device)
+        is_init, count = td.get("is_init", None), td.get("step_count", None)
+        if is_init is not None:
+            begins = begins | is_init.reshape(shape)
+        if count is not None and count.numel() == shape.numel():
+            begins = begins | (count.reshape(shape) == 0)
+        led_to = None if self._acted is None else self._acted.get("next", None)
+        if led_to is None or led_to is self._stale or led_to.batch_size != shape:
+            return begins
+        done = led_to.get("done", None)
+        other = torch.zeros_like(begins) if done is None else _any(done, shape)
+        for key in self.state_keys or led_to.keys(True, True):
+            one, two = led_to.get(key, None), td.get(key, None)
+            if isinstance(one, Tensor) and isinstance(two, Tensor) and one.shape == two.shape:
+                nan = (one != one) & (two != two)
+                other = other | _any((one != two) & ~nan, shape)
+        for key, wrote in self._wrote.items():
+            carried = td.get(key, None)
+            if carried is None or carried.shape != wrote.shape:
+                return begins
+            other = other & ~_any(carried != wrote, shape)
+        return begins | other
+
+
+def _any(flags: Tensor, shape: torch.Size) -> Tensor:
+    """Whether any flag of an element is set, bool ``[*B]``."""
+    return flags.reshape(*shape, -1).any(-1)

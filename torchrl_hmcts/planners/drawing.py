@@ -6,7 +6,8 @@ Letters: ``N`` nodes drawn, ``A`` options.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from torchrl_hmcts.planners.export import (
     plural,
     shown_nodes,
 )
-from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, SearchTree
+from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, TreeArrays
 
 Axes = Any  # matplotlib.axes.Axes; matplotlib is loaded by the first picture only
 Color = tuple[float, float, float]
@@ -36,7 +37,7 @@ OPTION_COLORS = (
     (26, 133, 255),
     (64, 176, 60),
 )  # 0 to 255
-_PRUNED = (0.77, 0.77, 0.77)
+_PRUNED, _REFUSED = (0.77, 0.77, 0.77), (0.6, 0.6, 0.6)
 _PLAN = "#ffd23f"
 _INK = "#1f2430"
 _START, _END = "#2563eb", "#16a34a"
@@ -54,36 +55,49 @@ def option_color(option: int) -> Color:
     return red / 255, green / 255, blue / 255
 
 
-class _Shown(NamedTuple):
+@dataclass
+class _Shown:
     """The nodes to draw, renumbered from 0; the root is the first."""
 
     ids: np.ndarray  # [N] their numbers in the tree
     nodes: np.ndarray  # [N] their records
     parents: np.ndarray  # [N] row of the node above, -1 for the root
-    pruned: np.ndarray  # [N] bool, refused by the novelty test or known from elsewhere
     plan: np.ndarray  # [L] rows of the best plan, from the root on; empty without one
     left_out: int
 
+    def __post_init__(self) -> None:
+        flags = self.nodes["flags"]
+        self.pruned, self.rewarded = (flags & PRUNED) != 0, (flags & REWARDED) != 0
+        self.terminal = ~self.pruned & ((flags & TERMINAL) != 0)
+        self.known = self.pruned & (self.nodes["twin"] >= 0)  # searched elsewhere in the tree
+        self.on_plan = np.zeros(len(flags), np.bool_)  # an edge of the plan leads there
+        self.on_plan[self.plan[1:]] = True
+        self.colors = [  # of the edge that leads to each node
+            _PRUNED if pruned else option_color(int(option))
+            for pruned, option in zip(self.pruned, self.nodes["option"], strict=True)
+        ]
 
-def _shown(tree: SearchTree, root: int, max_nodes: int | None) -> _Shown:
+    def lines(self, ax: Axes, paths: np.ndarray, rows: np.ndarray, **style: Any) -> None:
+        """Draw the edges that lead to ``rows``, along ``paths [N, points, 2]``."""
+        from matplotlib.collections import LineCollection
+
+        colors = style.pop("colors", [self.colors[row] for row in rows])
+        if len(rows):
+            ax.add_collection(LineCollection(list(paths[rows]), colors=colors, **style))
+
+
+def _shown(tree: TreeArrays, root: int, max_nodes: int | None) -> _Shown:
     count = check_root(tree, root)
     ids = shown_nodes(tree, root, max_nodes)
-    nodes = tree.nodes[root, ids]
     rows = np.full(count, -1)
     rows[ids] = np.arange(len(ids))
-    plan = rows[best_plan(tree, root)] if best_plan(tree, root) else np.empty(0, np.int64)
-    return _Shown(
-        ids=ids,
-        nodes=nodes,
-        parents=np.where(nodes["parent"] >= 0, rows[nodes["parent"]], -1),
-        pruned=(nodes["flags"] & PRUNED) != 0,
-        plan=plan[plan >= 0],
-        left_out=count - len(ids),
-    )
+    nodes, plan = tree.nodes[root, ids], rows[np.array(best_plan(tree, root), np.int64)]
+    parents = np.where(nodes["parent"] >= 0, rows[nodes["parent"]], -1)
+    return _Shown(ids, nodes, parents, plan[plan >= 0], count - len(ids))
 
 
 def plot_tree(
-    tree: SearchTree,
+    tree: TreeArrays,
     root: int = 0,
     *,
     ax: Axes | None = None,
@@ -130,21 +144,27 @@ def plot_tree(
     pyplot = _pyplot()
     labels = option_labels(tree.num_options, option_names, width=24)
     shown = _shown(tree, root, max_nodes)
-    across = layered_layout(shown.parents, _sibling_order(shown))
-    points = np.stack((across, shown.nodes["depth"].astype(float)), 1)
-    width, depth = float(np.ptp(across)), int(shown.nodes["depth"].max())
+    nodes = shown.nodes
+    across = layered_layout(shown.parents, np.lexsort((shown.ids, nodes["option"])))
+    points = np.stack((across, nodes["depth"].astype(float)), 1)
+    width, depth = float(np.ptp(across)), int(nodes["depth"].max())
     if ax is None:
         size = (np.clip(0.17 * width + 2.5, 6.4, 15.0), np.clip(0.55 * depth + 2.2, 3.6, 9.5))
         ax = pyplot.subplots(figsize=size, layout="constrained")[1]
     ax.set_xlim(across.min() - 0.03 * width - 0.6, across.max() + 0.03 * width + 0.6)
     ax.set_ylim(depth + 0.5, -0.5)
+    ax.set_xticks([])
+    ax.spines[["top", "right", "bottom"]].set_visible(False)
+    ax.yaxis.get_major_locator().set_params(integer=True)
+    ax.set_ylabel("options from the root")
+    ax.set_title("\n".join(_title(tree, root, shown)), fontsize=10, loc="left")
 
-    inches = ax.get_window_extent().width / ax.figure.dpi * (0.85 if colorbar else 0.95)
-    spacing = 72.0 * inches / (width + 2.0)  # points from leaf to leaf
-    row = 72.0 * ax.get_window_extent().height / ax.figure.dpi / (depth + 1.0)
+    box, dpi = ax.get_window_extent(), ax.figure.dpi
+    spacing = 72.0 * box.width / dpi * (0.85 if colorbar else 0.95) / (width + 2.0)  # in points
+    row = 72.0 * box.height / dpi / (depth + 1.0)
     largest = float(np.clip(min(1.1 * spacing, 0.45 * row), 7.0, 15.0))
     smallest = float(np.clip(0.62 * spacing, 1.4, 7.0))
-    visits = np.maximum(shown.nodes["visits"], 1)
+    visits = np.maximum(nodes["visits"], 1)
     fewest, most = int(visits.min()), int(visits.max())
 
     def share(number: Any) -> Any:
@@ -155,28 +175,24 @@ def plot_tree(
 
     diameters = diameter(visits)
     diameters[shown.plan] = np.maximum(diameters[shown.plan], 6.0)
-    _draw_tree_edges(ax, shown, points, share(visits), spacing)
+    _draw_curves(ax, shown, points, share(visits), float(np.clip(spacing / 12.0, 0.3, 0.8)))
     colors = _draw_nodes(ax, shown, points, diameters, cmap)
-
-    ax.set_xticks([])
-    ax.spines[["top", "right", "bottom"]].set_visible(False)
-    ax.yaxis.get_major_locator().set_params(integer=True)
-    ax.set_ylim(depth + 0.5, -0.5)
-    ax.set_ylabel("options from the root")
-    ax.set_title("\n".join(_title(tree, root, shown)), fontsize=10, loc="left")
     if colorbar and colors.norm.vmin < colors.norm.vmax:
         bar = ax.figure.colorbar(colors, ax=ax, fraction=0.03, pad=0.01, aspect=30)
         bar.set_label("value V of the node")
         bar.outline.set_visible(False)
     if legend:
         handles = _option_handles(shown, labels, option_names is not None)
-        handles += _node_handles(shown, diameter, fewest, most)
+        handles += _node_handles(shown)
+        for number in dict.fromkeys([fewest, round((fewest * most) ** 0.5), most]):
+            size = {"markersize": diameter(number), "markeredgewidth": 0.5}
+            handles.append(_dot(plural(number, "visit"), **size))
         _add_legend(ax, handles)
     return ax
 
 
 def plot_positions(
-    tree: SearchTree,
+    tree: TreeArrays,
     root: int = 0,
     key: NestedKey | Callable[[TensorDictBase], Tensor] = "position",
     *,
@@ -230,35 +246,25 @@ def plot_positions(
     if fresh:
         ax.set_aspect("equal")
     limits = ax.get_xlim(), ax.get_ylim()
-    on_plan = _on_plan(shown)
+    paths = np.stack((points[shown.parents], points), 1)
     for chosen, line_width, alpha, order in (
-        (shown.pruned & ~on_plan, 0.7, 0.7, 2),
-        (~shown.pruned & ~on_plan, 1.1, 0.85, 3),
-        (on_plan, 3.6, 1.0, 4),
+        (shown.pruned & ~shown.on_plan, 0.7, 0.7, 2),
+        (~shown.pruned & ~shown.on_plan, 1.1, 0.85, 3),
+        (shown.on_plan, 3.6, 1.0, 4),
     ):
         rows = np.flatnonzero(chosen & (shown.parents >= 0))
-        _add_lines(
-            ax,
-            np.stack((points[shown.parents[rows]], points[rows]), 1),
-            _edge_colors(shown, rows),
-            linewidths=line_width,
-            alpha=alpha,
-            zorder=order,
-        )
+        shown.lines(ax, paths, rows, linewidths=line_width, alpha=alpha, zorder=order)
     ax.plot(*points[0], "o", color=_START, markersize=11, zorder=5)
     if len(shown.plan):
         ax.plot(*points[shown.plan[-1]], "o", mec=_END, mew=2.5, mfc="white", ms=7.5, zorder=5)
     if fresh:
         ax.autoscale_view()
     else:
-        ax.set_xlim(limits[0])
-        ax.set_ylim(limits[1])
+        ax.set(xlim=limits[0], ylim=limits[1])
     if legend:
-        from matplotlib.lines import Line2D
-
         handles = _option_handles(shown, labels, option_names is not None)
         if shown.pruned.any():
-            handles.append(Line2D([], [], color=_PRUNED, label="refused"))
+            handles.append(_line("refused", color=_PRUNED))
         _add_legend(ax, handles, below=0.08 if fresh else 0.02)
     return ax
 
@@ -322,30 +328,20 @@ def _pack(parents: np.ndarray, order: np.ndarray) -> np.ndarray:
     return across
 
 
-def _sibling_order(shown: _Shown) -> np.ndarray:
-    """All rows, those of siblings by option and then as they were drawn."""
-    return np.lexsort((shown.ids, shown.nodes["option"]))
-
-
-def _draw_tree_edges(
-    ax: Axes, shown: _Shown, points: np.ndarray, share: np.ndarray, spacing: float
+def _draw_curves(
+    ax: Axes, shown: _Shown, points: np.ndarray, share: np.ndarray, thin: float
 ) -> None:
-    on_plan = _on_plan(shown)
-    rows = np.arange(1, len(points))
-    curves = _curves(points[shown.parents[rows]], points[rows])
-    thin = float(np.clip(spacing / 12.0, 0.3, 0.8))
-    widths = np.where(shown.pruned[rows], thin, thin + 1.8 * share[rows])
-    widths = np.where(on_plan[rows], np.maximum(widths, 2.2), widths)
-    _add_lines(ax, curves[on_plan[rows]], _PLAN, linewidths=8.0, capstyle="round", zorder=1)
-    sequence = np.argsort(~shown.pruned[rows] + 2 * on_plan[rows], kind="stable")
-    _add_lines(
-        ax,
-        curves[sequence],
-        _edge_colors(shown, rows[sequence]),
-        linewidths=widths[sequence],
-        alpha=0.9,
-        zorder=2,
-    )
+    """Draw edges that leave and arrive upright, thicker with more visits."""
+    t = np.linspace(0.0, 1.0, 13)[None, :, None]
+    along = np.concatenate((t * t * (3.0 - 2.0 * t), t), -1)
+    start = points[shown.parents]
+    curves = start[:, None] + (points - start)[:, None] * along  # [N, 13, 2]
+    widths = np.where(shown.pruned, thin, thin + 1.8 * share)
+    widths = np.where(shown.on_plan, np.maximum(widths, 2.2), widths)
+    band = {"colors": _PLAN, "linewidths": 8.0, "capstyle": "round", "zorder": 1}
+    shown.lines(ax, curves, np.flatnonzero(shown.on_plan), **band)
+    rows = 1 + np.argsort(~shown.pruned[1:] + 2 * shown.on_plan[1:], kind="stable")
+    shown.lines(ax, curves, rows, linewidths=widths[rows], alpha=0.9, zorder=2)
 
 
 def _draw_nodes(
@@ -355,53 +351,42 @@ def _draw_nodes(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    searched = ~shown.pruned
-    values = shown.nodes["value"].astype(float)
-    flags, twin = shown.nodes["flags"], shown.nodes["twin"]
-    terminal = (flags & TERMINAL) != 0
-    scale = values[searched & ~terminal] if (searched & ~terminal).any() else values
+    values, inner = shown.nodes["value"].astype(float), ~shown.pruned & ~shown.terminal
+    scale = values[inner] if inner.any() else values
     colors = ScalarMappable(Normalize(float(scale.min()), float(scale.max())), cmap)
-    rewarded = (flags & REWARDED) != 0
     thin = np.clip(diameters / 12.0, 0.3, 0.9)
-    for chosen, marker in (
-        (searched & ~terminal, "o"),
-        (searched & terminal, "s"),
-    ):
-        rows = np.flatnonzero(chosen)
-        rims = [_END if rewarded[i] else _INK for i in rows]
+    rims = np.where(shown.rewarded, np.maximum(1.6, thin), thin)
+    for chosen, marker, area in ((inner, "o", 1.0), (shown.terminal, "s", 0.8)):
         ax.scatter(
-            *points[rows].T,
-            s=diameters[rows] ** 2 * (0.8 if marker == "s" else 1.0),
-            c="white" if marker == "s" else colors.to_rgba(values[rows]),
+            *points[chosen].T,
+            s=diameters[chosen] ** 2 * area,
+            c="white" if marker == "s" else colors.to_rgba(values[chosen]),
             marker=marker,
-            edgecolors=rims,
-            linewidths=np.where(rewarded[rows], np.maximum(1.6, thin[rows]), thin[rows]),
+            edgecolors=[_END if rewarded else _INK for rewarded in shown.rewarded[chosen]],
+            linewidths=rims[chosen],
             zorder=4,
         )
-    for chosen, marker in ((twin < 0, "x"), (twin >= 0, "D")):
-        rows = np.flatnonzero(shown.pruned & chosen)
-        if len(rows):
+    hollow = {"facecolors": "white", "edgecolors": [_REFUSED]}
+    crosses = shown.pruned & ~shown.known
+    for chosen, marker, color in ((crosses, "x", {"c": [_REFUSED]}), (shown.known, "D", hollow)):
+        if chosen.any():
             ax.scatter(
-                *points[rows].T,
-                s=(0.75 * diameters[rows]) ** 2,
+                *points[chosen].T,
+                s=(0.75 * diameters[chosen]) ** 2,
                 marker=marker,
-                **({"c": [(0.6, 0.6, 0.6)]} if marker == "x" else _HOLLOW),
-                linewidths=np.clip(diameters[rows] / 6.0, 0.5, 1.0),
+                linewidths=np.clip(diameters[chosen] / 6.0, 0.5, 1.0),
                 zorder=3,
+                **color,
             )
     return colors
 
 
-_HOLLOW = {"facecolors": "white", "edgecolors": [(0.6, 0.6, 0.6)]}
-
-
-def _title(tree: SearchTree, root: int, shown: _Shown) -> list[str]:
-    nodes = tree.nodes[root, : tree.num_nodes[root]]
+def _title(tree: TreeArrays, root: int, shown: _Shown) -> list[str]:
+    nodes, plan = tree.nodes[root, : tree.num_nodes[root]], best_plan(tree, root)
     lines = [
         f"{plural(len(nodes), 'node')}, depth {int(nodes['depth'].max()):,}, "
         f"{plural(int(nodes['visits'][0]), 'visit')}, root value {nodes['value'][0]:.4g}"
     ]
-    plan = best_plan(tree, root)
     if plan:
         end = nodes[plan[-1]]
         lines.append(
@@ -415,50 +400,40 @@ def _title(tree: SearchTree, root: int, shown: _Shown) -> list[str]:
     return lines
 
 
-def _option_handles(shown: _Shown, labels: list[str], named: bool) -> list[Any]:
+def _line(label: str, **style: Any) -> Any:
     from matplotlib.lines import Line2D
 
+    return Line2D([], [], label=label, **style)
+
+
+def _dot(label: str, **style: Any) -> Any:
+    style = {"marker": "o", "color": "#d6e4f2", "markeredgecolor": _INK, **style}
+    return _line(label, linestyle="", **style)
+
+
+def _option_handles(shown: _Shown, labels: list[str], named: bool) -> list[Any]:
     options = np.unique(shown.nodes["option"][1:][~shown.pruned[1:]]).tolist()
-    handles: list[Any] = [
-        Line2D(
-            [],
-            [],
-            color=option_color(o),
-            linewidth=2,
-            label=labels[o].split(" ", 1)[1] if named else f"option {o}",
-        )
-        for o in options[:_MAX_LEGEND]
-    ]
+    handles = []
+    for option in options[:_MAX_LEGEND]:
+        label = labels[option].split(" ", 1)[1] if named else f"option {option}"
+        handles.append(_line(label, color=option_color(option), linewidth=2))
     if len(options) > _MAX_LEGEND:
-        handles.append(
-            Line2D([], [], linestyle="", label=f"... {len(options) - _MAX_LEGEND} more options")
-        )
+        handles.append(_line(f"... {len(options) - _MAX_LEGEND} more options", linestyle=""))
     return handles
 
 
-def _node_handles(shown: _Shown, diameter: Any, fewest: int, most: int) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    def dot(label: str, **style: Any) -> Any:
-        style = {"marker": "o", "color": "#d6e4f2", "markeredgecolor": _INK, **style}
-        return Line2D([], [], linestyle="", label=label, **style)
-
-    handles = []
-    if len(shown.plan):
-        handles.append(Line2D([], [], color=_PLAN, linewidth=6, label="best plan"))
-    flags, twin = shown.nodes["flags"], shown.nodes["twin"]
-    if ((flags & TERMINAL) != 0).any():
-        handles.append(dot("terminal", marker="s", color="white"))
-    if ((flags & REWARDED) != 0).any():
-        handles.append(dot("rewarded", markeredgecolor=_END, markeredgewidth=1.6))
-    if (shown.pruned & (twin < 0)).any():
-        handles.append(dot("not new", marker="x", markersize=5, markeredgecolor="0.6"))
-    if (twin >= 0).any():
-        handles.append(dot("known state", marker="D", color="white", markeredgecolor="0.6"))
-    for number in dict.fromkeys([fewest, round((fewest * most) ** 0.5), most]):
-        handles.append(
-            dot(plural(number, "visit"), markersize=diameter(number), markeredgewidth=0.5)
-        )
+def _node_handles(shown: _Shown) -> list[Any]:
+    """What the marks of nodes mean, as far as there are such."""
+    handles = [_line("best plan", color=_PLAN, linewidth=6)] if len(shown.plan) else []
+    rim = {"markeredgecolor": "0.6"}
+    for chosen, label, style in (
+        ((shown.nodes["flags"] & TERMINAL) != 0, "terminal", {"marker": "s", "color": "white"}),
+        (shown.rewarded, "rewarded", {"markeredgecolor": _END, "markeredgewidth": 1.6}),
+        (shown.pruned & ~shown.known, "not new", {"marker": "x", "markersize": 5, **rim}),
+        (shown.known, "known state", {"marker": "D", "color": "white", **rim}),
+    ):
+        if chosen.any():
+            handles.append(_dot(label, **style))
     return handles
 
 
@@ -477,36 +452,8 @@ def _add_legend(ax: Axes, handles: list[Any], below: float = 0.02) -> None:
     )
 
 
-def _add_lines(ax: Axes, lines: np.ndarray, colors: Any, **style: Any) -> None:
-    from matplotlib.collections import LineCollection
-
-    if len(lines):
-        ax.add_collection(LineCollection(list(lines), colors=colors, **style))
-
-
-def _edge_colors(shown: _Shown, rows: np.ndarray) -> list[Color]:
-    return [
-        _PRUNED if shown.pruned[i] else option_color(int(shown.nodes["option"][i])) for i in rows
-    ]
-
-
-def _on_plan(shown: _Shown) -> np.ndarray:
-    """Which nodes an edge of the best plan leads to, bool ``[N]``."""
-    on_plan = np.zeros(len(shown.nodes), np.bool_)
-    on_plan[shown.plan[1:]] = True
-    return on_plan
-
-
-def _curves(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Lines from node to node that leave and arrive upright, ``[N, 13, 2]``."""
-    t = np.linspace(0.0, 1.0, 13)[None, :, None]
-    along = np.concatenate((t * t * (3.0 - 2.0 * t), t), -1)
-    curves: np.ndarray = start[:, None] + (end - start)[:, None] * along
-    return curves
-
-
 def _positions(
-    tree: SearchTree,
+    tree: TreeArrays,
     root: int,
     key: NestedKey | Callable[[TensorDictBase], Tensor],
     ids: np.ndarray,

@@ -21,7 +21,7 @@ from torchrl_hmcts.planners.tree import (
     PRUNED,
     REWARDED,
     TERMINAL,
-    SearchTree,
+    TreeArrays,
 )
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ _BAR = 12
 _NAME_WIDTH = 18
 
 
-def check_root(tree: SearchTree, root: int) -> int:
+def check_root(tree: TreeArrays, root: int) -> int:
     """Return the number of nodes of a root, or say why there is none."""
     if not 0 <= root < tree.num_roots:
         raise IndexError(
@@ -51,7 +51,7 @@ def check_root(tree: SearchTree, root: int) -> int:
     return int(tree.num_nodes[root])
 
 
-def children(tree: SearchTree, root: int, node: int) -> Iterator[int]:
+def children(tree: TreeArrays, root: int, node: int) -> Iterator[int]:
     """Yield the nodes that the options of a node led to, by option, in the order of their draw."""
     for first in tree.edges["child"][root, node].tolist():
         child = first
@@ -60,13 +60,13 @@ def children(tree: SearchTree, root: int, node: int) -> Iterator[int]:
             child = int(tree.nodes["sibling"][root, child])
 
 
-def best_plan(tree: SearchTree, root: int) -> list[int]:
+def best_plan(tree: TreeArrays, root: int) -> list[int]:
     """Return the nodes of the best plan from the root on, or none."""
     best = int(tree.roots["best_node"][root])
     return tree.path(root, best) if best > 0 else []
 
 
-def most_visited_path(tree: SearchTree, root: int) -> list[int]:
+def most_visited_path(tree: TreeArrays, root: int) -> list[int]:
     """Return the nodes from the root on along the options with most visits, then highest Q."""
     path, node = [0], 0
     while True:
@@ -85,7 +85,7 @@ def most_visited_path(tree: SearchTree, root: int) -> list[int]:
         path.append(node)
 
 
-def shown_nodes(tree: SearchTree, root: int, max_nodes: int | None) -> np.ndarray:
+def shown_nodes(tree: TreeArrays, root: int, max_nodes: int | None) -> np.ndarray:
     """Return the most visited nodes, in ascending order, each with the node above it.
 
     The best plan is among them whatever its visits, as far as ``max_nodes`` allows.
@@ -114,7 +114,7 @@ def shown_nodes(tree: SearchTree, root: int, max_nodes: int | None) -> np.ndarra
 
 
 def to_networkx(
-    tree: SearchTree, root: int = 0, *, max_nodes: int | None = None, states: bool = False
+    tree: TreeArrays, root: int = 0, *, max_nodes: int | None = None, states: bool = False
 ) -> Any:
     """Return the tree of one root as a directed graph of networkx, its nodes numbered as here.
 
@@ -192,7 +192,7 @@ def to_networkx(
     return graph
 
 
-def to_torchrl(tree: SearchTree, root: int = 0) -> Tree:
+def to_torchrl(tree: TreeArrays, root: int = 0) -> Tree:
     """Return the tree of one root as TorchRL's ``Tree``; nothing is shared with this one.
 
     A vertex is a node of this tree, and its fields hold:
@@ -272,7 +272,7 @@ def to_torchrl(tree: SearchTree, root: int = 0) -> Tree:
     return vertices[0]
 
 
-def summary(tree: SearchTree, root: int = 0, option_names: Sequence[str] | None = None) -> str:
+def summary(tree: TreeArrays, root: int = 0, option_names: Sequence[str] | None = None) -> str:
     """Return what a search found as text: its size, the root's options, and the principal plan.
 
     The plan is the best one found, or else the path of most visits. Of its columns, ``steps`` and
@@ -360,79 +360,68 @@ def option_labels(
     return [_clip(label, width or len(label)) for label in labels]
 
 
-def _table_of_options(tree: SearchTree, root: int, names: list[str]) -> list[str]:
+def _table_of_options(tree: TreeArrays, root: int, names: list[str]) -> list[str]:
     edges = tree.edges[root, 0]
-    order = sorted(
-        range(tree.num_options),
-        key=lambda a: (
-            int(edges["closed"][a]) == FORBIDDEN,
-            -int(edges["visits"][a]),
-            -float(edges["value"][a]),
-        ),
-    )
-    values, total = _numbers(edges["value"]), max(int(edges["visits"].sum()), 1)
-    width = max(len("option"), *(len(names[a]) for a in order[:_MAX_OPTIONS]))
-    visits_width = max(len("visits"), len(f"{int(edges['visits'].max()):,}"))
-    value_width = max(map(len, values))
-    gap = " " * (_BAR + 11)
-    lines = [f"{'option':{width}}  {'visits':>{visits_width}}{gap}  {'Q':>{value_width}}  prior"]
-    for a in order[:_MAX_OPTIONS]:
-        visits = int(edges["visits"][a])
-        if int(edges["closed"][a]) == FORBIDDEN:
-            lines.append(f"{names[a]:{width}}  {'not allowed':>{visits_width}}")
-            continue
-        bar = "#" * round(_BAR * visits / total)
-        simulated = int(edges["child"][a]) >= 0
-        lines.append(
-            f"{names[a]:{width}}  {visits:>{visits_width},} {100 * visits / total:5.1f} % "
-            f"|{bar:{_BAR}}|  {values[a] if simulated else '-':>{value_width}}  "
-            f"{float(edges['prior'][a]):.3f}"
-        )
-    left_out = order[_MAX_OPTIONS:]
-    if left_out:
-        visits = int(edges["visits"][left_out].sum())
-        lines.append(f"... and {plural(len(left_out), 'option')} with {plural(visits, 'visit')}")
+    forbidden, visits = edges["closed"] == FORBIDDEN, edges["visits"].astype(np.int64)
+    order = np.lexsort((-edges["value"], -visits, forbidden))
+    shown, left_out = order[:_MAX_OPTIONS], order[_MAX_OPTIONS:]
+    shares, values = visits / max(int(visits.sum()), 1), _numbers(edges["value"])
+    columns: dict[str, list[str]] = {"option": [], "visits": [], "": [], "Q": [], "prior": []}
+    for a in shown:
+        bar = f"{100 * shares[a]:.1f} % |{'#' * round(_BAR * shares[a]):{_BAR}}|"
+        q = values[a] if edges["child"][a] >= 0 else "-"
+        cells = [names[a], f"{visits[a]:,}", bar, q, f"{edges['prior'][a]:.3f}"]
+        if forbidden[a]:
+            cells[1:] = ["not allowed", "", "", ""]
+        for column, cell in zip(columns.values(), cells, strict=True):
+            column.append(cell)
+    lines = _table(columns)
+    if len(left_out):
+        number = int(visits[left_out].sum())
+        lines.append(f"... and {plural(len(left_out), 'option')} with {plural(number, 'visit')}")
     return lines
 
 
-def _table_of_steps(tree: SearchTree, root: int, plan: list[int], names: list[str]) -> list[str]:
+def _table_of_steps(tree: TreeArrays, root: int, plan: list[int], names: list[str]) -> list[str]:
     nodes = tree.nodes[root, plan[1:]]
     edges = tree.edges[root, nodes["parent"], nodes["option"]]
-    columns = {
-        "option": [names[a] for a in nodes["option"]],
-        "steps": [f"{int(n):,}" for n in nodes["base_steps"]],
-        "R": _numbers(nodes["reward"]),
-        "return": _numbers(nodes["path_return"]),
-        "Q": _numbers(edges["value"]),
-        "V": _numbers(nodes["value"]),
-        "visits": [f"{int(n):,}" for n in nodes["visits"]],
-    }
-    widths = {name: max(len(name), *map(len, column)) for name, column in columns.items()}
-    number_width = max(3, len(str(len(nodes))))
-    room = _LINE_WIDTH - number_width - sum(width + 2 for width in widths.values())
-    if room < 0:
-        widths["option"] = max(widths["option"] + room, len("option"))
-        columns["option"] = [_clip(name, widths["option"]) for name in columns["option"]]
-
-    def row(number: str, cells: Sequence[str]) -> str:
-        texts = [
-            f"{cell:{width}}" if name == "option" else f"{cell:>{width}}"
-            for (name, width), cell in zip(widths.items(), cells, strict=True)
-        ]
-        return "  ".join([f"{number:>{number_width}}", *texts])
-
-    lines = [row("#", list(columns))]
-    rows = [row(str(i + 1), cells) for i, cells in enumerate(zip(*columns.values(), strict=True))]
-    if len(rows) > _MAX_STEPS:
-        head, tail = rows[: _MAX_STEPS // 2], rows[-_MAX_STEPS // 2 + 1 :]
-        gap = f"... {plural(len(rows) - len(head) - len(tail), 'option')} left out ..."
-        rows = [*head, f"{'':{number_width}}  {gap}", *tail]
-    lines += rows
+    lines = _table(
+        {
+            "#": [f"{i + 1:>3}" for i in range(len(nodes))],
+            "option": [names[a] for a in nodes["option"]],
+            "steps": [f"{int(n):,}" for n in nodes["base_steps"]],
+            "R": _numbers(nodes["reward"]),
+            "return": _numbers(nodes["path_return"]),
+            "Q": _numbers(edges["value"]),
+            "V": _numbers(nodes["value"]),
+            "visits": [f"{int(n):,}" for n in nodes["visits"]],
+        }
+    )
+    if len(nodes) > _MAX_STEPS:
+        head, tail = lines[: 1 + _MAX_STEPS // 2], lines[-_MAX_STEPS // 2 + 1 :]
+        gap = f"... {plural(len(lines) - len(head) - len(tail), 'option')} left out ..."
+        lines = [*head, f"     {gap}", *tail]
     twin = int(nodes["twin"][-1])
     if twin >= 0:
         where = ", ".join(names[a] for a in tree.options(root, twin))
-        lines.append(f"It goes on from the same state behind: {_clip(where, 48) or 'the root'}")
+        lines.append(f"It continues from the same state behind: {_clip(where, 48) or 'the root'}")
     return lines
+
+
+def _table(columns: dict[str, list[str]]) -> list[str]:
+    """Lines of a table, its header first; options are cut where it would be too wide."""
+    widths = {name: max(len(name), *map(len, cells)) for name, cells in columns.items()}
+    room = _LINE_WIDTH - sum(widths.values()) - 2 * (len(widths) - 1)
+    widths["option"] = max(widths["option"] + min(room, 0), len("option"))
+    columns = {**columns, "option": [_clip(name, widths["option"]) for name in columns["option"]]}
+    rows = [list(columns), *zip(*columns.values(), strict=True)]
+    return [
+        "  ".join(
+            f"{cell:{'<' if name == 'option' else '>'}{width}}"
+            for (name, width), cell in zip(widths.items(), row, strict=True)
+        )
+        for row in rows
+    ]
 
 
 def _numbers(values: Any) -> list[str]:

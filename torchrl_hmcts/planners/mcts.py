@@ -7,39 +7,39 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.nesting import option_gamma
-from torchrl_hmcts.planners.backups import Backup, MeanBackup
-from torchrl_hmcts.planners.budget import SearchBudget
-from torchrl_hmcts.planners.chance import ProgressiveWidening
-from torchrl_hmcts.planners.choices import BestPlan, FinalChoice, MostVisited
-from torchrl_hmcts.planners.growth import Growth, SearchProgress
-from torchrl_hmcts.planners.node_evaluation import (
-    Evaluator,
-    leaf_values,
-    node_codes,
-    node_features,
-    option_priors,
-)
-from torchrl_hmcts.planners.noise import DirichletNoise
+from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
+from torchrl_hmcts.planners.evaluation import Evaluator, NodeEvaluator
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.search import RootStates, Search, check_search, root_seeds
+from torchrl_hmcts.planners.root_options import (
+    BestPlan,
+    DirichletNoise,
+    FinalChoice,
+    MostVisited,
+    gumbel_choice,
+)
+from torchrl_hmcts.planners.search import RootStates, Search
+from torchrl_hmcts.planners.search_loop import SearchLoop, SearchProgress
+from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.simulator import Simulator
+from torchrl_hmcts.planners.subtree import find_end, reroot
 from torchrl_hmcts.planners.transpositions import Transpositions
-from torchrl_hmcts.planners.tree import TERMINAL
-from torchrl_hmcts.planners.tree_policies import UCT, Gumbel, TreePolicy
-from torchrl_hmcts.planners.tree_rollout import TreeRollout
+from torchrl_hmcts.planners.tree_policies import UCT, TreePolicy
+
+_PARTS = {part.name for part in fields(SearchSettings)}
 
 
 class MCTSPlanner(TensorDictModuleBase):
@@ -70,40 +70,21 @@ class MCTSPlanner(TensorDictModuleBase):
             none of those of the env that is acted in.
         gamma (float, optional): discount per base step. Default: that of the env's
             ``OptionTransform``, through any nesting of envs; 0.99 for an env without durations.
-        tree_policy: :class:`UCT` (default, ``c=1``), :class:`PUCT`, :class:`Gumbel`,
-            :class:`TorchRLScore`, or a callable over :class:`NodeStatistics`.
-        novelty (NoveltyTest, optional): which new nodes are worth searching, e.g.
-            ``RadiusNovelty("position", 0.35)``. Default: all.
-        transpositions (Transpositions, optional): which states are the same. Default: none are.
-        chance (ProgressiveWidening, optional): for a stochastic simulator, how often an option is
-            simulated in a node. Default: once.
+        tree_policy, backup, novelty, transpositions, chance: parts of the search, see
+            :class:`SearchSettings`. ``planner.settings`` holds them; each can be read and assigned
+            as an attribute.
+        rollout, expand, leaves_per_wave, waves_in_flight, exhausted: parts of the search, too.
         leaf_evaluator (callable, optional): ``leaf_evaluator(td) -> values [m]`` or ``[m, 1]`` of
-            new nodes, from their state and observation: :class:`ValueEvaluator`,
-            :class:`RolloutEvaluator`, :class:`MixedEvaluator` or your own. Default: 0.
+            new nodes, from their state and observation, or an :class:`Evaluation` of values and
+            priors: :class:`ValueEvaluator`, :class:`RolloutEvaluator`, :class:`MixedEvaluator`,
+            :class:`PolicyValueEvaluator` or your own. Default: 0.
         option_prior (callable, optional): ``option_prior(td) -> probabilities [m, A]``:
-            :class:`ModulePrior` or your own. Default: uniform.
-        rollout (TreeRollout, optional): from every new leaf go on for some options and keep them in
-            the tree. Needs ``expand="one"``. Default: none.
+            :class:`ModulePrior` or your own. Default: those of ``leaf_evaluator``, else uniform.
         root_noise (DirichletNoise, optional): noise in the prior of the roots. Default: none.
-        backup: :class:`MeanBackup` (default) or :class:`MaxBackup`.
         final_choice: :class:`BestPlan`, :class:`MostVisited`, :class:`HighestValue` or
             :class:`SampledVisits`. Default: best plan; with ``chance`` most visited, since no
             sequence of options is sure to repeat; with :class:`Gumbel` its own choice.
         budget (SearchBudget): limits per root. Default: 1,000 expansions, until a plan is found.
-        expand: ``"all"`` simulates every option of a leaf at once (default), ``"one"`` only the
-            option that the tree policy chooses, as in the textbook.
-        leaves_per_wave (int): leaves of each root that share a simulator call. More are faster for
-            few roots and search less selectively. At most 255; default 1.
-        waves_in_flight (int): waves that are simulated at a time, the next one chosen before the
-            outcomes of those before it are known. For a simulator that works beside the planner,
-            such as :class:`AtariOptionPool` with processes: with 2 it has work while the planner
-            inserts and selects. Outcomes are inserted in the order of the waves, whichever is
-            ready first, so that the tree is the same each time (but for a budget of seconds) and
-            on every simulator. Times ``leaves_per_wave`` at most 255; default 1.
-        exhausted: what a descent does with an option behind which nothing is left to simulate:
-            ``"skip"`` it (default: every simulation finds something new), or ``"revisit"`` it and
-            back its known value up once more, at no simulator's cost, so that visits and mean
-            values are those of the textbook. Always ``"revisit"`` with ``chance`` or ``Gumbel``.
         duration_key, mask_key (NestedKey): entries of the env with the base steps of a step, int64
             ``[*B, 1]`` (1 if the env has none or None is named), and the options that may be taken,
             bool ``[*B, A]`` (all if it has none or None is named). Under an ``OptionTransform``
@@ -121,6 +102,7 @@ class MCTSPlanner(TensorDictModuleBase):
         ValueError: at construction if the env cannot be set to a state or its action is not
             discrete; at the call if an entry of the state is missing or not finite, or no option
             may be taken.
+        TypeError: if a part is of another kind.
 
     Reference:
         Dissertation, sections 2.4.2, 3.2.1 and 4.2; Kocsis and Szepesvari 2006.
@@ -147,7 +129,7 @@ class MCTSPlanner(TensorDictModuleBase):
         option_prior: Evaluator | None = None,
         rollout: TreeRollout | None = None,
         root_noise: DirichletNoise | None = None,
-        backup: Backup | None = None,
+        backup: Literal["mean", "max"] = "mean",
         final_choice: FinalChoice | None = None,
         budget: SearchBudget | None = None,
         expand: Literal["all", "one"] = "all",
@@ -161,74 +143,52 @@ class MCTSPlanner(TensorDictModuleBase):
         progress: Callable[[SearchProgress], None] | None = None,
     ) -> None:
         super().__init__()
-        if gamma is not None and not 0.0 < gamma <= 1.0:
-            raise ValueError(f"MCTSPlanner needs a discount gamma in (0, 1]; got {gamma}.")
-        tree_policy = UCT() if tree_policy is None else tree_policy
-        budget = SearchBudget() if budget is None else budget
-        check_search(
-            "MCTSPlanner",
-            tree_policy=tree_policy,
-            num_simulations=budget.simulations,
+        self.settings = SearchSettings(
+            tree_policy=UCT() if tree_policy is None else tree_policy,
+            backup=backup,
+            novelty=novelty,
+            transpositions=transpositions,
+            chance=chance,
+            rollout=rollout,
             expand=expand,
             leaves_per_wave=leaves_per_wave,
-            exhausted=exhausted,
             waves_in_flight=waves_in_flight,
+            exhausted=exhausted,
         )
-        if rollout is not None and (expand != "one" or isinstance(tree_policy, Gumbel)):
-            raise ValueError(
-                f"MCTSPlanner: a TreeRollout goes on from the one option that was simulated; got "
-                f"expand={expand!r} and tree_policy={tree_policy!r}. Pass expand='one' and UCT, "
-                f"PUCT or a policy of your own."
-            )
-        if chance is not None and transpositions is not None:
-            raise ValueError(
-                "MCTSPlanner: transpositions share what follows a state, which chance redraws; "
-                "leave one of the two out."
-            )
-        extra = []
-        for part in (novelty, transpositions, leaf_evaluator, option_prior):
-            extra += [unravel_key(k) for k in getattr(part, "in_keys", ())]
+        self.budget = SearchBudget() if budget is None else budget
+        if gamma is not None:
+            real_number("MCTSPlanner", "gamma", gamma, above=0.0, most=1.0)
+        if root_noise is not None:
+            instance("MCTSPlanner", "root_noise", root_noise, DirichletNoise)
+        readers = (novelty, transpositions, leaf_evaluator, option_prior)
         self.simulator = Simulator(
             env,
-            extra_keys=extra,
+            extra_keys=[key for part in readers for key in getattr(part, "in_keys", ())],
             duration_key=duration_key,
             mask_key=mask_key,
             reward_key=reward_key,
         )
-        if gamma is None:  # after the simulator's check: it must be an env
-            gamma = option_gamma(env, self.simulator.duration_key)
-        self.gamma = gamma
-        self.tree_policy = tree_policy
-        self.novelty = novelty
-        self.transpositions = transpositions
-        self.chance = chance
-        # Not sub-modules: training or moving the planner must not change its owner's networks.
-        self.__dict__["leaf_evaluator"] = leaf_evaluator
-        self.__dict__["option_prior"] = option_prior
-        for part in (leaf_evaluator, option_prior):
-            bind = getattr(part, "bind", None)
-            if bind is not None:
-                bind(self.simulator, gamma)
-        self.rollout = rollout
+        self.option_key, self.num_options = self.simulator.option_key, self.simulator.num_options
+        # after the simulator's check: it must be an env
+        self.gamma = option_gamma(env, self.simulator.duration_key) if gamma is None else gamma
+        # Not a sub-module: training or moving the planner must not change its owner's networks.
+        self.evaluate = NodeEvaluator(leaf_evaluator, option_prior, self.num_options)
+        self.evaluate.bind(self.simulator, self.gamma)
         self.root_noise = root_noise
-        self.backup = MeanBackup() if backup is None else backup
+        self._gumbel_choice = final_choice is None and self.settings.is_gumbel
         if final_choice is None:
             final_choice = BestPlan() if chance is None else MostVisited()
-            self._gumbel_choice = isinstance(tree_policy, Gumbel)
-        else:
-            self._gumbel_choice = False
+        if not hasattr(final_choice, "choose"):
+            raise TypeError(
+                f"final_choice needs choose(search), e.g. BestPlan(); got {final_choice}."
+            )
+        if progress is not None and not callable(progress):
+            raise TypeError(f"progress must be callable; got {progress!r}.")
         self.final_choice = final_choice
-        self.budget = budget
-        self.expand = expand
-        self.leaves_per_wave = int(leaves_per_wave)
-        self.waves_in_flight = int(waves_in_flight)
-        self.exhausted = exhausted
         self.progress = progress
         if seed is not None:
             whole_number("MCTSPlanner", "seed", seed)
         self._seeds = None if seed is None else np.random.SeedSequence(int(seed))
-        self.option_key = self.simulator.option_key
-        self.num_options = self.simulator.num_options
         self.in_keys = list(self.simulator.root_keys)
         self.out_keys = [
             self.option_key,
@@ -240,6 +200,23 @@ class MCTSPlanner(TensorDictModuleBase):
             "num_simulated_steps",
         ]
         self.last_search: Search | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name in _PARTS:
+            return getattr(self.settings, name)
+        return super().__getattr__(name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _PARTS:
+            name, value = "settings", replace(self.settings, **{name: value})
+        if name == "settings":
+            instance("MCTSPlanner", name, value, SearchSettings)
+            if "budget" in self.__dict__:
+                value.check_simulations(self.budget.simulations)
+        elif name == "budget":
+            instance("MCTSPlanner", name, value, SearchBudget)
+            self.settings.check_simulations(value.simulations)
+        super().__setattr__(name, value)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Search from every state of the tensordict and write the options to take."""
@@ -292,36 +269,18 @@ class MCTSPlanner(TensorDictModuleBase):
         """Plant a tree at every state of ``td``; nothing is simulated until :meth:`resume`."""
         root = self.simulator.root(td)
         num_roots = root.batch_size[0]
-        search = Search(
-            num_roots, self.num_options, **self._parts(), capacity=self._capacity(num_roots)
-        )
-        self._seed(search, seed)
+        capacity = self._capacity(num_roots)
+        search = Search(num_roots, self.num_options, self.settings, capacity=capacity)
+        search.seed(self._draw_seed() if seed is None else seed)
         self._plant(search, root, None)
         self.last_search = search
         return search
 
-    def _parts(self) -> dict[str, Any]:
-        """What a search is set to, as it is now, once more checked: it may have been assigned."""
-        check_search(
-            "MCTSPlanner",
-            tree_policy=self.tree_policy,
-            num_simulations=self.budget.simulations,
-            expand=self.expand,
-            leaves_per_wave=self.leaves_per_wave,
-            exhausted=self.exhausted,
-            waves_in_flight=self.waves_in_flight,
-        )
-        names = (
-            *("tree_policy", "backup", "novelty", "transpositions", "chance", "expand"),
-            *("leaves_per_wave", "waves_in_flight", "exhausted"),
-        )
-        return {name: getattr(self, name) for name in names}
-
     def _capacity(self, num_roots: int) -> int:
         """Nodes to make room for at once: all that the budget allows, if that is not very many."""
-        budget = self.budget
+        budget, settings = self.budget, self.settings
         limits = [x for x in (budget.simulations, budget.nodes) if x is not None]
-        per_wave = self.leaves_per_wave * self.waves_in_flight * self.num_options
+        per_wave = settings.leaves_per_wave * settings.waves_in_flight * self.num_options
         if not limits or num_roots * min(limits) > 2**20:
             return 64
         return min(limits) + per_wave + 1
@@ -335,12 +294,20 @@ class MCTSPlanner(TensorDictModuleBase):
         Raises:
             ValueError: if the search was planted with another backup, novelty test or the like.
         """
-        search.follow(**self._parts())
+        search.follow(self.settings)
         return self._grow(search, time.perf_counter(), _rows(search, where))
 
     def _grow(self, search: Search, begin: float, rows: np.ndarray) -> Search:
+        loop = SearchLoop(
+            search,
+            self.simulator,
+            self.evaluate,
+            gamma=self.gamma,
+            budget=self.budget,
+            progress=self.progress,
+        )
         with self.simulator.searching():
-            return Growth(self, search).run(begin, rows)
+            return loop.run(begin, rows)
 
     def advance(
         self,
@@ -351,7 +318,7 @@ class MCTSPlanner(TensorDictModuleBase):
         where: Tensor | None = None,
         seed: int | None = None,
     ) -> Tensor:
-        """Move the roots of a search along: ``options`` were carried out and led to ``td``.
+        """Move the roots of a search along: ``options`` were executed and led to ``td``.
 
         Where an outcome of the options in the tree is the state in ``td``, bit for bit, its subtree
         is kept; elsewhere a new tree is planted. Nothing is simulated until :meth:`resume`.
@@ -393,88 +360,61 @@ class MCTSPlanner(TensorDictModuleBase):
         taken = options.reshape(search.num_roots, -1)[index].tolist()
         state, done = self.simulator.state(root), self.simulator.done(root)
         kept = np.zeros(search.num_roots, np.bool_)
-        self._seed(search, seed)
-        reuse = not isinstance(self.tree_policy, Gumbel)  # halving starts from zero visits
+        search.seed(self._draw_seed() if seed is None else seed)
         for i, b in enumerate(rows.tolist()):
             path = [option for option in taken[i] if option >= 0]
-            node = self._find_outcome(search, b, path, state[i], done[i]) if path and reuse else -1
+            if not path or self.settings.is_gumbel:  # halving starts from zero visits
+                continue
+            keys = self.simulator.state_keys
+            node = find_end(search.tree, b, path, state[i], bool(done[i]), keys)
             if node >= 0:
-                search.reroot(b, node)
+                reroot(search, b, node)
                 kept[b] = True
         fresh = np.flatnonzero(~kept[rows])
         if len(fresh):
             self._plant(search, root[torch.from_numpy(fresh)], rows[fresh])
         if self.root_noise is not None and kept.any():
-            search.add_noise(self.root_noise, np.flatnonzero(kept))
+            self.root_noise.add(search, np.flatnonzero(kept))
         self.last_search = search
         return torch.from_numpy(kept).view(shape)
 
-    def _find_outcome(
-        self, search: Search, b: int, path: list[int], state: TensorDictBase, done: bool
-    ) -> int:
-        """The outcome of the options ``path`` of root ``b`` with exactly this state, or -1."""
-        states, nodes = search.tree.states, search.tree.nodes[b]
-        assert states is not None
-        reached = [0]
-        for option in path:
-            outcomes = [n for above in reached for n in search.outcomes_of(b, option, above)]
-            twins = [int(nodes["twin"][n]) for n in outcomes]  # where an equal state is searched
-            reached = [t if t >= 0 else n for n, t in zip(outcomes, twins, strict=True)]
-        for node in reached:
-            if bool(nodes["flags"][node] & TERMINAL) == done and all(
-                torch.equal(states.get(key)[b, node], state.get(key))
-                for key in self.simulator.state_keys
-            ):
-                return node
-        return -1
-
-    def _seed(self, search: Search, seed: int | None) -> None:
-        if seed is None:
-            if self._seeds is None:
-                self._seeds = np.random.SeedSequence(
-                    int(torch.empty((), dtype=torch.int64).random_())
-                )
-            seed = int(self._seeds.spawn(1)[0].generate_state(1, np.uint32)[0])
-        search.seed(root_seeds("MCTSPlanner", seed, search.num_roots))
+    def _draw_seed(self) -> int:
+        """The seed of the next call."""
+        if self._seeds is None:
+            self._seeds = np.random.SeedSequence(int(torch.empty((), dtype=torch.int64).random_()))
+        return int(self._seeds.spawn(1)[0].generate_state(1, np.uint32)[0])
 
     def _plant(self, search: Search, root: TensorDictBase, rows: np.ndarray | None) -> None:
         """Plant the roots ``rows`` of a search, all by default, at the states ``root``."""
-        simulator = self.simulator
+        simulator, settings = self.simulator, self.settings
         where = np.arange(search.num_roots) if rows is None else rows
         with torch.no_grad(), simulator.searching():
-            done = simulator.done(root)
-            masks = simulator.masks(root)
+            done, masks = simulator.done(root), simulator.masks(root)
             if len(masks) and not (masks.any(-1) | done).all():
                 bad = int(where[np.flatnonzero(~(masks.any(-1) | done))[0]])
                 raise ValueError(
                     f"Root {bad} has no option that may be taken: its action mask is all False. "
                     f"Plan from a state that is not a dead end, or mark it as done."
                 )
-            looked_at = root
-            if self.leaf_evaluator is not None or self.option_prior is not None:
-                looked_at = root.clone()  # the state to plan from stays what it is
-            values = leaf_values(
-                self.leaf_evaluator,
-                looked_at,
-                simulator.terminated(root),
-                lambda: search.seeds[where],
-            )
+            terminated = simulator.terminated(root)
+            priors, values = self.evaluate(root, terminated, lambda: search.seeds[where])
+            novelty, transpositions = settings.novelty, settings.transpositions
             known = RootStates(
                 values=values,
                 done=done,
-                priors=option_priors(self.option_prior, looked_at, self.num_options),
+                priors=priors,
                 masks=masks,
-                features=node_features(self.novelty, root),
-                codes=node_codes(self.transpositions, root),
+                features=None if novelty is None else novelty.features(root),
+                codes=None if transpositions is None else transpositions.codes(root),
             )
-        search.start(known, rows)
+        search.plant(known, rows)
         search.tree.set_states(where, np.zeros_like(where), simulator.state(root))
         if self.root_noise is not None:
-            search.add_noise(self.root_noise, where)
+            self.root_noise.add(search, where)
 
     def choose(self, search: Search) -> np.ndarray:
         """Return the option to take in each root of a search, int64 ``[B]``."""
-        return search.gumbel_choice() if self._gumbel_choice else self.final_choice.choose(search)
+        return gumbel_choice(search) if self._gumbel_choice else self.final_choice.choose(search)
 
     def __repr__(self) -> str:
         return (

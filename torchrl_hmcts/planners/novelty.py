@@ -5,14 +5,16 @@ Letters: ``B`` roots, ``m`` new nodes of a wave, ``F`` features.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+
+from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts.planners.keys import entry_keys
 
 
 class NoveltyTest(Protocol):
@@ -63,7 +65,26 @@ class NoveltyTest(Protocol):
         """Be less strict for one root whose search is exhausted; False if that is impossible."""
 
 
-class RadiusNovelty:
+class _Counted:
+    """What both tests count."""
+
+    num_tested: int
+    _tally: np.ndarray
+
+    @property
+    def num_refused(self) -> int:
+        """How many of the tests refused a state."""
+        return int(self._tally[0])
+
+    def statistics(self) -> dict[str, int]:
+        """Return how many tests were made, and how many states they refused.
+
+        Tests repeated after a relaxation, or when the root moved on, are counted again.
+        """
+        return {"novelty_tested": self.num_tested, "novelty_refused": self.num_refused}
+
+
+class RadiusNovelty(_Counted):
     r"""Refuses a state that lies within a radius of one already in its tree.
 
     .. math:: \text{novel}(s) \iff \min_{s' \in A} \lVert \phi(s) - \phi(s') \rVert \ge r
@@ -90,7 +111,7 @@ class RadiusNovelty:
             0.75; a smaller factor reopens more at once, which the hardest searches pay for.
         max_relaxations: how often the radius of a search may be relaxed. Default 14, to a sixtieth.
         shorter_paths: accept states near others that are reached in fewer base steps. Default
-            False: a place is searched from the first path to it. Meant for a budget that goes on
+            False: a place is searched from the first path to it. Meant for a budget that continues
             after the first plan (``improve_expansions``).
         shorter_by: :math:`\beta` in ``(0, 1]``, the share of the base steps that a shorter path may
             need at most. Default 1: a single step less will do; 0.9 asks for a tenth.
@@ -125,36 +146,29 @@ class RadiusNovelty:
         shorter_paths: bool = False,
         shorter_by: float = 1.0,
     ) -> None:
-        self.in_keys = _keys(key, "RadiusNovelty")
+        self.in_keys = entry_keys("RadiusNovelty", "key", key)
+        self.radius = real_number("RadiusNovelty", "radius", radius, above=0.0)
         self.scale = [1.0] * len(self.in_keys) if scale is None else list(scale)
-        if not (math.isfinite(radius) and radius > 0.0):
-            raise ValueError(
-                f"RadiusNovelty needs a radius > 0, in units of {self.in_keys}; got {radius}. To "
-                f"search without a novelty test pass novelty=None to the planner."
-            )
         if len(self.scale) != len(self.in_keys):
             raise ValueError(
-                f"RadiusNovelty needs one scale per key; got {len(self.scale)} for {self.in_keys}."
+                f"RadiusNovelty needs one scale per key; got {self.scale} for {self.in_keys}."
             )
-        self.radius = float(radius)
-        if not 0.0 < relaxation < 1.0:
+        for factor in self.scale:
+            real_number("RadiusNovelty", "scale", factor)
+        self.relaxation = real_number("RadiusNovelty", "relaxation", relaxation)
+        if not 0.0 < self.relaxation < 1.0:
             raise ValueError(
                 f"RadiusNovelty needs a relaxation in (0, 1), by which an exhausted search shrinks "
                 f"its radius; got {relaxation}."
             )
-        if not 0.0 < shorter_by <= 1.0:
-            raise ValueError(
-                f"RadiusNovelty needs shorter_by in (0, 1], the share of the base steps that a "
-                f"shorter path may need; got {shorter_by}. Use 1 for any path that is shorter."
-            )
-        self.relaxation = float(relaxation)
-        self.max_relaxations = max_relaxations
+        self.max_relaxations = whole_number("RadiusNovelty", "max_relaxations", max_relaxations)
+        instance("RadiusNovelty", "shorter_paths", shorter_paths, bool)
         self.shorter_paths = shorter_paths
-        self.shorter_by = float(shorter_by)
+        self.shorter_by = real_number("RadiusNovelty", "shorter_by", shorter_by, above=0, most=1)
         self.start(0)
 
     def start(self, num_roots: int) -> None:
-        """Forgets everything; ``num_roots`` searches begin."""
+        """Forget everything: ``num_roots`` searches begin."""
         self._num_roots = num_roots
         self._known: np.ndarray | None = None  # [B] of novelty_kernels.RADIUS_ROOT
         self._relaxed = np.zeros(num_roots, np.int64)
@@ -162,7 +176,7 @@ class RadiusNovelty:
         self._tally = np.zeros(2, np.int64)
 
     def _make_room(self, num_features: int) -> None:
-        """Allocate for the first states, or double what there is; the grids are built anew."""
+        """Allocate for the first states, or double what there is; the grids are built again."""
         from torchrl_hmcts.planners.novelty_kernels import RADIUS_ROOT, accept_distant
 
         self._accept_distant = accept_distant
@@ -188,24 +202,20 @@ class RadiusNovelty:
         return self.radius * self.relaxation**self._relaxed
 
     def features(self, tensordict: TensorDictBase) -> np.ndarray:
-        """Returns the features of states, ``[m, F]``."""
-        parts = []
-        for key, scale in zip(self.in_keys, self.scale, strict=True):
-            part = tensordict.get(key).to(torch.float32)
-            part = part.reshape(len(part), part.shape[1:].numel())
-            parts.append(part if scale == 1.0 else part * scale)
-        joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-        return joined.cpu().contiguous().numpy()
+        """Return the features of states, ``[m, F]``."""
+        parts = [tensordict.get(key).to(torch.float32) for key in self.in_keys]
+        scaled = zip(parts, self.scale, strict=True)
+        return _side_by_side([part if scale == 1.0 else part * scale for part, scale in scaled])
 
     def restart(self, root: int) -> None:
-        """Forgets the states of one root."""
+        """Forget the states of one root."""
         self._relaxed[root] = 0
         if self._known is not None:
             self._known[root] = 0
             self._known["radius"][root] = self.radius
 
     def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
-        """Returns which new states are novel, bool ``[m]``, and remembers those."""
+        """Return which new states are novel, bool ``[m]``, and remembers those."""
         features = np.ascontiguousarray(features, np.float32)
         if self._known is None:
             self._make_room(features.shape[1])
@@ -225,7 +235,7 @@ class RadiusNovelty:
         return accepted
 
     def relax(self, root: int) -> bool:
-        """Is less strict for one root from now on; False if that is impossible."""
+        """Be less strict for one root from now on; False if that is impossible."""
         if self._relaxed[root] >= self.max_relaxations:
             return False
         self._relaxed[root] += 1
@@ -233,18 +243,9 @@ class RadiusNovelty:
             self._known["radius"][root] = self.radii[root]
         return True
 
-    @property
-    def num_refused(self) -> int:
-        """How many of the tests refused a state."""
-        return int(self._tally[0])
-
     def statistics(self) -> dict[str, int]:
-        """Return how many tests were made, and how many states they refused.
-
-        Tests repeated after a relaxation, or when the root moved on, are counted again. With
-        ``shorter_paths`` also how many states were accepted for a shorter path alone.
-        """
-        counts = {"novelty_tested": self.num_tested, "novelty_refused": self.num_refused}
+        """Return the counts; with ``shorter_paths`` also of states new for a shorter path alone."""
+        counts = super().statistics()
         if self.shorter_paths:
             counts["novelty_shorter"] = int(self._tally[1])
         return counts
@@ -254,7 +255,7 @@ class RadiusNovelty:
         return f"RadiusNovelty({self.in_keys}, radius={self.radius}{shorter})"
 
 
-class WidthNovelty:
+class WidthNovelty(_Counted):
     r"""Refuses a state in which no feature has a value that is new to its tree.
 
     .. math:: \text{novel}(s) \iff \exists f:\ \lvert \{ s' \in A : s'_f = s_f \} \rvert < n
@@ -287,24 +288,24 @@ class WidthNovelty:
     """
 
     def __init__(self, key: NestedKey | Sequence[NestedKey], *, max_relaxations: int = 14) -> None:
-        self.in_keys = _keys(key, "WidthNovelty")
-        if not 0 <= max_relaxations <= 254:
+        self.in_keys = entry_keys("WidthNovelty", "key", key)
+        self.max_relaxations = whole_number("WidthNovelty", "max_relaxations", max_relaxations)
+        if self.max_relaxations > 254:
             raise ValueError(
                 f"WidthNovelty counts values up to 255, so that max_relaxations is from 0 to 254; "
                 f"got {max_relaxations}."
             )
-        self.max_relaxations = max_relaxations
         self.start(0)
 
     def start(self, num_roots: int) -> None:
-        """Forgets everything; ``num_roots`` searches begin."""
+        """Forget everything: ``num_roots`` searches begin."""
         self._limits = np.ones(num_roots, np.int64)
         self._used: np.ndarray | None = None
         self.num_tested = 0
         self._tally = np.zeros(1, np.int64)
 
     def features(self, tensordict: TensorDictBase) -> np.ndarray:
-        """Returns the features of states, ``[m, F]``."""
+        """Return the features of states, ``[m, F]``."""
         parts = []
         for key in self.in_keys:
             part = tensordict.get(key)
@@ -313,13 +314,11 @@ class WidthNovelty:
                     f"WidthNovelty compares discrete values; {key!r} is of type {part.dtype}. Use "
                     f"RadiusNovelty({key!r}, radius=...), or discretise the entry."
                 )
-            part = part.to(torch.uint8) if part.dtype == torch.bool else part
-            parts.append(part.reshape(len(part), part.shape[1:].numel()))
-        joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-        return joined.cpu().contiguous().numpy()
+            parts.append(part.to(torch.uint8) if part.dtype == torch.bool else part)
+        return _side_by_side(parts)
 
     def restart(self, root: int) -> None:
-        """Forgets the states of one root."""
+        """Forget the states of one root."""
         self._limits[root] = 1
         if self._used is not None:
             self._used[root] = 0
@@ -354,7 +353,7 @@ class WidthNovelty:
         self._values, self._owners, self._counts = values, owners, counts
 
     def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
-        """Returns which new states are novel, bool ``[m]``, and remembers those."""
+        """Return which new states are novel, bool ``[m]``, and remembers those."""
         if features.dtype != np.uint8:
             features = features.astype(np.int64, copy=False)
         features = np.ascontiguousarray(features)
@@ -380,33 +379,20 @@ class WidthNovelty:
         return accepted
 
     def relax(self, root: int) -> bool:
-        """Is less strict for one root from now on; False if that is impossible."""
+        """Be less strict for one root from now on; False if that is impossible."""
         if self._limits[root] > self.max_relaxations:
             return False
         self._limits[root] += 1
         return True
 
-    @property
-    def num_refused(self) -> int:
-        """How many of the tests refused a state."""
-        return int(self._tally[0])
-
-    def statistics(self) -> dict[str, int]:
-        """Return how many tests were made, and how many states they refused.
-
-        Tests repeated after a relaxation, or when the root moved on, are counted again.
-        """
-        return {"novelty_tested": self.num_tested, "novelty_refused": self.num_refused}
-
     def __repr__(self) -> str:
         return f"WidthNovelty({self.in_keys})"
 
 
-def _keys(key: NestedKey | Sequence[NestedKey], name: str) -> list[NestedKey]:
-    keys = [key] if isinstance(key, (str, tuple)) else list(key)
-    if not keys:
-        raise ValueError(f'{name} needs the entries it compares; got none. Name them, e.g. "ram".')
-    return [unravel_key(k) for k in keys]
+def _side_by_side(parts: list[torch.Tensor]) -> np.ndarray:
+    flat = [part.reshape(len(part), part.shape[1:].numel()) for part in parts]
+    joined = flat[0] if len(flat) == 1 else torch.cat(flat, -1)
+    return joined.cpu().contiguous().numpy()
 
 
 def _check_width(test: RadiusNovelty | WidthNovelty, features: np.ndarray, width: int) -> None:

@@ -331,7 +331,7 @@ def find_equal(seen, seen_nodes, links, heads, counts, tally, roots, codes, node
 
 @njit()
 def link_codes(seen, links, heads, counts):
-    """Sort all states into buckets anew."""
+    """Sort all states into buckets again."""
     heads[:] = -1
     for b in range(seen.shape[0]):
         for j in range(counts[b]):

@@ -10,12 +10,12 @@ import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
-from torchrl_hmcts.planners.docstrings import KeepsDocstring
 from torchrl_hmcts.planners.search import Search
+from torchrl_hmcts.planners.tree import KeepsDocstring
 
 
 class Plan(TensorClass, metaclass=KeepsDocstring):
-    """The best plan of each root: options that earn a reward when carried out one after the other.
+    """The best plan of each root: options that earn a reward one after the other.
 
     Attributes:
         options (Tensor): ``[*B, L]`` int64, -1 behind a plan's end.

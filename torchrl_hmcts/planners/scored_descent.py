@@ -6,97 +6,77 @@ level with the statistics of every node they stand at.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_hmcts.planners.tree import CLOSED, EXPANDED, FORBIDDEN, PENDING, PRUNED, TERMINAL
+from torchrl_hmcts.planners.settings import SearchSettings
+from torchrl_hmcts.planners.tree import EXPANDED, FORBIDDEN, PRUNED, TERMINAL, TreeArrays
 from torchrl_hmcts.planners.tree_policies import NodeStatistics, ScoreFunction
 
-if TYPE_CHECKING:
-    from torchrl_hmcts.planners.search import Search
 
-
-def select_by_scores(search: Search, scores: ScoreFunction, wave: np.ndarray) -> int:
+def select_by_scores(
+    tree: TreeArrays, settings: SearchSettings, record: np.ndarray, wave: np.ndarray
+) -> int:
     """Descend to the leaves of every active root; return how many outcomes to simulate.
 
-    Does what :func:`kernels.select` does, with one difference: a root whose descent ends in a leaf
-    that is known already has it backed up and adds nothing to this wave.
+    Python walks the trees down, and :func:`kernels.select` continues from there, with one descent
+    of each root at a time: one that ends in a leaf that is known adds nothing to this wave.
     """
-    tree, kernels = search.tree, search._kernels
-    nodes, edges, roots = tree.nodes, tree.edges, tree.roots
-    settings = search.settings[0]
-    revisit = bool(settings["revisit"])
-    scheduled = roots["scheduled"].copy()
-    waits = np.zeros(search.num_roots, np.bool_)  # ran into a leaf that is being simulated
-    count = 0
+    from torchrl_hmcts.planners import kernels
 
-    def schedule(b: np.ndarray, n: np.ndarray, a: np.ndarray) -> None:
-        nonlocal count
-        rows = wave[count : count + len(b)]
-        rows["root"], rows["node"], rows["option"] = b, n, a
-        np.add.at(scheduled, b, 1)
-        count += len(b)
-
-    def give_up(b: np.ndarray, n: np.ndarray) -> None:
-        waits[b] = True
-        kernels.release_all(nodes, edges, b, n)
-
-    for _ in range(search.leaves_per_wave):
-        room = roots["simulations"] + scheduled < roots["limit"]
-        open_ = (nodes["flags"][:, 0] & CLOSED) == 0
-        if revisit:
-            open_ |= roots["limit"] != np.iinfo(np.int64).max
-        b = np.flatnonzero((roots["active"] != 0) & room & open_ & ~waits)
-        n = np.zeros_like(b)
-        while len(b):
-            flags = nodes["flags"][b, n]
-            known = (flags & (TERMINAL | PRUNED)) != 0
-            fresh = np.zeros(len(b), np.bool_)
-            if search.expand_all:
-                fresh = ~known & ((flags & EXPANDED) == 0) & (nodes["open_options"][b, n] > 0)
-                pending = fresh & ((flags & PENDING) != 0)
-                give_up(b[pending], n[pending])
-                leaves = fresh & ~pending
-                nodes["flags"][b[leaves], n[leaves]] |= PENDING
-                which, options = np.nonzero(edges["closed"][b[leaves], n[leaves]] != FORBIDDEN)
-                schedule(b[leaves][which], n[leaves][which], options)
-            # With chance, what is in flight keeps options above from being drawn again.
-            early = known & search.stochastic & (scheduled[b] > 0)
-            give_up(b[early], n[early])
-            late = known & ~early
-            kernels.revisit_all(nodes, edges, roots, search.settings, b[late], n[late])
-            stays = known | fresh
-            b, n = b[~stays], n[~stays]
-            if not len(b):
-                break
-            edge = edges[b, n]  # [d, A], a copy
-            allowed = edge["closed"] != FORBIDDEN if revisit else edge["closed"] == 0
-            stuck = ~allowed.any(-1)
-            if stuck.any():
-                if revisit:
-                    kernels.revisit_all(nodes, edges, roots, search.settings, b[stuck], n[stuck])
-                else:
-                    give_up(b[stuck], n[stuck])
-                b, n, edge, allowed = b[~stuck], n[~stuck], edge[~stuck], allowed[~stuck]
-                if not len(b):
-                    break
-            if settings["twins"]:
-                kernels.refresh_all(nodes, edges, b, n)
-                edge = edges[b, n]
-            a = _best(scores, nodes[b, n], edge, allowed)
-            taken = edge[np.arange(len(b)), a]
-            wants = (taken["child"] < 0) | kernels.wants_samples(edges, search.settings, b, n, a)
-            busy = wants & (taken["in_flight"] > 0)
-            give_up(b[busy], n[busy])
-            edges["in_flight"][b[~busy], n[~busy], a[~busy]] += 1
-            new = wants & ~busy
-            schedule(b[new], n[new], a[new])
-            b, child = b[~wants], taken["child"][~wants].astype(np.int64)
-            n = kernels.outcomes(nodes, b, child)
+    roots, count = tree.roots, 0
+    active, scheduled = roots["active"].copy(), roots["scheduled"].copy()
+    alone, gumbel = record.copy(), np.zeros((0, 0), np.float32)
+    alone["leaves"] = 1
+    try:
+        for _ in range(settings.leaves_per_wave):
+            revisits = roots["revisits"].copy()
+            begin = roots["simulations"] + roots["scheduled"]
+            _walk(tree, settings, record)
+            found = kernels.select(tree.nodes, tree.edges, roots, alone, gumbel, wave[count:], True)
+            np.add.at(roots["scheduled"], wave["root"][count : count + found], 1)
+            count += found
+            # Who has met what is being simulated, or has spent its simulations, waits.
+            moved = roots["simulations"] + roots["scheduled"] > begin
+            roots["active"] &= moved | (roots["revisits"] > revisits)
+    finally:
+        roots["active"], roots["scheduled"] = active, scheduled
     return count
+
+
+def _walk(tree: TreeArrays, settings: SearchSettings, record: np.ndarray) -> None:
+    """Take all active roots down; write their node, and the option to simulate, if any."""
+    from torchrl_hmcts.planners import subtree_kernels as kernels
+
+    nodes, edges, roots = tree.nodes, tree.edges, tree.roots
+    scores = settings.tree_policy
+    assert callable(scores)
+    roots["at"], roots["choice"] = 0, -1
+    b = np.flatnonzero(kernels.may_descend(nodes, roots, record))
+    n = np.zeros_like(b)
+    while len(b):
+        flags = nodes["flags"][b, n]
+        ends = (flags & (TERMINAL | PRUNED)) != 0
+        if settings.expand == "all":
+            ends |= ((flags & EXPANDED) == 0) & (nodes["open_options"][b, n] > 0)
+        b, n = b[~ends], n[~ends]
+        if settings.transpositions is not None:
+            kernels.refresh_all(nodes, edges, b, n)
+        edge = edges[b, n]  # [d, A], a copy
+        allowed = edge["closed"] != FORBIDDEN if settings.revisit else edge["closed"] == 0
+        further = allowed.any(-1)
+        b, n, edge, allowed = b[further], n[further], edge[further], allowed[further]
+        if not len(b):
+            return
+        a = _best(scores, nodes[b, n], edge, allowed)
+        child = edge["child"][np.arange(len(b)), a].astype(np.int64)
+        wants = (child < 0) | kernels.wants_samples(edges, record, b, n, a)
+        roots["choice"][b[wants]] = a[wants]
+        b, n, a, child = b[~wants], n[~wants], a[~wants], child[~wants]
+        edges["in_flight"][b, n, a] += 1
+        n = kernels.outcomes(nodes, b, child)
+        roots["at"][b] = n
 
 
 def _best(

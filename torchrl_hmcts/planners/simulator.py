@@ -21,11 +21,20 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Categorical, OneHot, TensorSpec
+from torchrl.data import OneHot
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
 from torchrl_hmcts.nesting import env_name, flat_transforms, set_states, step_states
+from torchrl_hmcts.planners.keys import entry_key
+from torchrl_hmcts.planners.simulator_checks import (
+    check_durations_and_masks,
+    check_env,
+    check_rewards_and_ends,
+    count_options,
+    find_done_keys,
+    find_reward_key,
+)
 
 _BESIDE = ("step_async", "step_wait", "step_abandon")
 
@@ -53,34 +62,9 @@ class Simulator:
         mask_key: NestedKey | None = "action_mask",
         reward_key: NestedKey | None = None,
     ) -> None:
-        if not isinstance(env, EnvBase):
-            raise TypeError(
-                f"MCTSPlanner plans in a TorchRL env; got {type(env).__name__}. Wrap a Gymnasium "
-                f"env as described in TorchRL's GymWrapper, with a state that can be set."
-            )
+        check_env(env)
         name = env_name(env)
         self.stateless = not env.batch_locked
-        if not (env._supports_set_state or self.stateless):
-            raise ValueError(
-                f"MCTSPlanner needs an env it can set to any state; {name} cannot "
-                f"(_supports_set_state={env._supports_set_state}, "
-                f"batch_locked={env.batch_locked}). Make a Gymnasium env by "
-                f"SettableGymEnv(its id). Of others use one that is stateless, e.g. "
-                f"WaterworldMazeEnv(), or one whose reset(td, set_state=True) restores the state "
-                f"in td. If all that its step reads is in the tensordict already, declare it by "
-                f"StatelessSimulator(env)."
-            )
-        if len(env.action_keys) != 1:
-            raise ValueError(
-                f"MCTSPlanner chooses one option per step; {name} has the actions "
-                f"{env.action_keys}."
-            )
-        if not list(env.full_state_spec.keys(True, True)):
-            raise ValueError(
-                f"{name} has an empty state_spec, so its state cannot be stored in a tree. Declare "
-                f"in state_spec every entry that its _step reads or that reset(td, set_state=True) "
-                f"restores (for TorchRL's MujocoEnv qpos and qvel, by a transform)."
-            )
         self.given_env, self.env = env, planning_env(env)
         self._foreign = ForeignStates(env)
         env = self.env
@@ -88,21 +72,10 @@ class Simulator:
         self.works_beside = self.stateless and all(hasattr(type(env), name) for name in _BESIDE)
         self.option_key = env.action_keys[0]
         spec = env.full_action_spec[self.option_key]
-        self._one_hot = isinstance(spec, OneHot)
-        self._option_dtype = spec.dtype
-        boxes = getattr(spec.space, "boxes", [spec.space])  # the Multi specs have one per entry
+        self.num_options = count_options(env, spec)
+        self._one_hot, self._option_dtype = isinstance(spec, OneHot), spec.dtype
         # [] for most envs, [1] under an ActionDiscretizer
-        shape = () if self._one_hot else tuple(spec.shape[env.batch_dims :])
-        single = len(boxes) == 1 and _one_number(
-            spec.shape[:-1] if self._one_hot else spec.shape, env
-        )
-        if not isinstance(spec, (Categorical, OneHot)) or not single:
-            raise ValueError(
-                f"MCTSPlanner searches one discrete action; {name} has {spec}. Put the env under "
-                f"an OptionTransform, or discretise its action with torchrl's ActionDiscretizer."
-            )
-        self.num_options = int(boxes[0].n)
-        self._option_shape = shape
+        self._option_shape = () if self._one_hot else tuple(spec.shape[env.batch_dims :])
         self.state_keys = [unravel_key(k) for k in env.full_state_spec.keys(True, True)]
         available = {unravel_key(k) for k in env.full_observation_spec.keys(True, True)}
         available |= set(self.state_keys)
@@ -110,65 +83,22 @@ class Simulator:
         extra = [unravel_key(k) for k in extra_keys]
         self._check_available(extra, "The novelty test or an evaluator")
         self.kept_keys = list(self.state_keys)
-        shown = [None if key is None else unravel_key(key) for key in (duration_key, mask_key)]
-        self.duration_key, self.mask_key = (k if k in available else None for k in shown)
+        for name, key in (("duration_key", duration_key), ("mask_key", mask_key)):
+            key = None if key is None else entry_key("MCTSPlanner", name, key)
+            setattr(self, name, key if key in available else None)
         self.root_keys = list(dict.fromkeys([*self.state_keys, *extra]))
         if self.mask_key is not None:
             self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))
-        self._reward_key = _reward_key(env, name, reward_key)
+        self._reward_key = find_reward_key(env, reward_key)
         self._done_spec = env.full_done_spec_unbatched  # a call has m states, not env.batch_size
         self._done_keys = [unravel_key(k) for k in env.done_keys]
-        self._done_key, self._terminated_key = _done_keys(env, name)
-        self._check_specs(env)
+        self._done_key, self._terminated_key = find_done_keys(env)
+        check_rewards_and_ends(env, self._reward_key, (self._done_key, self._terminated_key))
+        check_durations_and_masks(env, self.duration_key, self.mask_key, self.num_options)
         last = flat_transforms(env)[-1:] if type(env) is TransformedEnv else []
         self._run_from = getattr(last[0], "run_from", None) if last else None
         self._ones = np.ones(0, np.int64)
         self._no_masks = np.zeros((0, self.num_options), np.bool_)
-
-    def _check_specs(self, env: EnvBase) -> None:
-        """Refuse entries of which a search would read other numbers than are meant."""
-        name = self._name
-        reward = env.full_reward_spec[self._reward_key]
-        if not _one_number(reward.shape, env) or reward.dtype.is_complex:
-            raise ValueError(
-                f"MCTSPlanner plans for one reward, a real number per step; the reward "
-                f"{self._reward_key!r} of {name} is {_described(reward, env)}. Make one number of "
-                f"it, e.g. by torchrl's LineariseRewards or a transform of your own."
-            )
-        for key in (self._done_key, self._terminated_key):
-            done = env.full_done_spec[key]
-            if not _one_number(done.shape, env) or done.dtype != torch.bool:
-                raise ValueError(
-                    f"MCTSPlanner needs one end per state, a bool [1]; {key!r} of {name} is "
-                    f"{_described(done, env)}. Reduce it, e.g. by any(-1, keepdim=True), in a "
-                    f"transform."
-                )
-        shown = env.full_observation_spec
-        if self.duration_key is not None:
-            duration = shown[self.duration_key]
-            integer = not (duration.dtype.is_floating_point or duration.dtype.is_complex)
-            if not _one_number(duration.shape, env) or not integer or duration.dtype == torch.bool:
-                raise ValueError(
-                    f"MCTSPlanner reads the base steps of a step, an int64 [1], from "
-                    f"{self.duration_key!r}; in {name} that is {_described(duration, env)}. Name "
-                    f"another entry by duration_key, or None if every step is one."
-                )
-        if self.mask_key is not None:
-            mask = shown[self.mask_key]
-            if mask.shape[env.batch_dims :].numel() != self.num_options:
-                raise ValueError(
-                    f"MCTSPlanner reads which of the {self.num_options} options may be taken, bool "
-                    f"[{self.num_options}], from {self.mask_key!r}; in {name} that is "
-                    f"{_described(mask, env)}. Name the options' own mask by mask_key, or None if "
-                    f"all may be taken."
-                )
-            below = _masks_actions_below_options(env, self.mask_key)
-            if below:
-                raise ValueError(
-                    f"MCTSPlanner reads which options may be taken from {self.mask_key!r}, which "
-                    f"{name} writes of its {below} base actions, below the OptionTransform. Write "
-                    f"the options' own mask in a transform behind it, or pass mask_key=None."
-                )
 
     def root(self, td: TensorDictBase) -> TensorDictBase:
         """Return the root states in one batch dimension, after checking them."""
@@ -191,12 +121,12 @@ class Simulator:
         return flat
 
     def state(self, td: TensorDictBase) -> TensorDictBase:
-        """Return what is stored of a state: that from which the simulator can go on, and more."""
+        """Return what is stored of a state: all that the simulator continues from, and more."""
         return td.select(*self.kept_keys)
 
     def keep(self, keys: Sequence[NestedKey]) -> None:
         """Store further entries of the observation with every node, before a search begins."""
-        self._check_available(keys, "The policy that carries plans out")
+        self._check_available(keys, "The policy that executes plans")
         self.kept_keys = list(dict.fromkeys([*self.kept_keys, *keys]))
         self.root_keys = list(dict.fromkeys([*self.root_keys, *keys]))
 
@@ -326,13 +256,7 @@ class Simulator:
     def rewards(self, after: TensorDictBase) -> np.ndarray:
         """Return the rewards, float32 ``[m]``."""
         reward = _required(after, self._reward_key)
-        rewards = _array(reward if reward.dtype == torch.float32 else reward.to(torch.float32))
-        if not np.isfinite(rewards).all():
-            raise ValueError(
-                f"The simulator returned a reward of {rewards[~np.isfinite(rewards)][0]}. Rewards "
-                f"must be finite; find the state from which the env wrote it."
-            )
-        return rewards
+        return _array(reward if reward.dtype == torch.float32 else reward.to(torch.float32))
 
     def done(self, td: TensorDictBase) -> np.ndarray:
         """Return which states end the episode, bool ``[m]``; False where a root does not say.
@@ -399,58 +323,3 @@ def _array(value: Tensor) -> np.ndarray:
         value = value.cpu()
     array: np.ndarray = value.numpy().reshape(-1)
     return array
-
-
-def _reward_key(env: EnvBase, name: str, reward_key: NestedKey | None) -> NestedKey:
-    keys = [unravel_key(k) for k in env.reward_keys]
-    if reward_key is not None and unravel_key(reward_key) in keys:
-        return unravel_key(reward_key)
-    if reward_key is not None or len(keys) != 1:
-        raise ValueError(
-            f"MCTSPlanner plans for one reward; {name} has {keys}, and reward_key is "
-            f"{reward_key!r}. Name one of them, e.g. reward_key={keys[0]!r}."
-        )
-    return keys[0]
-
-
-def _masks_actions_below_options(env: EnvBase, mask_key: NestedKey) -> int:
-    """The number of base actions if the mask is theirs and nobody behind the options wrote it."""
-    transforms = flat_transforms(env) if isinstance(env, TransformedEnv) else []
-    for transform in reversed(transforms):
-        if mask_key in map(unravel_key, transform.out_keys):
-            return 0
-        if hasattr(transform, "num_options"):  # the options are made here
-            parent = transform.parent
-            if mask_key not in map(unravel_key, parent.full_observation_spec.keys(True, True)):
-                return 0
-            actions = [getattr(s.space, "n", 0) for s in parent.full_action_spec.values(True, True)]
-            numel = parent.full_observation_spec[mask_key].shape[parent.batch_dims :].numel()
-            return next((int(n) for n in actions if n == numel), 0)
-    return 0
-
-
-def _done_keys(env: EnvBase, name: str) -> tuple[NestedKey, NestedKey]:
-    """The entries that say that a state is the last of its episode, and that it is terminal."""
-    keys = [unravel_key(k) for k in env.done_keys]
-    ends = [k for k in keys if _last(k) == "done"]
-    if "done" not in ends and len(ends) != 1:
-        raise ValueError(
-            f"MCTSPlanner needs one entry that says that an episode is over; {name} has {ends}. "
-            f'Write "done" in a transform, e.g. where all of them are.'
-        )
-    done = "done" if "done" in ends else ends[0]
-    terminated = "terminated" if isinstance(done, str) else (*done[:-1], "terminated")
-    return done, terminated if terminated in keys else done
-
-
-def _one_number(shape: torch.Size, env: EnvBase) -> bool:
-    """Whether an entry has one number per element of the env's batch."""
-    return shape[: env.batch_dims] == env.batch_size and shape[env.batch_dims :].numel() == 1
-
-
-def _described(spec: TensorSpec, env: EnvBase) -> str:
-    return f"{spec.dtype} {list(spec.shape[env.batch_dims :])}"
-
-
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]

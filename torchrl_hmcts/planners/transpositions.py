@@ -9,8 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+
+from torchrl_hmcts.planners.keys import entry_keys
 
 
 class Transpositions:
@@ -33,7 +35,7 @@ class Transpositions:
         2008.
 
     Example:
-        >>> from torchrl_hmcts.planners import MaxBackup, MCTSPlanner, SearchBudget
+        >>> from torchrl_hmcts.planners import MCTSPlanner, SearchBudget, Transpositions
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> env = ChainEnv(length=6)
         >>> planner = MCTSPlanner(env, transpositions=Transpositions("state"),
@@ -44,13 +46,7 @@ class Transpositions:
     """
 
     def __init__(self, key: NestedKey | Sequence[NestedKey]) -> None:
-        keys = [key] if isinstance(key, (str, tuple)) else list(key)
-        if not keys:
-            raise ValueError(
-                "Transpositions needs the entries that make up a state; got none. Name them, e.g. "
-                'Transpositions("state"), or pass transpositions=None.'
-            )
-        self.in_keys = [unravel_key(k) for k in keys]
+        self.in_keys = entry_keys("Transpositions", "key", key)
         self.start(0)
 
     def start(self, num_roots: int) -> None:

@@ -1,4 +1,4 @@
-"""The search tree: packed records that the kernels write, seen as tensors.
+"""The search tree: packed records that the kernels write, and the states of its nodes.
 
 Letters, here and in the rest of the package: ``B`` roots searched at once, ``N`` nodes a root has
 room for, ``A`` options, ``m`` outcomes of one wave, ``F`` novelty features.
@@ -13,18 +13,16 @@ linked by ``sibling`` and ``Q`` is their mean, weighted by how often each was dr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorClass, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.tensorclass import _TensorClassMeta
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_hmcts.planners.docstrings import KeepsDocstring
-
-if TYPE_CHECKING:
-    from torchrl.data.map.tree import Tree
+from torchrl_hmcts.checks import whole_number
 
 NODE = np.dtype(
     [
@@ -87,6 +85,32 @@ WAVE = np.dtype(
     [("root", np.int64), ("node", np.int64), ("option", np.int64), ("new_node", np.int64)],
     align=True,
 )
+FACTORS = 256  # visits of a node up to which its exploration factor is looked up
+# What the kernels read of a search's settings: one record instead of a dozen arguments, which cost
+# 0.1 us each a call.
+RECORD = np.dtype(
+    [
+        ("score", np.int64),  # UCT_SCORE ... PYTHON_SCORE
+        ("c", np.float64),
+        ("c_base", np.float64),  # 0: a constant c
+        ("c_scale", np.float64),
+        ("unvisited_value", np.float64),
+        ("normalize", np.int64),  # RAW_VALUES ... WHOLE_TREE
+        ("backup", np.int64),  # MEAN_BACKUP or MAX_BACKUP
+        ("expand_all", np.int64),
+        ("leaves", np.int64),
+        ("mark", np.int64),  # whether options on the way down are marked as in flight
+        ("revisit", np.int64),
+        ("twins", np.int64),
+        ("widening", np.float64),  # 0: one outcome per option
+        ("widening_exponent", np.float64),
+        ("factors", np.float64, FACTORS),
+    ],
+    align=True,
+)
+UCT_SCORE, PUCT_SCORE, GUMBEL_SCORE, PYTHON_SCORE = 0, 1, 2, 3
+RAW_VALUES, SIBLINGS, WHOLE_TREE = 0, 1, 2
+MEAN_BACKUP, MAX_BACKUP = 0, 1
 
 # Bits of a node's flags.
 EXPANDED = 1  # its options have been simulated
@@ -103,99 +127,41 @@ MOST_VISITS = MOST_NODES - 2**24
 MOST_SAMPLES = np.iinfo(np.int16).max  # outcomes drawn of one option
 # Rewards and values are smaller than this: no sum of them along a path overflows in float32.
 LARGEST = 1e30
+_MOST_EDGES = 2**48
 
 # An edge's ``closed``: 0, or one of these.
 SOLVED = 1  # nothing is left to simulate behind it
 FORBIDDEN = 2  # the mask does not allow the option
 
 
-class TreeView(TensorClass, metaclass=KeepsDocstring):
-    """A search tree as tensors that share the memory of the kernels' records.
+class KeepsDocstring(_TensorClassMeta):
+    """Metaclass of a ``TensorClass`` that keeps its docstring, as tensordict's own does not."""
 
-    Only the first ``num_nodes[b]`` nodes of root ``b`` have a meaning. Node 0 is the root. A view
-    is of the arrays at the time it was made: make a new one after the tree has grown.
-
-    Attributes:
-        num_nodes (Tensor): ``[B]`` nodes in use.
-        node_visits (Tensor): ``[B, N]`` backups through a node, its own evaluation included.
-        node_values (Tensor): ``[B, N]`` value V of a node.
-        raw_values (Tensor): ``[B, N]`` the leaf evaluator's value of a node.
-        rewards (Tensor): ``[B, N]`` reward R of the option that led here.
-        discounts (Tensor): ``[B, N]`` its discount D.
-        parents (Tensor): ``[B, N]`` node above, -1 for the root.
-        parent_options (Tensor): ``[B, N]`` option that led here, -1 for the root.
-        siblings (Tensor): ``[B, N]`` next outcome of the same option, -1 for the last.
-        samples (Tensor): ``[B, N]`` how often the simulator gave this outcome.
-        twins (Tensor): ``[B, N]`` node of the same state that is searched in its place, -1 for
-            none.
-        depths (Tensor): ``[B, N]`` options from the root.
-        base_steps (Tensor): ``[B, N]`` base steps from the root.
-        path_returns (Tensor): ``[B, N]`` discounted reward collected from the root.
-        flags (Tensor): ``[B, N]`` bits EXPANDED ... REWARDED of this module.
-        children (Tensor): ``[B, N, A]`` first outcome of an option, -1 if not simulated.
-        children_visits (Tensor): ``[B, N, A]`` backups through an option.
-        children_values (Tensor): ``[B, N, A]`` value Q = R + D V of an option.
-        children_priors (Tensor): ``[B, N, A]`` prior probability of an option, 0 if forbidden.
-        children_closed (Tensor): ``[B, N, A]`` 0 open, SOLVED or FORBIDDEN.
-        states (TensorDictBase): ``[B, N]`` what the simulator needs to go on from a node.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> env = ChainEnv(length=4)
-        >>> view = MCTSPlanner(env).search(env.reset()).tree.view()
-        >>> view.children[0, 0].tolist()  # the nodes that the two options of the root led to
-        [1, 2]
-        >>> view.parents[0, 1:3].tolist()
-        [0, 0]
-    """
-
-    num_nodes: Tensor
-    node_visits: Tensor
-    node_values: Tensor
-    raw_values: Tensor
-    rewards: Tensor
-    discounts: Tensor
-    parents: Tensor
-    parent_options: Tensor
-    siblings: Tensor
-    samples: Tensor
-    twins: Tensor
-    depths: Tensor
-    base_steps: Tensor
-    path_returns: Tensor
-    flags: Tensor
-    children: Tensor
-    children_visits: Tensor
-    children_values: Tensor
-    children_priors: Tensor
-    children_closed: Tensor
-    states: TensorDictBase
+    def __new__(mcs, name: str, bases: Any, namespace: dict[str, Any], **kwargs: Any) -> Any:
+        cls = super().__new__(mcs, name, bases, namespace, **kwargs)
+        if "__doc__" in namespace:
+            cls.__doc__ = namespace["__doc__"]
+        return cls
 
 
-class SearchTree:
+class TreeArrays:
     """The trees of ``B`` roots in preallocated arrays that grow by doubling.
 
     Args:
         num_roots: B.
         num_options: A.
         capacity: nodes per root to make room for at first.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> env = ChainEnv(length=4)
-        >>> tree = MCTSPlanner(env).search(env.reset()).tree
-        >>> tree.path(root=0, node=1), tree.path(root=0, node=2)
-        ([0, 1], [0, 2])
-        >>> tree.options(root=0, node=2)
-        [1]
     """
 
     def __init__(self, num_roots: int, num_options: int, capacity: int = 64) -> None:
-        self.num_roots = num_roots
-        self.num_options = num_options
-        self.capacity = capacity
+        self.num_roots = whole_number("A search", "num_roots", num_roots)
+        self.num_options = whole_number("A search", "num_options", num_options, least=1)
+        self.capacity = whole_number("A search", "capacity", capacity, least=1)
+        if self.num_roots * self.num_options * self.capacity > _MOST_EDGES:
+            raise ValueError(
+                f"A search of num_roots={num_roots} with num_options={num_options} and room for "
+                f"capacity={capacity} nodes each is too large for any memory."
+            )
         self.nodes = np.zeros((num_roots, capacity), NODE)
         self.edges = np.zeros((num_roots, capacity, num_options), EDGE)
         self.roots = np.zeros(num_roots, ROOT)
@@ -292,6 +258,19 @@ class SearchTree:
             self._flat = (self.states, columns)
         return self._flat[1]
 
+    def remember(
+        self,
+        roots: np.ndarray,
+        nodes: np.ndarray,
+        features: np.ndarray | None,
+        codes: np.ndarray | None,
+    ) -> None:
+        """Store what novelty tests and transpositions read of nodes, for when they forget it."""
+        if features is not None:
+            self.features[roots, nodes] = features
+        if codes is not None:
+            self.codes[roots, nodes] = codes
+
     def path(self, root: int, node: int) -> list[int]:
         """Return the nodes from the root to ``node``, both included."""
         nodes = [node]
@@ -303,69 +282,10 @@ class SearchTree:
         """Return the options that lead from the root to ``node``."""
         return [int(self.nodes[root, n]["option"]) for n in self.path(root, node)[1:]]
 
-    def view(self) -> TreeView:
-        """Return the trees as tensors; nothing is copied."""
-
-        def tensor(array: np.ndarray, field: str) -> Tensor:
-            return torch.from_numpy(array[field])
-
-        nodes, edges = self.nodes, self.edges
-        states = self.states
-        if states is None:
-            states = TensorDict({}, batch_size=[self.num_roots, self.capacity])
-        return TreeView(
-            num_nodes=tensor(self.roots, "num_nodes"),
-            node_visits=tensor(nodes, "visits"),
-            node_values=tensor(nodes, "value"),
-            raw_values=tensor(nodes, "raw_value"),
-            rewards=tensor(nodes, "reward"),
-            discounts=tensor(nodes, "discount"),
-            parents=tensor(nodes, "parent"),
-            parent_options=tensor(nodes, "option"),
-            siblings=tensor(nodes, "sibling"),
-            samples=tensor(nodes, "samples"),
-            twins=tensor(nodes, "twin"),
-            depths=tensor(nodes, "depth"),
-            base_steps=tensor(nodes, "base_steps"),
-            path_returns=tensor(nodes, "path_return"),
-            flags=tensor(nodes, "flags"),
-            children=tensor(edges, "child"),
-            children_visits=tensor(edges, "visits"),
-            children_values=tensor(edges, "value"),
-            children_priors=tensor(edges, "prior"),
-            children_closed=tensor(edges, "closed"),
-            states=states,
-            batch_size=[self.num_roots],
-        )
-
-    def summary(self, root: int = 0, option_names: Sequence[str] | None = None) -> str:
-        """Return what was found as text; see :func:`~torchrl_hmcts.planners.export.summary`."""
-        from torchrl_hmcts.planners import export
-
-        return export.summary(self, root, option_names)
-
-    def to_networkx(
-        self, root: int = 0, *, max_nodes: int | None = None, states: bool = False
-    ) -> Any:
-        """Return a graph; see :func:`~torchrl_hmcts.planners.export.to_networkx`."""
-        from torchrl_hmcts.planners import export
-
-        return export.to_networkx(self, root, max_nodes=max_nodes, states=states)
-
-    def to_torchrl(self, root: int = 0) -> Tree:
-        """Return TorchRL's ``Tree``; see :func:`~torchrl_hmcts.planners.export.to_torchrl`."""
-        from torchrl_hmcts.planners import export
-
-        return export.to_torchrl(self, root)
-
-    def plot(self, root: int = 0, **kwargs: Any) -> Any:
-        """Draw the tree; see :func:`~torchrl_hmcts.planners.drawing.plot_tree` for keywords."""
-        from torchrl_hmcts.planners import drawing
-
-        return drawing.plot_tree(self, root, **kwargs)
-
-    def plot_positions(self, root: int = 0, key: Any = "position", **kwargs: Any) -> Any:
-        """Draw where nodes lie; see :func:`~torchrl_hmcts.planners.drawing.plot_positions`."""
-        from torchrl_hmcts.planners import drawing
-
-        return drawing.plot_positions(self, root, key, **kwargs)
+    def outcomes(self, root: int, option: int, node: int = 0) -> list[int]:
+        """Return the nodes that an option of a node, the root by default, has led to."""
+        nodes, child = [], int(self.edges["child"][root, node, option])
+        while child >= 0:
+            nodes.append(child)
+            child = int(self.nodes["sibling"][root, child])
+        return nodes

@@ -4,8 +4,7 @@ A check is a function over the part. It returns nothing if the part keeps its co
 raises a :class:`ContractError` that says what is wrong, why it matters and what to do.
 """
 
-from torchrl_hmcts.arguments import name_all_arguments
-from torchrl_hmcts.testing.claims import ContractError
+from torchrl_hmcts.testing.contract import ContractError
 from torchrl_hmcts.testing.env_checks import check_env, check_macro_env, check_parallel_env
 from torchrl_hmcts.testing.loss_checks import LOSS_CHECKS, check_loss
 from torchrl_hmcts.testing.novelty_checks import check_novelty
@@ -44,5 +43,3 @@ __all__ = [
     "check_tree_policy",
     "check_worker",
 ]
-
-name_all_arguments(globals(), __all__)

@@ -9,23 +9,24 @@ from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch.nn.functional import one_hot
 from torchrl.data import Categorical, OneHot
-from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.carried_state import ForeignStates
+from torchrl_hmcts.nesting import env_name, flat_transforms
 from torchrl_hmcts.planners.simulator import Simulator
-from torchrl_hmcts.testing.claims import (
-    ContractError,
-    different,
+from torchrl_hmcts.testing.contract import (
     during,
     leaves,
     require,
-    row,
+    require_same,
     seeded,
 )
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 def check_env(
@@ -39,10 +40,10 @@ def check_env(
 ) -> None:
     """Check that an env keeps TorchRL's contract: specs, seeds, episodes, partial resets and steps.
 
-    TorchRL's ``check_env_specs``, with episodes that go on after their end; the same seed gives the
-    same rollout; the next step begins where the last one ended, and after the end of an episode in
-    a new one; a reset of some elements leaves the others as they are; of elements of which some are
-    not to step the others step as they do alone, and the former stay where they are.
+    TorchRL's ``check_env_specs``, with episodes that continue after their end; the same seed gives
+    the same rollout; the next step begins where the last one ended, and after the end of an episode
+    in a new one; a reset of some elements leaves the others as they are; of elements of which some
+    are not to step the others step as they do alone, and the former stay where they are.
 
     Args:
         env (EnvBase): any env. Stateless ones (``batch_locked=False``) are tried in batches too.
@@ -68,14 +69,13 @@ def check_env(
             env.set_seed(seed)
             check_env_specs(env, break_when_any_done="both")
     act = _Random(env, mask_key)
-    data = _rollout(env, num_steps, seed, act)
+    data = rollout(env, num_steps, seed, act)
     if seeds_repeat:
-        again = _rollout(env, num_steps, seed, act)
-        where = different(data, again, sorted(leaves(data), key=str))
-        require(
-            where is None,
-            f"{name}: two rollouts with seed {seed} differ in {where and where[0]!r}. Draw every "
-            "random number from a generator that _set_seed seeds.",
+        require_same(
+            data,
+            rollout(env, num_steps, seed, act),
+            f"{name}: two rollouts with seed {seed} differ in <key>. Draw every random number from "
+            "a generator that _set_seed seeds.",
         )
     _check_continuity(env, data, {unravel_key(key) for key in redrawn_keys})
     if env.batch_size or not env.batch_locked:
@@ -97,7 +97,7 @@ def check_macro_env(
     """Check that a planner can search an env: a macro environment, one that is set to states.
 
     All of :func:`check_env`, and: the action is one discrete option; a step takes at least one base
-    step; some option may be taken wherever an episode goes on; set to the states of a rollout and
+    step; some option may be taken wherever an episode continues; set to the states of a rollout and
     stepped with its options the env gives what the unbroken rollout gave, for all of them at once
     if it is stateless; a step leaves its input as it was; transforms of your own keep no tensor to
     themselves that changes from step to step. With ``step_async``, ``step_wait`` and
@@ -130,7 +130,7 @@ def check_macro_env(
         simulator = Simulator(env, duration_key=duration_key, mask_key=mask_key)
     foreign = ForeignStates(env)
     before = foreign.read()
-    _rollout(env, num_steps, seed, _Random(env, mask_key))
+    rollout(env, num_steps, seed, _Random(env, mask_key))
     changed = foreign.changed(before)
     require(
         changed is None,
@@ -145,11 +145,10 @@ def check_macro_env(
         mask_key=mask_key,
         redrawn_keys=redrawn_keys,
     )
-    data = _rollout(env, num_steps, seed, _Random(env, mask_key))
-    duration_key, mask_key = unravel_key(duration_key), unravel_key(mask_key)
+    data = rollout(env, num_steps, seed, _Random(env, mask_key))
+    after = data.get("next")
     if simulator.duration_key is not None:
-        duration = data.get("next").get(duration_key)
-        shape = (*data.batch_size, 1)
+        duration, shape = after.get(simulator.duration_key), (*data.batch_size, 1)
         require(
             duration.dtype == torch.int64 and duration.shape == torch.Size(shape),
             f"{name}: the duration under {duration_key!r} is {duration.dtype} "
@@ -161,10 +160,9 @@ def check_macro_env(
             "at least one, or a search would go round in a circle without any discount.",
         )
     if simulator.mask_key is not None:
-        mask = data.get("next").get(mask_key)
-        stuck = ~mask.any(-1) & ~data.get("next").get(env.done_keys[0]).squeeze(-1)
+        stuck = ~after.get(simulator.mask_key).any(-1)
         require(
-            not stuck.any(),
+            not (stuck & ~after.get(env.done_keys[0]).squeeze(-1)).any(),
             f"{name}: {mask_key!r} allows no option in a state that is not done. Mark the state as "
             "terminated, or allow an option there.",
         )
@@ -206,7 +204,7 @@ def check_parallel_env(
     name = _name(serial)
     try:
         with during(name, "in a SerialEnv"):
-            expected = _rollout(serial, num_steps, seed, _Random(serial, "action_mask"))
+            expected = rollout(serial, num_steps, seed, _Random(serial, "action_mask"))
     finally:
         serial.close(raise_if_closed=False)
     for method in start_methods:
@@ -216,30 +214,26 @@ def check_parallel_env(
             try:
                 with seeded(seed):
                     check_env_specs(parallel)
-                actual = _replay(parallel, expected, seed)
+                actual = rollout(parallel, num_steps, seed, recorded(expected, parallel))
             finally:
                 parallel.close(raise_if_closed=False)
-        other = different(expected, actual, sorted(leaves(expected), key=str))
-        require(
-            other is None,
-            f"{name}: {other and other[0]!r} is another {where} than in a SerialEnv, with the same "
-            f"seed and actions. Let _set_seed seed all that is random, and share no state between "
-            "envs.",
+        require_same(
+            expected,
+            actual,
+            f"{name}: <key> is another {where} than in a SerialEnv, with the same seed and "
+            "actions. Let _set_seed seed all that is random, and share no state between envs.",
         )
 
 
 def _name(env: EnvBase) -> str:
-    if not isinstance(env, EnvBase):
-        raise ContractError(
-            f"{type(env).__name__} is no torchrl.envs.EnvBase. Wrap it, e.g. with GymWrapper."
-        )
-    transforms: list[str] = []
+    require(
+        isinstance(env, EnvBase),
+        f"{type(env).__name__} is no torchrl.envs.EnvBase. Wrap it, e.g. with GymWrapper.",
+    )
+    name, transforms = env_name(env), []
     while isinstance(env, TransformedEnv):
-        inner = env.transform
-        parts = list(inner) if isinstance(inner, Compose) else [inner]
-        transforms = [type(part).__name__ for part in parts] + transforms
+        transforms[:0] = [type(part).__name__ for part in flat_transforms(env)]
         env = env.base_env
-    name = type(env).__name__
     return f"{name} under {', '.join(transforms)}" if transforms else name
 
 
@@ -267,95 +261,75 @@ class _Random:
         return td.set(self.env.action_keys[0], option.reshape(old.shape).to(old.dtype))
 
 
-def _rollout(env: EnvBase, num_steps: int, seed: int, act: _Random) -> TensorDictBase:
-    """A random rollout ``[*B, T]`` through the ends of episodes."""
+def rollout(
+    env: EnvBase, num_steps: int, seed: int = 0, policy: Policy | None = None
+) -> TensorDictBase:
+    """Return a rollout ``[*B, T]`` through the ends of episodes, of random actions by default."""
     with seeded(seed):
         env.set_seed(seed)
-        return env.rollout(num_steps, act, break_when_any_done=False)
+        return env.rollout(num_steps, policy, break_when_any_done=False)
 
 
-def _replay(env: EnvBase, data: TensorDictBase, seed: int) -> TensorDictBase:
-    """The rollout of another env with the same seed and the actions of ``data``."""
+def recorded(data: TensorDictBase, env: EnvBase) -> Policy:
+    """Return a policy that takes the actions of a rollout ``[*B, T]`` again."""
     actions = iter(data.select(*env.action_keys).unbind(-1))
+    return lambda td: td.update(next(actions))
 
-    def policy(td: TensorDictBase) -> TensorDictBase:
-        return td.update(next(actions))
 
-    with seeded(seed):
-        env.set_seed(seed)
-        return env.rollout(data.batch_size[-1], policy, break_when_any_done=False)
+def _ended(env: EnvBase, td: TensorDictBase) -> torch.Tensor:
+    """Return in which elements an episode has ended, bool ``[*B]``."""
+    done = [td.get(key).reshape(*td.batch_size, -1).any(-1) for key in env.done_keys]
+    return torch.stack(done).any(0)
 
 
 def _check_continuity(env: EnvBase, data: TensorDictBase, redrawn: set[NestedKey]) -> None:
-    """What a step wrote is where the next one starts, until the end of the episode."""
-    name, last = _name(env), data.batch_dims - 1
-    steps = data.unbind(last)
+    """See that what a step wrote is where the next one starts, until the end of the episode."""
+    name = _name(env)
+    steps = data.unbind(data.batch_dims - 1)
     roots = leaves(data.exclude("next", *env.action_keys, *redrawn))
-    kept = roots & leaves(data.get("next"))
-    done_keys = set(map(unravel_key, env.done_keys))
+    kept = roots & leaves(data.get("next")) - set(map(unravel_key, env.done_keys))
     for t, (before, after) in enumerate(zip(steps[:-1], steps[1:], strict=True)):
-        following = before.get("next")
-        ended = torch.zeros(before.batch_size, dtype=torch.bool, device=before.device)
-        for key in env.done_keys:
-            done = following.get(key)
-            ended |= done.reshape(*before.batch_size, -1).any(-1)
-        begun = torch.zeros_like(ended)
-        for key in done_keys:
-            begun |= after.get(key).reshape(*before.batch_size, -1).any(-1)
         require(
-            not begun.any(),
+            not _ended(env, after).any(),
             f"{name}: step {t + 1} of a rollout starts in a state that is done. A reset must give "
-            "a state from which an episode can go on.",
+            "a state from which an episode can continue.",
         )
-        if ended.all():
-            continue
-        goes_on = ~ended
-        one, two = following[goes_on], after[goes_on]
-        where = different(one, two, sorted(kept - done_keys, key=str))
-        require(
-            where is None,
-            f"{name}: after step {t} {where and where[0]!r} changed on the way to the next root. "
-            "Only a transform may do that; if it is meant, name it in redrawn_keys.",
+        running = ~_ended(env, before.get("next"))
+        require_same(
+            before.get("next")[running],
+            after[running],
+            f"{name}: after step {t} <key> changed on the way to the next root. Only a transform "
+            "may do that; if it is meant, name it in redrawn_keys.",
+            kept,
         )
 
 
-def _batch(env: EnvBase, seed: int, act: _Random) -> TensorDictBase:
-    """Roots of several elements, one random step after a reset."""
-    with seeded(seed):
+def _batch(env: EnvBase, seed: int, act: Policy) -> tuple[TensorDictBase, torch.Tensor]:
+    """Return roots of several elements, a random step after a reset, and every other of them."""
+    with during(_name(env), "stepping a batch"), seeded(seed):
         env.set_seed(seed)
         td = env.reset() if env.batch_size else env.reset(TensorDict(batch_size=[4]))
         _, td = env.step_and_maybe_reset(act(td))
-    return td
+    odd = torch.arange(td.batch_size.numel(), device=td.device) % 2
+    return td, (odd == 0).reshape(td.batch_size)
 
 
-def _half(td: TensorDictBase) -> torch.Tensor:
-    """Every other element, bool ``[*B]``."""
-    n = td.batch_size.numel()
-    return (torch.arange(n, device=td.device) % 2 == 0).reshape(td.batch_size)
-
-
-def _check_partial_resets(env: EnvBase, seed: int, act: _Random) -> None:
+def _check_partial_resets(env: EnvBase, seed: int, act: Policy) -> None:
     name = _name(env)
-    with during(name, "stepping a batch"):
-        before = _batch(env, seed, act)
-    mask = _half(before)
+    before, mask = _batch(env, seed, act)
     asked = before.clone()
     for reset_key, done_keys in zip(env.reset_keys, env.done_keys_groups, strict=True):
         shape = before.get(done_keys[0]).shape
-        asked.set(
-            reset_key, mask.reshape(*mask.shape, *[1] * (len(shape) - mask.ndim)).expand(shape)
-        )
+        asked.set(reset_key, expand_as_right(mask, before.get(done_keys[0])).expand(shape))
     with during(name, "resetting half of a batch"), seeded(seed):
         after = env.reset(asked, **({"set_state": False} if env._supports_set_state else {}))
-    rest = ~mask
-    if rest.any():
-        keys = leaves(before) & leaves(after)
-        where = different(before[rest], after[rest], sorted(keys, key=str))
-        require(
-            where is None,
-            f"{name}: a reset of some elements changed {where and where[0]!r} of others. Reset "
-            'only where "_reset" is True.',
-        )
+    require_same(
+        before[~mask],
+        after[~mask],
+        f'{name}: a reset of some elements changed <key> of others. Reset only where "_reset" is '
+        "True.",
+        leaves(before) & leaves(after),
+    )
     for key in env.done_keys:
         require(
             not after[mask].get(key).any(),
@@ -363,63 +337,52 @@ def _check_partial_resets(env: EnvBase, seed: int, act: _Random) -> None:
         )
 
 
-def _check_partial_steps(env: EnvBase, seed: int, act: _Random) -> None:
+def _check_partial_steps(env: EnvBase, seed: int, act: Policy) -> None:
     name = _name(env)
-    before = _batch(env, seed, act)
+    before, mask = _batch(env, seed, act)
     with seeded(seed):
         before = act(before)
-    mask = _half(before)
     if mask.all():
         return  # a batch of one
-    asked = before.clone().set("_step", mask)
     with during(name, "stepping half of a batch"), seeded(seed):
         env.set_seed(seed)
-        after = env.step(asked).get("next")
-    rest = ~mask
+        after = env.step(before.clone().set("_step", mask)).get("next")
     if isinstance(env, TransformedEnv) and env.batch_locked:
         return  # transforms count on for all elements, and a rollout puts them back
     if env.batch_locked:  # of a stateless env TorchRL itself steps those that are asked for
         root = before.exclude("next", *env.action_keys)
-        keys = {unravel_key(key) for key in env.full_observation_spec.keys(True, True)}
-        keys = {key for key in keys if root.get(key, None) is not None}
-        where = different(root[rest], after[rest], sorted(keys, key=str))
-        require(
-            where is None,
-            f'{name}: {where and where[0]!r} changed where "_step" is False. Leave those elements '
-            "as they are.",
+        require_same(
+            root[~mask],
+            after[~mask],
+            f'{name}: <key> changed where "_step" is False. Leave those elements as they are.',
+            leaves(root) & {unravel_key(k) for k in env.full_observation_spec.keys(True, True)},
         )
-    else:
-        with during(name, "stepping a batch"), seeded(seed):
-            env.set_seed(seed)
-            alone = env.step(before[mask].clone()).get("next")
-        where = different(alone, after[mask], sorted(leaves(alone), key=str))
-        require(
-            where is None,
-            f"{name}: {where and where[0]!r} of elements that step depends on those beside them "
-            "that do not.",
-        )
+        return
+    with during(name, "stepping a batch"), seeded(seed):
+        env.set_seed(seed)
+        alone = env.step(before[mask].clone()).get("next")
+    message = "<key> of elements that step depends on those beside them that do not."
+    require_same(alone, after[mask], f"{name}: {message}")
 
 
 def _check_beside(
     env: EnvBase, simulator: Simulator, data: TensorDictBase, tolerance: float
 ) -> None:
-    """Begun together and waited for in another order, steps give what they give one by one."""
-    name = _name(env)
+    """See that steps under way together give what they give one by one, in another order too."""
     steps = data.select(*simulator.root_keys, simulator.option_key).reshape(-1)
     expected = data.get("next").reshape(-1)
-    with during(name, "with several steps under way"):
+    with during(_name(env), "with several steps under way"):
         tickets = [env.step_async(steps[i : i + 1].clone()) for i in range(len(steps))]
         env.step_abandon(env.step_async(steps.clone()))
         found = [env.step_wait(ticket) for ticket in reversed(tickets)][::-1]
     for i, after in enumerate(found):
-        outcome = expected[i : i + 1]
-        keys = sorted(set(leaves(outcome)) & set(leaves(after)), key=str)
-        where = different(outcome, after, keys, tolerance)
-        require(
-            where is None,
-            f"{name}: step {i} of {len(found)} under way gave {where and where[0]!r} = "
-            f"{where and row(after, *where)}, alone {where and row(outcome, *where)}. Keep apart "
-            "what belongs to each ticket of step_async.",
+        require_same(
+            expected[i : i + 1],
+            after,
+            f"{_name(env)}: step {i} of {len(found)} under way gave <key> = <other>, alone <one>. "
+            "Keep apart what belongs to each ticket of step_async.",
+            leaves(expected) & leaves(after),
+            tolerance,
         )
 
 
@@ -430,49 +393,41 @@ def _check_set_state(
     deterministic: bool,
     tolerance: float,
 ) -> None:
-    """Set to the states of a rollout and stepped, the env gives the rollout."""
+    """See that the env, set to the states of a rollout and stepped, gives the rollout."""
     name, env = _name(env), simulator.env  # in which transforms keep nothing to themselves
-    option_key = simulator.option_key
-    roots = data.select(*simulator.root_keys)
-    options = data.get(option_key)
-    if env.batch_locked:
-        batches = list(zip(roots.unbind(-1), options.unbind(data.batch_dims - 1), strict=True))
-        expected = list(data.get("next").unbind(-1))
-    else:
-        batches = [(roots.reshape(-1), options.flatten(0, data.batch_dims - 1))]
-        expected = [data.get("next").reshape(-1)]
-    written = set(map(unravel_key, env.full_observation_spec.keys(True, True)))
-    written |= {unravel_key(k) for k in (*env.full_reward_spec.keys(True, True), *env.done_keys)}
-    for (state, option), outcome in zip(batches, expected, strict=True):
+    written = {*env.full_observation_spec.keys(True, True), *env.done_keys}
+    written |= set(env.full_reward_spec.keys(True, True))
+    steps = data.unbind(-1) if env.batch_locked else [data.reshape(-1)]
+    for step in steps:
+        state, outcome = step.select(*simulator.root_keys), step.get("next")
         root = state.clone()
         if env._supports_set_state:  # without it a stateless env is stepped from the state itself
             with during(name, "reset to a state", "reset(td, set_state=True) must restore it."):
                 root = env.reset(root, set_state=True)
-        where = different(state, root, simulator.state_keys)
-        require(
-            where is None,
-            f"{name}: set to a state it shows another {where and where[0]!r}: "
-            f"{where and row(root, *where)} instead of {where and row(state, *where)}. "
+        require_same(
+            state,
+            root,
+            f"{name}: set to a state it shows another <key>: <other> instead of <one>. "
             "reset(td, set_state=True) must keep every entry of state_spec.",
+            simulator.state_keys,
         )
-        root.set(option_key, option.clone())
+        root.set(simulator.option_key, step.get(simulator.option_key).clone())
         held = root.clone()
         with during(name, "stepped from a state that it was set to"):
             after = env.step(root).get("next")
-        where = different(held, root, leaves(held))
-        require(
-            where is None,
-            f"{name}: a step changed {where and where[0]!r} of its input. Write under 'next' only, "
-            "and into new tensors.",
+        require_same(
+            held,
+            root,
+            f"{name}: a step changed <key> of its input. Write under 'next' only, and into new "
+            "tensors.",
         )
-        if not deterministic:
-            continue
-        keys = {key for key in written if outcome.get(key, None) is not None}
-        where = different(outcome, after, sorted(keys, key=str), tolerance)
-        require(
-            where is None,
-            f"{name}: set to a state and stepped it gives {where and where[0]!r} = "
-            f"{where and row(after, *where)}, the unbroken run gave "
-            f"{where and row(outcome, *where)}. Its state is not all in state_spec: declare every "
-            "entry that _step reads. (For random outcomes pass deterministic=False.)",
-        )
+        if deterministic:
+            require_same(
+                outcome,
+                after,
+                f"{name}: set to a state and stepped it gives <key> = <other>, the unbroken run "
+                "gave <one>. Its state is not all in state_spec: declare every entry that _step "
+                "reads. (For random outcomes pass deterministic=False.)",
+                set(map(unravel_key, written)) & leaves(outcome),
+                tolerance,
+            )

@@ -13,7 +13,17 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_hmcts.testing.claims import ContractError, different, during, leaves, require, seeded
+from torchrl_hmcts.nesting import parts
+from torchrl_hmcts.testing.contract import (
+    ContractError,
+    during,
+    leaves,
+    refuse_unknown,
+    require,
+    require_kind,
+    require_same,
+    seeded,
+)
 
 Rename = Callable[[NestedKey], NestedKey]
 
@@ -113,52 +123,28 @@ def check_loss(
         >>> gradients = {"loss_discriminator": ["discriminator_params"]}
         >>> check_loss(make_loss, td, gradients=gradients, checks=["gradients", "nested_keys"])
     """
-    unknown = [check for check in checks if check not in LOSS_CHECKS]
-    if unknown:
-        raise ValueError(
-            f"check_loss has no check {unknown[0]!r}; it has {', '.join(LOSS_CHECKS)}."
-        )
+    refuse_unknown("check_loss", checks, LOSS_CHECKS)
     it = _Loss(make_loss, tensordict, tolerance, seed)
+    calls: dict[str, Callable[[], None]] = {
+        "gradients": lambda: it.gradients(gradients),
+        "target_networks": lambda: it.target_networks(targets),
+        "set_keys": lambda: it.renamed("set_keys", _flat, keys),
+        "nested_keys": lambda: it.renamed("nested_keys", _nested, keys),
+        "value_estimators": lambda: it.value_estimators(value_estimators),
+    }
     for check in checks:
-        if check == "out_keys":
-            it.out_keys()
-        elif check == "reduction":
-            it.reduction()
-        elif check == "gradients":
-            it.gradients(gradients)
-        elif check == "target_networks":
-            it.target_networks(targets)
-        elif check == "dispatch":
-            it.dispatch()
-        elif check == "select_out_keys":
-            it.select_out_keys()
-        elif check == "set_keys":
-            it.renamed(check, _flat, keys)
-        elif check == "nested_keys":
-            it.renamed(check, _nested, keys)
-        elif check == "value_estimators":
-            it.value_estimators(value_estimators)
-        elif check == "terminal_states":
-            it.terminal_states()
-        elif check == "state_dict":
-            it.state_dict()
-        else:
-            it.compiled()
+        calls.get(check, getattr(it, check, None))()  # type: ignore[misc]
 
 
 class _Loss:
-    """The loss under test, and data for it."""
+    """The loss under test, and data for it; a method for each check."""
 
     def __init__(
         self, make_loss: MakeLoss, data: TensorDictBase, tolerance: float, seed: int
     ) -> None:
         self._make, self.data, self.tolerance, self.seed = make_loss, data, tolerance, seed
         loss = self.make()
-        self.name = type(loss).__name__
-        if not isinstance(loss, LossModule):
-            raise ContractError(
-                f"{self.name} is no torchrl.objectives.LossModule. Derive it from that class."
-            )
+        self.name = require_kind(loss, LossModule)
         with during(self.name, "on the data that check_loss was given"):
             self.expected = self.run(loss)
         self.losses = [key for key in self.expected.keys() if str(key).startswith("loss")]
@@ -173,27 +159,26 @@ class _Loss:
         with seeded(self.seed):
             return loss((self.data if data is None else data).clone())
 
+    def backward(self, out: TensorDictBase) -> None:
+        out.select(*self.losses).sum(reduce=True).backward()
+
     def equal(
         self, actual: TensorDictBase, doing: str, expected: TensorDictBase | None = None
     ) -> None:
         expected = self.expected if expected is None else expected
-        missing = leaves(expected) ^ leaves(actual)
-        require(
-            not missing,
-            f"{self.name} {doing}: it writes {sorted(map(str, leaves(actual)))} instead of "
-            f"{sorted(map(str, leaves(expected)))}.",
-        )
-        one, two = expected.detach(), actual.detach()
-        where = different(one, two, sorted(leaves(one), key=str), self.tolerance)
-        require(
-            where is None,
-            f"{self.name} {doing}: {where and where[0]!r} is {where and two.get(where[0])!s:.200} "
-            f"instead of {where and one.get(where[0])!s:.200}.",
+        require_same(
+            expected.detach(),
+            actual.detach(),
+            f"{self.name} {doing}: <key> is <other> instead of <one>.",
+            leaves(expected) | leaves(actual),
+            self.tolerance,
         )
 
+    def close(self, one: torch.Tensor, other: torch.Tensor) -> bool:
+        return torch.allclose(one, other, rtol=self.tolerance, atol=self.tolerance)
+
     def out_keys(self) -> None:
-        loss = self.make()
-        given = self.data.clone()
+        loss, given = self.make(), self.data.clone()
         with seeded(self.seed):
             out = loss(given)
         require(
@@ -202,63 +187,53 @@ class _Loss:
             f"{sorted(map(str, leaves(out)))}. Let both be the same.",
         )
         require(bool(self.losses), f"{self.name} writes no entry that begins with 'loss'.")
-        for key in leaves(out):
-            value = out.get(key)
+        for key, value in out.items(True, True):
             is_loss = str(key).startswith("loss")
-            if is_loss:
-                require(
-                    torch.isfinite(value).all(),
-                    f"{self.name}: {key!r} is {value!s:.200}, not finite.",
-                )
+            require(
+                not is_loss or torch.isfinite(value).all(),
+                f"{self.name}: {key!r} is {value!s:.200}, not finite.",
+            )
             require(
                 is_loss or not value.requires_grad,
                 f"{self.name}: {key!r} has a gradient. A trainer sums what begins with 'loss'; "
                 "rename it, or detach it.",
             )
-        where = different(self.data, given, leaves(self.data))
-        require(
-            where is None,
-            f"{self.name} changed {where and where[0]!r} of its input. Write to a copy.",
-        )
+        require_same(self.data, given, f"{self.name} changed <key> of its input. Write to a copy.")
 
     def reduction(self) -> None:
         single = self.run(self.make(reduction="none"))
         for kind in ("mean", "sum"):
             reduced = self.run(self.make(reduction=kind))
             for key in self.losses:
-                value = getattr(single.get(key), kind)()
-                close = torch.allclose(
-                    reduced.get(key), value, rtol=self.tolerance, atol=self.tolerance
-                )
+                value, found = getattr(single.get(key), kind)(), reduced.get(key)
                 require(
-                    close and reduced.get(key).ndim == 0,
-                    f"{self.name}(reduction={kind!r}): {key!r} is {reduced.get(key)!s:.200}, the "
-                    f"{kind} of reduction='none' is {value.item():.6g}. Reduce with "
-                    "self._reduce_loss.",
+                    found.ndim == 0 and self.close(found, value),
+                    f"{self.name}(reduction={kind!r}): {key!r} is {found!s:.200}, the {kind} of "
+                    f"reduction='none' is {value.item():.6g}. Reduce with self._reduce_loss.",
                 )
-        try:
-            self.make(reduction="median")
-        except ValueError as error:
-            require(
-                "median" in str(error),
-                f"{self.name} refuses reduction='median' without naming it: {error}",
-            )
-            return
-        raise ContractError(
-            f"{self.name} accepts reduction='median' at construction. Refuse what is not 'mean', "
-            "'sum' or 'none' with a ValueError."
+        self._refuses(
+            lambda: self.make(reduction="median"),
+            "accepts reduction='median' at construction. Refuse what is not 'mean', 'sum' or "
+            "'none' with a ValueError that names it",
+            "median",
         )
 
+    def _refuses(self, call: Callable[[], object], what: str, named: str = "") -> None:
+        try:
+            call()
+        except ValueError as error:
+            if named in str(error):
+                return
+        raise ContractError(f"{self.name} {what}.")
+
     def _touched(self, key: NestedKey) -> set[str]:
+        """Return the names of the parameters for which a loss has a gradient."""
         loss = self.make()
         value = self.run(loss).get(key)
         if value.requires_grad:
             value.sum().backward()
-        return {
-            name
-            for name, parameter in loss.named_parameters()
-            if parameter.grad is not None and bool((parameter.grad != 0).any())
-        }
+        named = [(name, p.grad) for name, p in loss.named_parameters() if p.grad is not None]
+        return {name for name, grad in named if bool((grad != 0).any())}
 
     def gradients(self, gradients: Mapping[str, Sequence[str]] | None) -> None:
         names = [name for name, p in self.make().named_parameters() if p.requires_grad]
@@ -271,9 +246,8 @@ class _Loss:
                 "out of the loss's parameters.",
             )
             return
-        missing = set(touched) ^ set(gradients)
         require(
-            not missing,
+            set(touched) == set(gradients),
             f"{self.name} has the losses {sorted(touched)}; gradients= names {sorted(gradients)}.",
         )
         for key, beginnings in gradients.items():
@@ -291,60 +265,46 @@ class _Loss:
                 )
 
     def target_networks(self, targets: Sequence[str]) -> None:
+        if not targets:
+            return
         loss = self.make()
-        parameters = {id(p) for p in loss.parameters()}
+        trainable = {id(p) for p in loss.parameters()}
+        create = "Create them with convert_to_functional(..., create_target_params=True)."
         for network in targets:
             held = getattr(loss, f"target_{network}_params", None)
-            require(
-                held is not None, f"{self.name} has no target_{network}_params. Create them with "
-                "convert_to_functional(..., create_target_params=True).",
-            )  # fmt: skip
+            require(held is not None, f"{self.name} has no target_{network}_params. {create}")
             assert held is not None
-            own = getattr(loss, f"{network}_params")
-            for target, trained in zip(
-                held.values(True, True), own.values(True, True), strict=True
-            ):
+            own = getattr(loss, f"{network}_params").values(True, True)
+            for target, trained in zip(held.values(True, True), own, strict=True):
                 require(
-                    id(target) not in parameters and not target.requires_grad,
-                    f"{self.name}: target_{network}_params would be trained. Create them with "
-                    "convert_to_functional(..., create_target_params=True).",
+                    id(target) not in trainable and not target.requires_grad,
+                    f"{self.name}: target_{network}_params would be trained. {create}",
                 )
                 require(
                     target.data_ptr() != trained.data_ptr(),
                     f"{self.name}: target_{network}_params are the network's own. Pass the "
                     "argument that delays them.",
                 )
-        if not targets:
-            return
+
+        def data(prefix: str) -> dict[str, TensorDictBase]:
+            return {n: getattr(loss, f"{prefix}{n}_params").data.clone() for n in targets}
+
         with during(self.name, "under torchrl.objectives.SoftUpdate"):
             updater = SoftUpdate(loss, tau=0.5)
         with torch.no_grad():
             for parameter in loss.parameters():
                 parameter.add_(1.0)
-        before = {n: getattr(loss, f"target_{n}_params").data.clone() for n in targets}
-        trained = {n: getattr(loss, f"{n}_params").data.clone() for n in targets}
-        self.run(loss).select(*self.losses).sum(reduce=True).backward()
-        moved = self._moved(loss, before)
-        require(
-            moved is None, f"{self.name}: a call moved target_{moved}_params. Only an updater may."
-        )
+        before, trained = data("target_"), data("")
+        self.backward(self.run(loss))
+        for network, now in data("target_").items():
+            message = f"a call moved target_{network}_params (<key>). Only an updater may."
+            require_same(before[network], now, f"{self.name}: {message}")
         updater.step()
-        for network in targets:
-            now = getattr(loss, f"target_{network}_params").data
+        for network, now in data("target_").items():
             half = before[network].lerp(trained[network], 0.5)
-            where = different(half, now, leaves(half), self.tolerance)
-            require(
-                where is None,
-                f"{self.name}: SoftUpdate(tau=0.5) did not move target_{network}_params half of "
-                f"the way ({where and where[0]!r}).",
-            )
-
-    def _moved(self, loss: LossModule, before: Mapping[str, TensorDictBase]) -> str | None:
-        for network, old in before.items():
-            now = getattr(loss, f"target_{network}_params").data
-            if different(old, now, leaves(old)) is not None:
-                return network
-        return None
+            message = f"did not move target_{network}_params half of the way (<key>)."
+            message = f"{self.name}: SoftUpdate(tau=0.5) {message}"
+            require_same(half, now, message, tolerance=self.tolerance)
 
     def dispatch(self) -> None:
         loss = self.make()
@@ -356,7 +316,7 @@ class _Loss:
                 f"{self.name} announces the in_key {key!r}, which it does without: the data have "
                 f"{sorted(map(str, leaves(self.data)))}. Correct in_keys.",
             )
-            flat[key if isinstance(key, str) else "_".join(key)] = value.clone()
+            flat["_".join(parts(key))] = value.clone()
         advice = "Decorate forward with tensordict.nn.dispatch, and name all it reads in in_keys."
         with during(self.name, "called with tensors by keyword", advice), seeded(self.seed):
             values = loss(**flat)
@@ -366,9 +326,8 @@ class _Loss:
             f"{self.name} called with tensors returns {len(values)} of {len(loss.out_keys)} "
             "outputs. Return all out_keys.",
         )
-        out = TensorDict(
-            dict(zip(loss.out_keys, values, strict=True)), batch_size=self.expected.batch_size
-        )
+        out = dict(zip(loss.out_keys, values, strict=True))
+        out = TensorDict(out, batch_size=self.expected.batch_size)
         self.equal(out, "called with tensors by keyword")
 
     def select_out_keys(self) -> None:
@@ -384,37 +343,31 @@ class _Loss:
 
     def renamed(self, check: str, name: Rename, keys: Sequence[str] | None) -> None:
         loss = self.make(name)
-        fields = loss._AcceptedKeys.__dataclass_fields__
-        names = list(fields) if keys is None else list(keys)
-        defaults = self.make().tensor_keys
+        fields = list(loss._AcceptedKeys.__dataclass_fields__) if keys is None else keys
         new: dict[str, Any] = {}
-        for field in names:
-            default = getattr(defaults, field)
-            new[field] = [name(k) for k in default] if isinstance(default, list) else name(default)
+        for field in fields:
+            key = getattr(self.make().tensor_keys, field)
+            new[field] = [name(k) for k in key] if isinstance(key, list) else name(key)
         with during(self.name, f"in set_keys(**{new}) ({check!r})"):
             loss.set_keys(**new)
-        moved = TensorDict({}, batch_size=self.data.batch_size, device=self.data.device)
+        moved = TensorDict(batch_size=self.data.batch_size, device=self.data.device)
         for key in leaves(self.data):
             moved.set(name(key), self.data.get(key).clone())
-        with during(
-            self.name, f"with renamed keys ({check!r})", "Read every key from self.tensor_keys."
-        ):
+        doing = f"with renamed keys ({check!r})"
+        with during(self.name, doing, "Read every key from self.tensor_keys."):
             out = self.run(loss, moved)
-        self.equal(out, f"with renamed keys ({check!r})")
+        self.equal(out, doing)
         absent = [key for key in map(unravel_key, loss.in_keys) if moved.get(key, None) is None]
         require(
             not absent,
-            f"{self.name}: after set_keys in_keys still names {absent}. Compute them anew in "
+            f"{self.name}: after set_keys in_keys still names {absent}. Compute them again in "
             "_forward_value_estimator_keys.",
         )
         with during(self.name, "after its keys were renamed, refusing an unknown one"):
-            try:
-                loss.set_keys(no_such_key="x")
-            except ValueError:
-                return
-        raise ContractError(
-            f"{self.name}.set_keys accepts a key of which its _AcceptedKeys know nothing."
-        )
+            self._refuses(
+                lambda: loss.set_keys(no_such_key="x"),
+                ".set_keys accepts a key of which its _AcceptedKeys know nothing",
+            )
 
     def value_estimators(self, value_estimators: Sequence[Any]) -> None:
         for kind in value_estimators:
@@ -429,22 +382,21 @@ class _Loss:
             )
 
     def terminal_states(self) -> None:
-        loss = self.make()
-        keys = [unravel_key(("next", k)) for k in _ends(loss)]
-        if not any(self.data.get(key, None) is not None for key in keys):
+        loss, data = self.make(), self.data.clone()
+        names = [n for n in ("terminated", "done") if hasattr(loss.tensor_keys, n)]
+        ends = [data.get(("next", getattr(loss.tensor_keys, n)), None) for n in names]
+        if not any(end is not None for end in ends):
             return
-        data = self.data.clone()
         first = (0,) * data.ndim
-        for key in keys:
-            if data.get(key, None) is not None:
-                data.get(key)[first] = True
+        for end in ends:
+            if end is not None:
+                end[first] = True
         kept = unravel_key(("next", getattr(loss.tensor_keys, "reward", "reward")))
-        for key in leaves(data):
-            value = data.get(key)
+        for key, value in data.items(True, True):
             if key[0] == "next" and key != kept and value.is_floating_point():
                 value[first] = torch.nan
         out = self.run(loss, data).select(*self.losses)
-        out.sum(reduce=True).backward()
+        self.backward(out)
         gradients = {n: p.grad for n, p in loss.named_parameters() if p.grad is not None}
         for name, value in (*out.items(), *gradients.items()):
             require(
@@ -456,8 +408,7 @@ class _Loss:
     def state_dict(self) -> None:
         loss, other = self.make(), self.make(seed=self.seed + 1)
         at_first = set(loss.state_dict())
-        used = self.run(loss)
-        used.select(*self.losses).sum(reduce=True).backward()
+        self.backward(self.run(loss))
         grown = set(loss.state_dict()) ^ at_first
         require(
             not grown,
@@ -468,45 +419,30 @@ class _Loss:
             other.load_state_dict(loss.state_dict())
         self.equal(self.run(other), "with the state dict of another", self.run(loss))
 
-    def compiled(self) -> None:
-        torch._dynamo.reset()
+    def compile(self) -> None:
+        torch.compiler.reset()
         loss, plain = self.make(), self.make()
-        expected = self.run(plain)
+        expected, where = self.run(plain), "under torch.compile(fullgraph=True)"
         advice = "Leave out of forward what torch.compile cannot trace, e.g. print or .item()."
-        with during(self.name, "under torch.compile(fullgraph=True)", advice):
+        with during(self.name, where, advice):
             actual = self.run(torch.compile(loss, backend="eager", fullgraph=True))
-        self.equal(actual, "under torch.compile(fullgraph=True)", expected)
-        for out in (expected, actual):
-            out.select(*self.losses).sum(reduce=True).backward()
-        for (name, a), (_, b) in zip(
-            plain.named_parameters(), loss.named_parameters(), strict=True
-        ):
-            if a.grad is None or b.grad is None:
-                same = (a.grad is None or not a.grad.any()) and (b.grad is None or not b.grad.any())
-            else:
-                same = torch.allclose(a.grad, b.grad, rtol=self.tolerance, atol=self.tolerance)
+        self.equal(actual, where, expected)
+        self.backward(expected)
+        self.backward(actual)
+        for (name, a), b in zip(plain.named_parameters(), loss.parameters(), strict=True):
+            one, other = (torch.zeros_like(a) if p.grad is None else p.grad for p in (a, b))
             require(
-                same,
-                f"{self.name} under torch.compile(fullgraph=True): the gradient of {name!r} is "
-                "another.",
+                self.close(one, other), f"{self.name} {where}: the gradient of {name!r} is another."
             )
-
-
-def _ends(loss: LossModule) -> list[NestedKey]:
-    """The names of what says that an episode is at its end."""
-    keys = loss.tensor_keys
-    return [getattr(keys, name) for name in ("terminated", "done") if hasattr(keys, name)]
 
 
 def _flat(key: NestedKey) -> NestedKey:
     """``"a"`` becomes ``"other_a"``, also under ``"next"``."""
-    if isinstance(key, str):
-        return f"other_{key}"
-    return (*key[:-1], f"other_{key[-1]}")
+    *path, last = parts(key)
+    return unravel_key((*path, f"other_{last}"))
 
 
 def _nested(key: NestedKey) -> NestedKey:
     """``"a"`` becomes ``("group", "a")``, also under ``"next"``."""
-    if isinstance(key, str):
-        return ("group", key)
-    return ("next", "group", *key[1:]) if key[0] == "next" else ("group", *key)
+    path = parts(key)
+    return ("next", "group", *path[1:]) if path[0] == "next" else ("group", *path)

@@ -11,7 +11,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.planners.novelty import NoveltyTest
-from torchrl_hmcts.testing.claims import ContractError, during, require
+from torchrl_hmcts.testing.contract import during, require, require_alone, require_read
 
 _MANY = 10_000
 _MEMBERS = ("in_keys", "start", "restart", "features", "accept", "relax")
@@ -26,7 +26,7 @@ def check_novelty(novelty: NoveltyTest, states: TensorDictBase) -> None:
     restarted; a search has a copy of its own; relaxing it comes to an end.
 
     Args:
-        novelty (NoveltyTest): the test; it is started anew.
+        novelty (NoveltyTest): the test; it is started again.
         states (TensorDictBase): states ``[m]`` with its ``in_keys``, at least two that differ.
 
     Raises:
@@ -53,59 +53,53 @@ def check_novelty(novelty: NoveltyTest, states: TensorDictBase) -> None:
         f"{name} lacks {missing}. A novelty test has the members of "
         "torchrl_hmcts.planners.NoveltyTest.",
     )
-    for key in novelty.in_keys:
-        require(
-            states.get(key, None) is not None,
-            f"{name} reads {key!r}, which the states do not have. Add it, or correct in_keys.",
-        )
-    m = len(states)
+    require_read(name, novelty, states, "a state")
     with during(name, "reading features"):
         novelty.start(1)
         features = novelty.features(states.clone())
-        single = [novelty.features(states[i : i + 1].clone()) for i in range(m)]
-    good = isinstance(features, np.ndarray) and features.ndim == 2 and len(features) == m
-    if not good or features.dtype.kind not in "biuf":
-        got = (
-            f"{features.dtype} {list(features.shape)}"
-            if isinstance(features, np.ndarray)
-            else type(features).__name__
-        )
-        raise ContractError(
-            f"{name}.features gives {got} for {m} states; it must give a numeric array [{m}, F]."
-        )
-    for i, alone in enumerate(single):
-        require(
-            np.array_equal(alone[0], features[i]),
-            f"{name}.features of state {i} are others alone than among the rest. Let them depend "
-            "on their own state only.",
-        )
+    _require_array(f"{name}.features", features, (len(states), -1), "biuf")
+    require_alone(
+        f"{name}.features",
+        lambda rows: novelty.features(rows.clone()),
+        states,
+        features,
+        "state",
+        "Let them depend on their own state only.",
+    )
     _check_accept(name, novelty, features)
+    _check_relax(name, novelty)
+    statistics = getattr(novelty, "statistics", dict)()
+    good = isinstance(statistics, dict) and all(
+        isinstance(count, (int, float)) for count in statistics.values()
+    )
+    require(good, f"{name}.statistics gives {statistics!r}; it must give a dict of numbers.")
+
+
+def _require_array(what: str, array: object, shape: tuple[int, ...], kinds: str) -> None:
+    """Require a NumPy array of a shape, in which -1 is any number, and of kinds of types."""
+    got = type(array).__name__
+    good = isinstance(array, np.ndarray)
+    if isinstance(array, np.ndarray):
+        got = f"{array.dtype} {list(array.shape)}"
+        good = array.dtype.kind in kinds and len(array.shape) == len(shape)
+        good = good and all(want in (-1, n) for want, n in zip(shape, array.shape, strict=True))
+    kind = "bool" if kinds == "b" else "numeric"
+    require(good, f"{what} gives {got}; it must give a {kind} array {list(shape)}, -1 for any.")
 
 
 def _check_accept(name: str, novelty: NoveltyTest, features: np.ndarray) -> None:
     m = len(features)
-    steps = np.arange(m, dtype=np.int64)
 
     def ask(test: NoveltyTest, root: int, at: int = 0) -> np.ndarray:
         with during(name, "asked about new states"):
-            accepted = test.accept(np.full(m, root, np.int64), features, steps + at)
-        if not isinstance(accepted, np.ndarray) or accepted.dtype != np.bool_:
-            raise ContractError(
-                f"{name}.accept gives {type(accepted).__name__} "
-                f"{getattr(accepted, 'dtype', '')}; it must give a bool array, True where a state "
-                "is novel."
-            )
-        require(
-            accepted.shape == (m,),
-            f"{name}.accept gives {list(accepted.shape)} for {m} states; it must give [{m}].",
-        )
+            accepted = test.accept(np.full(m, root), features, np.arange(m) + at)
+        _require_array(f"{name}.accept", accepted, (m,), "b")
         return accepted
 
     novelty.start(3)
     first = ask(novelty, 0)
     require(first[0], f"{name} refuses the first state of an empty tree. Nothing is known there.")
-    again = ask(novelty, 0, at=m)
-    twice = np.flatnonzero(again & first)
+    twice = np.flatnonzero(ask(novelty, 0, at=m) & first)
     require(
         not len(twice),
         f"{name} accepts state {twice[:1]} a second time. Remember what was accepted, or a search "
@@ -133,7 +127,10 @@ def _check_accept(name: str, novelty: NoveltyTest, features: np.ndarray) -> None
         f"{name}: a copy that was started shares what it knows with the original. Assign new "
         "arrays in start(): each search starts a shallow copy.",
     )
-    for times in range(_MANY + 1):
+
+
+def _check_relax(name: str, novelty: NoveltyTest) -> None:
+    for _ in range(_MANY):
         with during(name, "relaxed"):
             relaxed = novelty.relax(0)
         require(
@@ -141,16 +138,9 @@ def _check_accept(name: str, novelty: NoveltyTest, features: np.ndarray) -> None
             f"{name}.relax gives {relaxed!r}; it must give True, or False if it cannot.",
         )
         if not relaxed:
-            break
-        require(
-            times < _MANY,
-            f"{name}.relax(0) was True {_MANY} times. Give False at last, or an exhausted search "
-            "never ends.",
-        )
-    statistics = getattr(novelty, "statistics", None)
-    if statistics is not None:
-        counts = statistics()
-        good = isinstance(counts, dict) and all(
-            isinstance(count, (int, float)) for count in counts.values()
-        )
-        require(good, f"{name}.statistics gives {counts!r}; it must give a dict of numbers.")
+            return
+    require(
+        False,
+        f"{name}.relax(0) was True {_MANY} times. Give False at last, or an exhausted search never "
+        "ends.",
+    )

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import torch
@@ -15,7 +17,10 @@ from tensordict.utils import NestedKey
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.testing.claims import ContractError, seeded
+from torchrl_hmcts.testing.contract import ContractError, seeded
+
+Episode = tuple[list[TensorDictBase], list[int]]
+"""Steps, and those among them whose states are to be restored."""
 
 
 def check_settable(
@@ -55,26 +60,25 @@ def check_settable(
     name = repr(env) if len(repr(env)) < 120 else type(env).__name__
     episodes = _record(env, num_states, num_steps, seed)
     skipped = {unravel_key(key) for key in unread_keys}
-    tried: list[tuple[str, Any]] = [
-        ("the same instance", lambda: _replay(env, episodes, num_steps, skipped)),
-        ("a second instance", lambda: _replay(make_env(), episodes, num_steps, skipped)),
-    ]
+    tried: dict[str, Callable[[], tuple[NestedKey, int] | None]] = {
+        "the same instance": lambda: _replay(env, episodes, num_steps, skipped),
+        "a second instance": lambda: _replay(make_env(), episodes, num_steps, skipped),
+    }
     if other_process:
-        tried.append(
-            ("a second process", lambda: _elsewhere(make_env, episodes, num_steps, skipped))
-        )
-    for where, replay in tried:
+        tried["a second process"] = lambda: _elsewhere(make_env, episodes, num_steps, skipped)
+    for where, replay in tried.items():
         found = replay()
         if found is None:
             continue
         key, step = found
-        again = _replay(env, episodes, num_steps, skipped, from_reset=seed)
+        repeats = _replay(env, episodes, num_steps, skipped, from_reset=seed) is None
         cause = (
-            "The env is not deterministic: the same seed and actions give another episode. Plan in "
-            "it with chance nodes (chance=ProgressiveWidening()), whose outcomes are sampled."
-            if again is not None
-            else "A part of the state is not stored. Pass a snapshot that stores it, e.g. "
+            "A part of the state is not stored. Pass a snapshot that stores it, e.g. "
             "snapshot=(read, restore) or snapshot=ReplaySnapshot of SettableGymEnv."
+            if repeats
+            else "The env is not deterministic: the same seed and actions give another episode. "
+            "Plan in it with chance nodes (chance=ProgressiveWidening()), whose outcomes are "
+            "sampled."
         )
         raise ContractError(
             f"{name}: in {where}, {step + 1} steps after a state was restored, {key!r} is not "
@@ -82,13 +86,11 @@ def check_settable(
         )
 
 
-def _record(
-    env: EnvBase, num_states: int, num_steps: int, seed: int
-) -> list[tuple[list[TensorDictBase], list[int]]]:
-    """Random episodes, and the steps at which their states are to be restored."""
+def _record(env: EnvBase, num_states: int, num_steps: int, seed: int) -> list[Episode]:
+    """Return random episodes, and the steps at which their states are to be restored."""
     generator = torch.Generator().manual_seed(seed)
     env.set_seed(seed)
-    episodes: list[tuple[list[TensorDictBase], list[int]]] = []
+    episodes: list[Episode] = []
     left = num_states
     while left > 0:
         with seeded(seed + len(episodes)):
@@ -103,68 +105,39 @@ def _record(
 
 def _replay(
     env: EnvBase,
-    episodes: list[tuple[list[TensorDictBase], list[int]]],
+    episodes: list[Episode],
     num_steps: int,
     skipped: set[NestedKey],
     from_reset: int | None = None,
 ) -> tuple[NestedKey, int] | None:
-    """Takes recorded actions again; returns the first entry that differs, and after which step."""
+    """Take recorded actions again; return the first entry that differs, and after which step."""
     if from_reset is not None:
         env.set_seed(from_reset)
     for episode, starts in episodes:
-        for start in [0] if from_reset is not None else starts:
-            if from_reset is not None:
-                td = env.reset()
-            else:
+        for start in starts if from_reset is None else [0]:
+            if from_reset is None:
                 td = env.reset(episode[start].exclude("next", "action").clone(), set_state=True)
+            else:
+                td = env.reset()
             for step, right in enumerate(episode[start : start + num_steps]):
-                td = td.set(env.action_key, right.get(env.action_key))
-                td = env.step(td).get("next")
-                for key in right.get("next").keys(True, True):
-                    if unravel_key(key) in skipped:
-                        continue
-                    if not _same(td.get(key), right.get(("next", *_path(key)))):
+                td = env.step(td.set(env.action_key, right.get(env.action_key))).get("next")
+                after = right.get("next")
+                for key in after.keys(True, True):
+                    if unravel_key(key) not in skipped and not _same(td.get(key), after.get(key)):
                         return key, step
                 td = td.exclude(*env.reward_keys)
     return None
 
 
 def _elsewhere(make_env: Callable[[], EnvBase], *work: Any) -> tuple[NestedKey, int] | None:
+    """Take recorded actions again in a second process."""
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(
-        target=_replay_there,
-        args=(
-            theirs,
-            CloudpickleWrapper(make_env),
-            CloudpickleWrapper(lambda: work),
-        ),  # no shared memory
-        daemon=True,
-    )
-    process.start()
-    theirs.close()
-    try:
-        answer = ours.recv()
-    except EOFError:
-        raise ContractError("The second process died while it restored states.") from None
-    finally:
-        process.join(10)
-    if isinstance(answer, Exception):
-        raise answer
-    return answer  # type: ignore[no-any-return]
-
-
-def _replay_there(
-    connection: Any, make_env: Callable[[], EnvBase], work: Callable[[], Any]
-) -> None:
-    try:
-        connection.send(_replay(make_env(), *work()))
-    except Exception as error:
-        connection.send(error)
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key
+    replay = CloudpickleWrapper(lambda: _replay(make_env(), *work))  # no shared memory
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        try:
+            return pool.submit(replay).result()
+        except BrokenProcessPool:
+            raise ContractError("The second process died while it restored states.") from None
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -9,10 +9,18 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_hmcts.modules.skill_prior import SkillPrior
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
-from torchrl_hmcts.testing.claims import ContractError, during, leaves, require, seeded
+from torchrl_hmcts.testing.contract import (
+    during,
+    leaves,
+    require,
+    require_alone,
+    require_kind,
+    seeded,
+)
 from torchrl_hmcts.testing.loss_checks import MakeLoss, check_loss
 
 
@@ -50,17 +58,18 @@ def check_skill_objective(
     """
     with seeded(0):
         objective = make_objective(lambda key: key)
-    name = type(objective).__name__
-    if not isinstance(objective, SkillObjective):
-        raise ContractError(f"{name} is no SkillObjective. Derive it from that class.")
-    n = len(tensordict)
-    given = tensordict.clone()
-    with during(name, "asked for the reward"), seeded(0):
-        reward = objective.reward(given)
+    name = require_kind(objective, SkillObjective)
+
+    def ask(transitions: TensorDictBase) -> Tensor:
+        with during(name, "asked for the reward"), seeded(0):
+            return objective.reward(transitions)
+
+    given, shape = tensordict.clone(), [*tensordict.batch_size, 1]
+    reward = ask(given)
     require(
-        reward.shape == torch.Size((*tensordict.batch_size, 1)),
-        f"{name}.reward gives {list(reward.shape)} for transitions {list(tensordict.batch_size)}; "
-        f"it must give {[*tensordict.batch_size, 1]}.",
+        list(reward.shape) == shape,
+        f"{name}.reward gives {list(reward.shape)} for transitions {shape[:-1]}; it must give "
+        f"{shape}.",
     )
     require(
         not reward.requires_grad,
@@ -74,14 +83,7 @@ def check_skill_objective(
         f"{name}.reward wrote {sorted(map(str, leaves(given) ^ leaves(tensordict)))} into the "
         "transitions. Select what it reads.",
     )
-    for i in range(n):
-        with seeded(0):
-            alone = objective.reward(tensordict[i : i + 1].clone())
-        require(
-            torch.allclose(alone[0], reward[i], rtol=1e-4, atol=1e-5),
-            f"{name}.reward gives transition {i} {alone[0].item():.6g} alone and "
-            f"{reward[i].item():.6g} among others. Judge each transition by itself.",
-        )
+    require_alone(f"{name}.reward", lambda row: ask(row.clone()), tensordict, reward, "transition")
     check_loss(make_objective, tensordict, **kwargs)
 
 
@@ -102,9 +104,7 @@ def check_skill_prior(prior: SkillPrior) -> None:
         >>> from torchrl_hmcts.testing import check_skill_prior
         >>> check_skill_prior(GrowingSkillPrior(4, num_active=2))
     """
-    name = type(prior).__name__
-    if not isinstance(prior, SkillPrior):
-        raise ContractError(f"{name} is no SkillPrior. Derive it from that class.")
+    name = require_kind(prior, SkillPrior)
     with during(name, "asked for its probabilities"), torch.no_grad():
         probs, log_probs, active = prior.probs(), prior.log_probs(), prior.active()
     require(

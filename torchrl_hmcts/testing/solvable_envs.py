@@ -13,10 +13,26 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-__all__ = ["ChainEnv", "PointMassEnv", "TableEnv"]
+
+class _TinyEnv(EnvBase):
+    """Stateless, batched and settable; its entry ``"state"`` is its whole state."""
+
+    batch_locked = False
+    _supports_set_state = True
+
+    def _begin(self, tensordict: TensorDictBase | None, start: int, set_state: bool) -> TensorDict:
+        """Return the states that a reset gives, those that were asked for or ``start``."""
+        shape = self.batch_size if tensordict is None else tensordict.batch_size
+        state = torch.full(shape, start, dtype=torch.int64, device=self.device)
+        if set_state and tensordict is not None:
+            state = tensordict.get("state").clone()
+        return TensorDict(state=state, batch_size=shape, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is random."""
 
 
-class TableEnv(EnvBase):
+class TableEnv(_TinyEnv):
     """A deterministic (semi-)Markov decision process given by its table of transitions.
 
     Stateless, batched and settable: ``"state"`` (int64 ``[*B]``) is its whole state. With
@@ -41,8 +57,6 @@ class TableEnv(EnvBase):
         (2.0, 3, True)
     """
 
-    batch_locked = False
-    _supports_set_state = True
     gamma = 0.99  # per base step: what a planner takes where it is told nothing else
 
     def __init__(
@@ -114,26 +128,13 @@ class TableEnv(EnvBase):
         return TensorDict(entries, batch_size=tensordict.batch_size, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        shape = self.batch_size if tensordict is None else tensordict.batch_size
-        if kwargs.get("set_state") and tensordict is not None:
-            state = tensordict.get("state")
-        else:
-            state = torch.full(shape, self.start, dtype=torch.int64, device=self.device)
-        return TensorDict(
-            {
-                "state": state.clone(),
-                "action_mask": self._allowed[state] | self._ends[state].unsqueeze(-1),
-                "duration": torch.zeros((*shape, 1), dtype=torch.int64, device=self.device),
-            },
-            batch_size=shape,
-            device=self.device,
-        )
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Nothing is random."""
+        td = self._begin(tensordict, self.start, kwargs.get("set_state", False))
+        td.set("action_mask", self._allowed[td["state"]] | self._ends[td["state"]].unsqueeze(-1))
+        duration = torch.zeros((*td.batch_size, 1), dtype=torch.int64, device=self.device)
+        return td.set("duration", duration)
 
 
-class ChainEnv(EnvBase):
+class ChainEnv(_TinyEnv):
     """Walk along a chain of states; the right end terminates with reward 1.
 
     Action 0 goes left (and stays at state 0), action 1 goes right. Stateless, batched and settable:
@@ -154,9 +155,6 @@ class ChainEnv(EnvBase):
         >>> td["next", "reward"].flatten().tolist()
         [0.0, 1.0]
     """
-
-    batch_locked = False
-    _supports_set_state = True
 
     def __init__(
         self,
@@ -195,15 +193,7 @@ class ChainEnv(EnvBase):
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        shape = self.batch_size if tensordict is None else tensordict.batch_size
-        if kwargs.get("set_state") and tensordict is not None:
-            state = tensordict.get("state").clone()
-        else:
-            state = torch.zeros(shape, dtype=torch.int64, device=self.device)
-        return TensorDict({"state": state}, batch_size=shape, device=self.device)
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Nothing is random."""
+        return self._begin(tensordict, 0, kwargs.get("set_state", False))
 
 
 class PointMassEnv(EnvBase):

@@ -14,7 +14,16 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from torchrl_hmcts.testing.claims import ContractError, different, during, leaves, require, seeded
+from torchrl_hmcts.testing.contract import (
+    during,
+    leaves,
+    require,
+    require_action,
+    require_alone,
+    require_read,
+    require_same,
+    seeded,
+)
 from torchrl_hmcts.transforms.option import OptionTransform
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
@@ -28,7 +37,7 @@ def check_worker(
     deterministic: bool = True,
     tolerance: float = 1e-6,
 ) -> None:
-    """Check that a worker can carry options out in an env.
+    """Check that a worker can execute options in an env.
 
     It reads what the env has and writes actions of its spec, for every option; it changes nothing
     else of its input and leaves its own parameters alone; it takes any batch shape, and what it
@@ -65,43 +74,34 @@ def check_worker(
     options = torch.arange(states.batch_size.numel()).reshape(states.batch_size) % num_options
     given = states.clone().set(skill_key, options.to(states.device or "cpu"))
     weights = _weights(worker)
-    shapes = [given] if env.batch_locked else [given, given.reshape(2, -1), given[:1]]
-    for td in shapes:
+    keys = set(map(unravel_key, env.action_keys))
+    random = (
+        "Read nothing of other elements (no batch statistics), and draw random numbers from "
+        "torch's generator or your own, seeded; for a random worker pass deterministic=False."
+    )
+    for td in [given] if env.batch_locked else [given, given.reshape(2, -1), given[:1]]:
         out = _act(name, worker, td)
-        for key in map(unravel_key, env.action_keys):
-            action = out.get(key, None)
-            require(
-                action is not None,
-                f"{name} wrote no {key!r} for a batch of shape {list(td.batch_size)}.",
-            )
-            spec = env.full_action_spec_unbatched[key].expand(
-                (*td.batch_size, *env.full_action_spec_unbatched[key].shape)
-            )
-            require(
-                action.shape == spec.shape and action.dtype == spec.dtype and spec.is_in(action),
-                f"{name} wrote {key!r} = {action.dtype} {list(action.shape)} for a batch of shape "
-                f"{list(td.batch_size)}, which does not fit the spec {spec}.",
-            )
-        where = different(td, out, leaves(td) & leaves(out))
+        require_action(name, env, out)
+        message = "changed <key> of its input. A worker writes actions; the env writes the rest."
+        require_same(td, out, f"{name} {message}")
+        message = f"the actions of two calls with the same seed differ in <key>. {random}"
+        require_same(out, _act(name, worker, td), f"{name}: {message}", keys)
+    for key, now in _weights(worker).items():
         require(
-            where is None and leaves(td) <= leaves(out),
-            f"{name} changed {where and where[0]!r} of its input. A worker writes actions; the "
-            "env writes the rest.",
-        )
-        _same(name, env, out, _act(name, worker, td), 0.0, "of two calls with the same seed")
-    for key, before in weights.items():
-        require(
-            torch.equal(before, _weights(worker)[key]),
+            torch.equal(weights[key], now),
             f"{name} changed its own {key!r} while acting. Call eval() first, or keep running "
             "statistics out of it.",
         )
     _check_option(name, worker, env, num_options, skill_key)
     if deterministic and not env.batch_locked:
         together = _act(name, worker, given)
-        for b in range(given.batch_size.numel()):
+        for b, option in enumerate(options.tolist()):
+            message = (
+                f"the actions of an element alone and among others (option {option}) differ: "
+                f"<other> and <one>. {random}"
+            )
             alone = _act(name, worker, given[b])
-            told = f"of an element alone and among others (option {int(options[b])})"
-            _same(name, env, together[b], alone, tolerance, told)
+            require_same(together[b], alone, f"{name}: {message}", keys, tolerance)
 
 
 def _check_option(
@@ -123,7 +123,7 @@ def _check_option(
         trajectory_keys=keys,
     )
     macro = TransformedEnv(env, options, auto_unwrap=False)
-    with during(name, "carrying an option out"), torch.no_grad():
+    with during(name, "executing an option"), torch.no_grad():
         with seeded(0):
             env.set_seed(0)
             td = macro.reset()
@@ -134,35 +134,32 @@ def _check_option(
             td = env.reset()
             for i in range(num_steps):
                 worker(td.set(skill_key, option))
-                td = env.step(td)
-                step = block[..., i]
+                td, step = env.step(td), block[..., i]
                 ran = step.get(OptionTrajectory.MASK_KEY)
-                for key in keys:
-                    one, two = td.get(key)[ran], step.get(key)[ran]
-                    close = one.shape == two.shape and torch.allclose(one.double(), two.double())
-                    require(
-                        close,
-                        f"{name} writes {key!r} = {two!s:.100} in base step {i} of an option and "
-                        f"{one!s:.100} in a plain rollout: its memory is lost. Let it write under "
-                        f"'next' what it reads in the next step, and keep nothing in itself.",
-                    )
+                require_same(
+                    td.select(*keys)[ran],
+                    step.select(*keys)[ran],
+                    f"{name} writes <key> = <other> in base step {i} of an option and <one> in a "
+                    "plain rollout: its memory is lost. Let it write under 'next' what it reads in "
+                    "the next step, and keep nothing in itself.",
+                    tolerance=1e-5,
+                )
                 if not block.get(OptionTrajectory.MASK_KEY)[..., i + 1 :].any():
                     return
                 td = step_mdp(td)
 
 
 def _states(env: EnvBase, num_options: int) -> TensorDictBase:
-    """Roots after no, one, two ... random steps; a batch for a stateless env."""
+    """Return roots; of a stateless env a batch, after three random steps."""
     with seeded(0):
         env.set_seed(0)
         if env.batch_locked or env.batch_size:
             td = env.reset()
-            return td.exclude("next", *env.action_keys)
-        n = 2 * num_options
-        td = env.reset(TensorDict(batch_size=[n]))
-        for _ in range(3):
-            _, td = env.step_and_maybe_reset(env.rand_action(td))
-        return td.exclude("next", *env.action_keys)
+        else:
+            td = env.reset(TensorDict(batch_size=[2 * num_options]))
+            for _ in range(3):
+                _, td = env.step_and_maybe_reset(env.rand_action(td))
+    return td.exclude("next", *env.action_keys)
 
 
 def _weights(worker: object) -> dict[str, Tensor]:
@@ -181,19 +178,6 @@ def _act(
         with torch.no_grad(), seeded(0):
             out = worker(td)
     return td if out is None else out
-
-
-def _same(
-    name: str, env: EnvBase, one: TensorDictBase, two: TensorDictBase, tolerance: float, told: str
-) -> None:
-    where = different(one, two, list(map(unravel_key, env.action_keys)), tolerance)
-    require(
-        where is None,
-        f"{name}: the actions {told} differ: {where and one.get(where[0])!s:.100} and "
-        f"{where and two.get(where[0])!s:.100}. Read nothing of other elements (no batch "
-        "statistics), and draw random numbers from torch's generator or your own, seeded; for a "
-        "random worker pass deterministic=False.",
-    )
 
 
 def check_termination(
@@ -233,38 +217,30 @@ def check_termination(
             f"check_termination needs a tensordict [m] of states; got batch size "
             f"{list(tensordict.batch_size)}."
         )
-    for key in getattr(termination, "in_keys", ()):
+    require_read(name, termination, tensordict, "the tensordict")
+    m = len(tensordict)
+
+    def ask(td: TensorDictBase) -> Tensor:
+        with during(name, f"asked about a batch of shape {list(td.batch_size)}"), torch.no_grad():
+            return termination(td)
+
+    for td in (tensordict.clone(), tensordict.clone().reshape(1, m)):
+        held, shape = td.clone(), td.batch_size
+        ends = ask(td)
+        got = f"{ends.dtype} {list(ends.shape)}" if isinstance(ends, Tensor) else repr(ends)
         require(
-            tensordict.get(key, None) is not None,
-            f"{name} reads {key!r}, which the tensordict does not have. Add it.",
+            got in (f"torch.bool {list(shape)}", f"torch.bool {[*shape, 1]}"),
+            f"{name} must give bool {list(shape)} or {[*shape, 1]}, True where the option ends; "
+            f"got {got}.",
         )
-    for shape in ((len(tensordict),), (1, len(tensordict))):
-        td = tensordict.clone().reshape(shape)
-        held = td.clone()
-        with during(name, f"asked about a batch of shape {list(shape)}"):
-            with torch.no_grad():
-                ends = termination(td)
-        good = isinstance(ends, Tensor) and ends.dtype == torch.bool
-        good = good and ends.shape in (torch.Size(shape), torch.Size((*shape, 1)))
-        if not good:
-            got = f"{ends.dtype} {list(ends.shape)}" if isinstance(ends, Tensor) else repr(ends)
-            raise ContractError(
-                f"{name} must give bool {list(shape)} or {[*shape, 1]}, True where the option "
-                f"ends; got {got}."
-            )
-        where = different(held, td, leaves(held))
-        require(
-            where is None and leaves(td) == leaves(held),
-            f"{name} changed its input. Write to a copy: td.copy().",
-        )
+        message = f"{name} changed its input: <key> is <other>. Write to a copy: td.copy()."
+        require_same(held, td, message, leaves(td) | leaves(held))
     if deterministic:
-        with torch.no_grad():
-            together = termination(tensordict.clone()).reshape(-1)
-            for i in range(len(tensordict)):
-                alone = termination(tensordict[i : i + 1].clone()).reshape(-1)
-                require(
-                    alone[0] == together[i],
-                    f"{name} says {bool(together[i])} of element {i} among others and "
-                    f"{bool(alone[0])} of it alone. Ask about each element by itself; for a random "
-                    "condition pass deterministic=False.",
-                )
+        require_alone(
+            name,
+            lambda row: ask(row.clone()).reshape(-1),
+            tensordict,
+            ask(tensordict.clone()).reshape(-1),
+            "element",
+            "Ask about each element by itself; for a random condition pass deterministic=False.",
+        )

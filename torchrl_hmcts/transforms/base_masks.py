@@ -7,6 +7,8 @@ from tensordict.utils import NestedKey
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
+from torchrl_hmcts.nesting import parts
+
 _CONVENTION = "action_mask"  # TorchRL's name
 
 
@@ -15,33 +17,28 @@ class BaseMasks:
 
     Above an OptionTransform the action is the option, and what is written under ``"action_mask"``
     there is the mask of the options. Below it, worker, termination and env see the base env's.
-
-    Args:
-        env: with all transforms below the OptionTransform.
     """
 
     def __init__(self, env: EnvBase) -> None:
         shown = list(map(unravel_key, env.full_observation_spec.keys(True, True)))
         self.renamed: dict[NestedKey, NestedKey] = {}
         for key in shown:
-            *path, last = _parts(key)
-            if last != _CONVENTION:
-                continue
-            while (new := unravel_key((*path, f"base_{last}"))) in shown:
-                last = f"base_{last}"
-            self.renamed[key] = new
+            *path, last = parts(key)
+            if last == _CONVENTION:
+                while (new := unravel_key((*path, f"base_{last}"))) in shown:
+                    last = f"base_{last}"
+                self.renamed[key] = new
 
     def hide(self, td: TensorDictBase) -> TensorDictBase:
         """Rename the base masks in what the env wrote, for those above; in place."""
         for key, new in self.renamed.items():
-            mask = td.get(key, None)
+            mask = td.pop(key, None)
             if mask is not None:
-                del td[key]
                 td.set(new, mask)
         return td
 
     def show(self, td: TensorDictBase) -> TensorDictBase:
-        """Write them under their own name for the env and the worker; in place."""
+        """Write them under their own name too, for the env and the worker; in place."""
         for key, new in self.renamed.items():
             mask = td.get(new, None)
             if mask is not None:
@@ -55,11 +52,3 @@ class BaseMasks:
                 spec[new] = spec[key]
                 del spec[key]
         return spec
-
-    def name(self, key: NestedKey) -> NestedKey:
-        """Return the name of an entry of the base env above the OptionTransform."""
-        return self.renamed.get(key, key)
-
-
-def _parts(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
-from torchrl.data import TensorSpec, Unbounded
-from torchrl.envs import Transform
+from tensordict.utils import NestedKey
+from torchrl.data import Composite, Unbounded
+
+from torchrl_hmcts.checks import nested_key
+from torchrl_hmcts.nesting import given
+from torchrl_hmcts.transforms.env_transform import EnvTransform
 
 
-class DisplacementTransform(Transform):
+class DisplacementTransform(EnvTransform):
     r"""Writes how far an entry has moved since the current skill began.
 
     .. math:: \Delta_t = x_t - x_{t_0}, \qquad t_0 = \text{the step at which the skill was drawn}
@@ -54,37 +57,30 @@ class DisplacementTransform(Transform):
         origin_key: NestedKey = "origin",
         skill_step_key: NestedKey | None = "skill_step",
     ) -> None:
-        self.in_key = unravel_key(in_key)
-        self.out_key = unravel_key(out_key)
-        self.origin_key = unravel_key(origin_key)
-        self.skill_step_key = None if skill_step_key is None else unravel_key(skill_step_key)
+        self.in_key = nested_key("DisplacementTransform", "in_key", in_key)
+        self.out_key = nested_key("DisplacementTransform", "out_key", out_key)
+        self.origin_key = nested_key("DisplacementTransform", "origin_key", origin_key)
+        self.skill_step_key: NestedKey | None = None
+        if skill_step_key is not None:
+            self.skill_step_key = nested_key(
+                "DisplacementTransform", "skill_step_key", skill_step_key
+            )
         super().__init__(in_keys=[self.in_key], out_keys=[self.out_key, self.origin_key])
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         position = tensordict_reset.get(self.in_key)
-        partial = any(
-            (key if isinstance(key, str) else key[-1]) == "_reset"
-            for key in tensordict.keys(True, True)
-        )
-        origin = None if partial else tensordict.get(self.origin_key, None)
+        origin = given(tensordict, self.origin_key)
         if origin is None:
             origin = position.clone()
         tensordict_reset.set(self.origin_key, origin)
-        tensordict_reset.set(self.out_key, position - origin)
-        return tensordict_reset
+        return tensordict_reset.set(self.out_key, position - origin)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        origin = tensordict.get(self.origin_key, None)
-        if origin is None:
-            raise KeyError(
-                f"DisplacementTransform carries the origin in the tensordict, but "
-                f"{self.origin_key!r} is missing from the one to step. Start from env.reset()."
-            )
+        origin = self._carried(tensordict, self.origin_key)
         next_tensordict.set(self.origin_key, origin)
-        next_tensordict.set(self.out_key, next_tensordict.get(self.in_key) - origin)
-        return next_tensordict
+        return next_tensordict.set(self.out_key, next_tensordict.get(self.in_key) - origin)
 
     def _post_step_mdp_hooks(
         self, tensordict: TensorDictBase, tensordict_: TensorDictBase
@@ -99,36 +95,23 @@ class DisplacementTransform(Transform):
             tensordict_.set(self.out_key, position - origin)
         return tensordict, tensordict_
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        raise RuntimeError(
-            "DisplacementTransform follows an env from step to step; stored data hold the "
-            "displacement already. Append it to a TransformedEnv instead of a replay buffer."
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        read = [key for key in (self.in_key, self.skill_step_key) if key is not None]
+        self._require(
+            observation_spec.keys(True, True),
+            *read,
+            advice="Put it after the SkillTransform, or pass skill_step_key=None to measure from "
+            "the reset.",
         )
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        keys = set(observation_spec.keys(True, True))
-        for key in (self.in_key, self.skill_step_key):
-            if key is not None and key not in keys:
-                raise KeyError(
-                    f"DisplacementTransform reads {key!r}, which the env before it does not write; "
-                    f"it writes {sorted(map(str, keys))}. Put it after the SkillTransform, or pass "
-                    "skill_step_key=None to measure from the reset."
-                )
         like = observation_spec[self.in_key]
         for key in (self.out_key, self.origin_key):
             observation_spec[key] = Unbounded(like.shape, dtype=like.dtype, device=like.device)
         return observation_spec
 
-    def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
         like = self.parent.full_observation_spec[self.in_key]
         state_spec[self.origin_key] = Unbounded(like.shape, dtype=like.dtype, device=like.device)
         return state_spec
 
-    def _check_batched_worker_compat(self) -> None:
-        if self.skill_step_key is not None:
-            raise RuntimeError(
-                "DisplacementTransform moves its origin between two steps, which the workers of a "
-                "SerialEnv or ParallelEnv do not do. Put it outside: "
-                "TransformedEnv(ParallelEnv(n, make_env), Compose(SkillTransform(...), "
-                "DisplacementTransform(...)))."
-            )
+    def _stays_outside(self) -> str | None:
+        return None if self.skill_step_key is None else "moves its origin between two steps"

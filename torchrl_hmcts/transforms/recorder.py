@@ -11,13 +11,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, ReplayBuffer
-from torchrl.envs import Transform
+from torchrl.data import Composite
 
+from torchrl_hmcts.checks import instance, nested_key
+from torchrl_hmcts.transforms.env_transform import EnvTransform
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
 
-class OptionRecorder(Transform):
+class OptionRecorder(EnvTransform):
     r"""Keeps the base transitions that options consist of, wherever the options are taken.
 
     Appended after an :class:`OptionTransform` that hands out its base transitions, it takes them
@@ -27,15 +28,14 @@ class OptionRecorder(Transform):
     .. math:: \Delta_t = x_t - x_{t_0}, \qquad t_0 = \text{the option's first base step}
 
     as :class:`DisplacementTransform` writes it in the env of a skill's training. What is simulated
-    by a planner is recorded like what is carried out, so that search itself feeds the training of
-    its worker. The env gives the same as without it.
+    by a planner is recorded like what is executed, so that search itself feeds the training of its
+    worker. The transitions are kept until :meth:`take` is called. The env gives the same as without
+    it.
 
     Args:
         keys (sequence of NestedKey): entries of a base transition to store, e.g. the ``in_keys`` of
             the loss: ``"velocity"``, ``"action"``, ``("next", "velocity")``. ``skill_key`` and
             ``displacement_key``, under ``"next"`` too, are written by the recorder.
-        replay_buffer (ReplayBuffer, optional): extended at every macro-step. Default ``None``: the
-            recorder keeps the transitions until :meth:`take` is called, which is faster.
         position_key (NestedKey): entry ``[*B, D]`` whose displacement is measured. Default
             ``"position"``; read only if ``displacement_key`` is among the ``keys``.
         displacement_key (NestedKey): displacement to write, ``[n, D]`` in the units of the
@@ -69,29 +69,25 @@ class OptionRecorder(Transform):
     def __init__(
         self,
         keys: Sequence[NestedKey],
-        replay_buffer: ReplayBuffer | None = None,
         *,
         position_key: NestedKey = "position",
         displacement_key: NestedKey = "displacement",
         skill_key: NestedKey = "skill",
     ) -> None:
         super().__init__(in_keys=[OptionTrajectory.KEY], out_keys=[])
-        self.keys = [unravel_key(key) for key in keys]
-        self.position_key = unravel_key(position_key)
-        self.displacement_key = unravel_key(displacement_key)
-        self.skill_key = unravel_key(skill_key)
-        self.replay_buffer = replay_buffer
+        instance("OptionRecorder", "keys", keys, list, tuple)
+        self.keys = [nested_key("OptionRecorder", "keys", key) for key in keys]
+        self.position_key = nested_key("OptionRecorder", "position_key", position_key)
+        self.displacement_key = nested_key("OptionRecorder", "displacement_key", displacement_key)
+        self.skill_key = nested_key("OptionRecorder", "skill_key", skill_key)
         self.num_base_steps = 0
         """Base steps recorded so far, an int."""
-        skill = (self.skill_key, _next(self.skill_key))
-        self._skill_keys = [key for key in self.keys if key in skill]
-        displacement = (self.displacement_key, _next(self.displacement_key))
-        self._displacement_keys = [key for key in self.keys if key in displacement]
-        made = {*self._skill_keys, *self._displacement_keys}
-        self._copied_keys = [key for key in self.keys if key not in made]
-        needed = list(self._copied_keys)
-        if self._displacement_keys:
-            needed += [self.position_key, _next(self.position_key)]
+        self._next_position = _next(self.position_key)
+        moves = (self.displacement_key, _next(self.displacement_key))
+        made = {self.skill_key, _next(self.skill_key), *moves}
+        needed = [key for key in self.keys if key not in made]
+        if any(key in moves for key in self.keys):
+            needed += [self.position_key, self._next_position]
         self.trajectory_keys: list[NestedKey] = list(dict.fromkeys(needed))
         """What the ``OptionTransform`` must hand out: its argument of the same name."""
         if not self.trajectory_keys:
@@ -113,8 +109,6 @@ class OptionRecorder(Transform):
         skill = skill.clone()  # its own: a planner may use the memory of its options again
         self._blocks.append((block.reshape(-1, block.shape[-1]), skill.reshape(-1)))
         self.num_base_steps += int(block.get(OptionTrajectory.MASK_KEY).sum())
-        if self.replay_buffer is not None:
-            self.replay_buffer.extend(self.take())
         return next_tensordict
 
     def _reset(
@@ -135,50 +129,35 @@ class OptionRecorder(Transform):
         blocks, skills = zip(*self._blocks, strict=True)
         self._blocks = []
         block: TensorDictBase = torch.cat(blocks) if len(blocks) > 1 else blocks[0]  # [m, T]
+        skill = torch.cat(skills)
         mask = block.get(OptionTrajectory.MASK_KEY)
         out = TensorDict(batch_size=[int(mask.sum())], device=block.device)
-        for key in self._copied_keys:
-            out.set(key, block.get(key)[mask])
-        if self._skill_keys:
-            skill = torch.cat(skills).unsqueeze(-1).expand(mask.shape)[mask]
-            for key in self._skill_keys:
-                out.set(key, skill.clone())
-        if self._displacement_keys:
-            position = block.get(self.position_key)  # [m, T, D]
-            origin = position[:, :1]
-            for key in self._displacement_keys:
-                is_next = key != self.displacement_key
-                moved = block.get(_next(self.position_key)) if is_next else position
-                out.set(key, (moved - origin)[mask])
+        for key in self.keys:
+            if key in (self.skill_key, _next(self.skill_key)):
+                entry = skill.unsqueeze(-1).expand(mask.shape)
+            elif key in (self.displacement_key, _next(self.displacement_key)):
+                where = self.position_key if key == self.displacement_key else self._next_position
+                entry = block.get(where) - block.get(self.position_key)[:, :1]
+            else:
+                entry = block.get(key)
+            out.set(key, entry[mask])
         return out
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined: the recorder listens to an env."""
-        raise RuntimeError(
-            "OptionRecorder records the options an env takes; stored data hold the transitions "
-            "already. Append it to a TransformedEnv, after the OptionTransform."
-        )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         key = OptionTrajectory.KEY
         handed = observation_spec[key].keys(True, True) if key in observation_spec.keys() else ()
-        missing = [key for key in self.trajectory_keys if key not in set(handed)]
-        if missing:
-            raise KeyError(
-                f"OptionRecorder records {missing}, which the env before it does not hand out. Put "
-                "it after an OptionTransform(..., trajectory_keys=recorder.trajectory_keys)."
-            )
+        self._require(
+            handed,
+            *self.trajectory_keys,
+            advice="Put it after an OptionTransform with trajectory_keys=recorder.trajectory_keys.",
+        )
         observation_spec = observation_spec.clone()
         del observation_spec[key]
         return observation_spec
 
-    def _check_batched_worker_compat(self) -> None:
-        raise RuntimeError(
-            "OptionRecorder in a worker of a SerialEnv or ParallelEnv would record out of your "
-            "reach. Put it outside: TransformedEnv(ParallelEnv(n, make_env), "
-            "Compose(OptionTransform(...), OptionRecorder(...)))."
-        )
+    def _stays_outside(self) -> str | None:
+        return "hands over here what it records"
 
 
 def _next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)
+    return unravel_key(("next", key))

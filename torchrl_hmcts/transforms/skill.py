@@ -6,15 +6,17 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.data import Bounded, Categorical, Composite
 
+from torchrl_hmcts.checks import nested_key, whole_number
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
+from torchrl_hmcts.nesting import given
+from torchrl_hmcts.transforms.env_transform import EnvTransform, count_spec, zero_count
 
 
-class SkillTransform(Transform):
+class SkillTransform(EnvTransform):
     r"""Samples a skill at reset and, mini-episode after mini-episode, again every few steps.
 
     .. math:: z \sim p(z) \quad \text{at reset and whenever } k \text{ steps were taken with it}
@@ -22,7 +24,7 @@ class SkillTransform(Transform):
     Writes two entries: the skill, int64 ``[*B]``, and ``skill_step``, int64 ``[*B, 1]``, the base
     steps taken with it so far. Each batch element has its own mini-episodes. On the last transition
     of one, ``("next", "skill")`` is still the old skill, so that values are bootstrapped with the
-    skill that acted; the next root holds the new one. Episodes go on: nothing is marked as done.
+    skill that acted; the next root holds the new one. Episodes continue: nothing is done.
 
     A reset draws new skills where it resets. To choose the skill, reset with it: a reset
     tensordict that holds a skill and no ``"_reset"`` mask keeps its skill (and ``skill_step``).
@@ -74,31 +76,23 @@ class SkillTransform(Transform):
         prior: SkillPrior | Sequence[float] | Tensor | None = None,
         seed: int | None = None,
     ) -> None:
-        if num_skills < 1:
-            raise ValueError(
-                f"SkillTransform needs at least one skill to sample; got num_skills={num_skills}."
+        self.num_skills = whole_number("SkillTransform", "num_skills", num_skills, least=1)
+        self.max_skill_steps: int | None = None
+        if max_skill_steps is not None:
+            self.max_skill_steps = whole_number(
+                "SkillTransform", "max_skill_steps", max_skill_steps, least=1
             )
-        if max_skill_steps is not None and max_skill_steps < 1:
-            raise ValueError(
-                "SkillTransform needs mini-episodes of at least one base step; got "
-                f"max_skill_steps={max_skill_steps}. Pass None for one skill per episode."
-            )
-        self.skill_key = unravel_key(skill_key)
-        self.skill_step_key = unravel_key(skill_step_key)
+        self.skill_key = nested_key("SkillTransform", "skill_key", skill_key)
+        self.skill_step_key = nested_key("SkillTransform", "skill_step_key", skill_step_key)
         super().__init__(in_keys=[], out_keys=[self.skill_key, self.skill_step_key])
-        self.num_skills = int(num_skills)
-        self.max_skill_steps = None if max_skill_steps is None else int(max_skill_steps)
-        live, fixed = None, None
-        if isinstance(prior, SkillPrior):
-            live = as_skill_prior("SkillTransform", prior, num_skills)
-        else:
-            fixed = check_prior("SkillTransform", prior, num_skills)
+        live = isinstance(prior, SkillPrior)
+        made = None if prior is None else as_skill_prior("SkillTransform", prior, self.num_skills)
         # Past nn.Module.__setattr__: a sub-module would be saved and moved with the env.
-        self.__dict__["skill_prior"] = live
-        self.register_buffer("prior", fixed)
+        self.__dict__["skill_prior"] = made if live else None
+        self.register_buffer("prior", None if live or made is None else made.probs())
         self.generator: torch.Generator | None = None
         if seed is not None:
-            self.set_seed(seed)
+            self.set_seed(whole_number("SkillTransform", "seed", seed))
 
     def set_seed(self, seed: int) -> None:
         """Gives the transform its own generator, seeded with ``seed``."""
@@ -123,29 +117,19 @@ class SkillTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        shape, device = tensordict_reset.batch_size, tensordict_reset.device
-        partial = any("_reset" in _last(key) for key in tensordict.keys(True, True))
-        skill = None if partial else tensordict.get(self.skill_key, None)
+        skill = given(tensordict, self.skill_key)
         step = None if skill is None else tensordict.get(self.skill_step_key, None)
         if skill is None:
-            skill = self.sample(shape, device)
+            skill = self.sample(tensordict_reset.batch_size, tensordict_reset.device)
         if step is None:
-            step = torch.zeros((*shape, 1), dtype=torch.int64, device=device)
+            step = zero_count(tensordict_reset)
         tensordict_reset.set(self.skill_key, skill)
-        tensordict_reset.set(self.skill_step_key, step)
-        return tensordict_reset
+        return tensordict_reset.set(self.skill_step_key, step)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        skill = tensordict.get(self.skill_key, None)
-        step = tensordict.get(self.skill_step_key, None)
-        if skill is None or step is None:
-            raise KeyError(
-                f"SkillTransform carries the skill in the tensordict, but {self.skill_key!r} or "
-                f"{self.skill_step_key!r} is missing from the one to step. Start from env.reset()."
-            )
-        next_tensordict.set(self.skill_key, skill)
-        next_tensordict.set(self.skill_step_key, step + 1)
-        return next_tensordict
+        next_tensordict.set(self.skill_key, self._carried(tensordict, self.skill_key))
+        step = self._carried(tensordict, self.skill_step_key)
+        return next_tensordict.set(self.skill_step_key, step + 1)
 
     def _post_step_mdp_hooks(
         self, tensordict: TensorDictBase, tensordict_: TensorDictBase
@@ -168,40 +152,23 @@ class SkillTransform(Transform):
             tensordict_.set(self.skill_step_key, step.masked_fill(ended, 0))
         return tensordict, tensordict_
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        raise RuntimeError(
-            "SkillTransform samples skills while an env runs; stored data hold the skills already. "
-            "Append it to a TransformedEnv instead of a replay buffer."
-        )
-
-    def _add_specs(self, spec: TensorSpec) -> TensorSpec:
-        shape, device = spec.shape, spec.device
-        spec[self.skill_key] = Categorical(
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        shape, device = state_spec.shape, state_spec.device
+        state_spec[self.skill_key] = Categorical(
             self.num_skills, shape=shape, dtype=torch.int64, device=device
         )
-        step_shape = torch.Size([*shape, 1])
-        if self.max_skill_steps is None:
-            step = Unbounded(step_shape, dtype=torch.int64, device=device)
-        else:
-            step = Bounded(
-                0, self.max_skill_steps, shape=step_shape, dtype=torch.int64, device=device
+        state_spec[self.skill_step_key] = count_spec(state_spec)
+        if self.max_skill_steps is not None:
+            state_spec[self.skill_step_key] = Bounded(
+                0, self.max_skill_steps, shape=(*shape, 1), dtype=torch.int64, device=device
             )
-        spec[self.skill_step_key] = step
-        return spec
+        return state_spec
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        return self._add_specs(observation_spec)
+    transform_observation_spec = transform_state_spec
 
-    def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
-        return self._add_specs(state_spec)
-
-    def _check_batched_worker_compat(self) -> None:
-        if self.max_skill_steps is not None or self.skill_prior is not None:
-            raise RuntimeError(
-                "SkillTransform draws new skills between two steps, which the workers of a "
-                "SerialEnv or ParallelEnv do not do. Put it outside: "
-                "TransformedEnv(ParallelEnv(n, make_env), SkillTransform(...))."
-            )
+    def _stays_outside(self) -> str | None:
+        draws = self.max_skill_steps is not None or self.skill_prior is not None
+        return "draws new skills between two steps" if draws else None
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Returns the state of its own generator, if it has one, for the state dict."""
@@ -213,27 +180,3 @@ class SkillTransform(Transform):
             if self.generator is None:
                 self.generator = torch.Generator()
             self.generator.set_state(state["generator"])
-
-
-def check_prior(
-    owner: str, prior: Sequence[float] | Tensor | None, num_skills: int
-) -> Tensor | None:
-    """Returns the prior as normalised probabilities ``[Z]``, or None for the uniform one."""
-    if prior is None:
-        return None
-    weights = torch.as_tensor(prior, dtype=torch.get_default_dtype()).detach().clone()
-    if weights.shape != (num_skills,):
-        raise ValueError(
-            f"{owner} needs one prior probability per skill, shape ({num_skills},); got shape "
-            f"{tuple(weights.shape)}."
-        )
-    if not (torch.isfinite(weights).all() and (weights > 0).all()):
-        raise ValueError(
-            f"{owner} needs positive, finite prior probabilities, since log p(z) enters the "
-            f"reward; got {weights.tolist()}."
-        )
-    return weights / weights.sum()
-
-
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Binary, TensorSpec
-from torchrl.envs import Transform
+from torchrl.data import Binary, Composite
 
+from torchrl_hmcts.checks import instance, nested_key
 from torchrl_hmcts.modules.skill_prior import SkillPrior
+from torchrl_hmcts.transforms.env_transform import EnvTransform
 
 
-class SkillMaskTransform(Transform):
+class SkillMaskTransform(EnvTransform):
     r"""Writes which options may be taken: those whose skill the prior has switched on.
 
     .. math:: \text{mask}(z) = [\,p(z) > 0\,]
@@ -53,12 +54,8 @@ class SkillMaskTransform(Transform):
     """
 
     def __init__(self, prior: SkillPrior, mask_key: NestedKey = "action_mask") -> None:
-        if not isinstance(prior, SkillPrior):
-            raise TypeError(
-                "SkillMaskTransform asks a SkillPrior which skills are on; got "
-                f"{type(prior).__name__}. Pass e.g. FixedSkillPrior(4, [1.0, 1.0, 0.0, 0.0])."
-            )
-        self.mask_key = unravel_key(mask_key)
+        instance("SkillMaskTransform", "prior", prior, SkillPrior)
+        self.mask_key = nested_key("SkillMaskTransform", "mask_key", mask_key)
         super().__init__(in_keys=[], out_keys=[self.mask_key])
         # Past nn.Module.__setattr__: a sub-module would be saved and moved with the env.
         self.__dict__["prior"] = prior
@@ -81,38 +78,21 @@ class SkillMaskTransform(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.mask(next_tensordict)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        raise RuntimeError(
-            "SkillMaskTransform says which skills may be taken while an env runs; what a replay "
-            "buffer holds has been taken. Append it to a TransformedEnv instead."
-        )
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        self._check_options()
-        shape = torch.Size([*observation_spec.shape, self.prior.num_skills])
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        number = self.prior.num_skills
+        for key in () if self.parent is None else self.parent.action_keys:
+            options = getattr(self.parent.full_action_spec[key].space, "n", number)
+            if int(options) != number:
+                raise ValueError(
+                    f"SkillMaskTransform says of {number} skills which are on, but the action "
+                    f"{key!r} has {int(options)} options. Build the OptionTransform with "
+                    f"num_options={number}, and append the mask after it."
+                )
+        shape = torch.Size([*observation_spec.shape, number])
         observation_spec[self.mask_key] = Binary(
-            self.prior.num_skills, shape=shape, dtype=torch.bool, device=observation_spec.device
+            number, shape=shape, dtype=torch.bool, device=observation_spec.device
         )
         return observation_spec
 
-    def _check_options(self) -> None:
-        """Raises ValueError unless the env has one option per skill."""
-        parent = self.parent
-        if parent is None:
-            return
-        for key in parent.action_keys:
-            space = parent.full_action_spec[key].space
-            number = getattr(space, "n", None)
-            if number is not None and int(number) != self.prior.num_skills:
-                raise ValueError(
-                    f"SkillMaskTransform says of {self.prior.num_skills} skills which are on, but "
-                    f"the action {key!r} has {int(number)} options. Build the OptionTransform with "
-                    f"num_options={self.prior.num_skills}, and append the mask after it."
-                )
-
-    def _check_batched_worker_compat(self) -> None:
-        raise RuntimeError(
-            "SkillMaskTransform reads a prior that changes; the workers of a SerialEnv or "
-            "ParallelEnv have a copy that does not. Put it outside: "
-            "TransformedEnv(ParallelEnv(n, make_env), SkillMaskTransform(prior))."
-        )
+    def _stays_outside(self) -> str | None:
+        return "reads a prior that changes here, and not in copies of it"

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
+from torchrl.data import Composite
+
+from torchrl_hmcts.checks import nested_key, real_number
+from torchrl_hmcts.transforms.env_transform import EnvTransform, count_spec, zero_count
 
 
-class StallTransform(Transform):
+class StallTransform(EnvTransform):
     r"""Counts the consecutive base steps in which an entry has not moved.
 
     .. math::
@@ -63,59 +63,32 @@ class StallTransform(Transform):
         tolerance: float = 1e-3,
         out_key: NestedKey = "stalled_steps",
     ) -> None:
-        if not (math.isfinite(tolerance) and tolerance >= 0.0):
-            raise ValueError(
-                f"StallTransform needs a tolerance >= 0, a distance in units of {in_key!r} per "
-                f"base step; got {tolerance}. Use e.g. a tenth of what a usual step moves."
-            )
-        self.in_key = unravel_key(in_key)
-        self.out_key = unravel_key(out_key)
+        self.tolerance = real_number("StallTransform", "tolerance", tolerance, least=0.0)
+        self.in_key = nested_key("StallTransform", "in_key", in_key)
+        self.out_key = nested_key("StallTransform", "out_key", out_key)
         super().__init__(in_keys=[self.in_key], out_keys=[self.out_key])
-        self.tolerance = float(tolerance)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        shape, device = tensordict_reset.batch_size, tensordict_reset.device
-        zero = torch.zeros((*shape, 1), dtype=torch.int64, device=device)
-        return tensordict_reset.set(self.out_key, zero)
+        return tensordict_reset.set(self.out_key, zero_count(tensordict_reset))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        before = tensordict.get(self.in_key, None)
-        if before is None:
-            raise KeyError(
-                f"StallTransform compares {self.in_key!r} before and after a step, but it is "
-                f"missing from the tensordict to step. Start from env.reset()."
-            )
-        after = next_tensordict.get(self.in_key)
-        moved = _distance(before, after, next_tensordict.batch_dims)
+        before, after = self._carried(tensordict, self.in_key), next_tensordict.get(self.in_key)
+        still = _distance(before, after, next_tensordict.batch_dims) < self.tolerance
         count = tensordict.get(self.out_key, None)
-        still = (moved < self.tolerance).to(torch.int64)
-        next_tensordict.set(self.out_key, still if count is None else (count + 1) * still)
-        return next_tensordict
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined: the count follows an env from step to step."""
-        raise RuntimeError(
-            "StallTransform follows an env from step to step; stored data hold the count already. "
-            "Append it to a TransformedEnv instead of a replay buffer."
-        )
+        count = still if count is None else (count + 1) * still
+        return next_tensordict.set(self.out_key, count.to(torch.int64))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        keys = {*observation_spec.keys(True, True), *self.parent.full_state_spec.keys(True, True)}
-        if self.in_key not in set(map(unravel_key, keys)):
-            raise KeyError(
-                f"StallTransform reads {self.in_key!r}, which the env before it does not have; it "
-                f"has {sorted(map(str, keys))}. Pass one of them as in_key."
-            )
-        observation_spec[self.out_key] = Unbounded(
-            (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device
-        )
+        states = self.parent.full_state_spec.keys(True, True)
+        self._require([*observation_spec.keys(True, True), *states], self.in_key)
+        observation_spec[self.out_key] = count_spec(observation_spec)
         return observation_spec
 
-    def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
         # A step reads the entry, so that a planner has to keep it with the state.
-        if self.in_key not in set(map(unravel_key, state_spec.keys(True, True))):
+        if self.in_key not in state_spec.keys(True, True):
             state_spec[self.in_key] = self.parent.full_observation_spec[self.in_key].clone()
         return state_spec
 

@@ -1,26 +1,57 @@
 """Subgoals of a manager's plan, and the worker's reward for reaching them.
 
-Letters: *B batch of the tensordict, m its elements in one dimension, G goals of the longest plan, K
-goals that the worker is shown, D coordinates of a goal.
+Letters: *B batch of the tensordict, m its elements in one dimension, L goals of a manager's longest
+plan, G goals kept, K goals that the worker is shown, D coordinates of a goal.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
 
-from torchrl_hmcts.transforms.goal_plans import GoalPlan, PlansGoals, ask_for_goals
+from torchrl_hmcts.checks import nested_key, real_number, whole_number
+from torchrl_hmcts.direct_calls import put
+from torchrl_hmcts.nesting import parts
+from torchrl_hmcts.transforms.env_transform import EnvTransform, count_spec
 
 
-class SubgoalTransform(Transform):
+@runtime_checkable
+class PlansGoals(Protocol):
+    """What :class:`SubgoalTransform` asks of a manager; a plain function of the same form will do.
+
+    An attribute ``in_keys`` is optional: the entries the manager reads. With it only those are
+    handed over.
+
+    Example:
+        >>> import torch
+        >>> class ToTheRight:
+        ...     def plan_goals(self, tensordict):
+        ...         goals = tensordict["position"].unsqueeze(1) + torch.tensor([1.0, 0.0])
+        ...         return goals, torch.ones(len(tensordict), dtype=torch.int64)
+        >>> from torchrl_hmcts.transforms import PlansGoals
+        >>> isinstance(ToTheRight(), PlansGoals)
+        True
+    """
+
+    def plan_goals(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return goals ``[m, L, D]`` and how many of them each plan has, int64 ``[m]``, at least 1.
+
+        ``tensordict`` (batch ``[m]``) holds the states to plan from. ``L`` is any number, other in
+        each call; what stands behind the end of a plan is ignored.
+        """
+
+
+GoalPlan = Callable[[TensorDictBase], tuple[Tensor, Tensor]]
+
+
+class SubgoalTransform(EnvTransform):
     r"""Leads a worker along the subgoals of a manager's plan and rewards it for reaching them.
 
     A plan :math:`g_0, \dots, g_n` is made at reset. After each base step, with :math:`g` the goal
@@ -32,10 +63,10 @@ class SubgoalTransform(Transform):
         r = r_\text{tick} + r_\text{met}\,[d < d_\text{met}] + r_\text{div}\,[d > d_\text{div}]
 
     A goal that is met makes way for the next one. Where :math:`d > d_\text{div}`, and where the
-    last goal is met though the episode goes on, a new plan is made from :math:`x` before the next
+    last goal is met though the episode continues, a new plan is made from :math:`x` before the next
     action. All elements of a batch that need a plan at the same base step get it in one call.
 
-    Writes, in the root and under ``"next"`` (all of it state: the env stays stateless and goes on
+    Writes, in the root and under ``"next"`` (all of it state: the env stays stateless and continues
     from any tensordict): ``goals_key`` (float32 ``[*B, K D]``, the next K goals, the last one
     repeated), ``"plan"`` (float32 ``[*B, G, D]``), ``"plan_length"`` and ``"goal_index"`` (int64
     ``[*B, 1]``), and the counters of the episode ``"num_plans"``, ``"num_goals_met"`` and
@@ -55,14 +86,14 @@ class SubgoalTransform(Transform):
             half a tile.
         goal_divergence_threshold (float): :math:`d_\text{div}`; must be larger than the distance of
             one goal to the next. ``math.inf`` never plans again. Default 2 tiles.
-        r_tick (float): reward of every base step. The source gives no number. Default -0.025:
+        r_tick (float): reward of every base step. The dissertation gives none. Default -0.025:
             going to and fro around a corner of Waterworld, where a plan pays for the same goals
             again, earns 0.020 per base step before it, so that with a smaller one it would pay not
             to arrive.
         r_goal_met (float): Default 1.
         r_goal_divergence (float): Default -1.
         num_goals (int): K. Default 3.
-        max_goals (int): G; a longer plan is cut, and goes on from a new plan when its last goal is
+        max_goals (int): G; a longer plan is cut, and a new plan follows when its last goal is
             met. Default 64.
         relative (bool): show goals relative to the position (default), so that what the worker
             learns in one place holds in all, or as they are.
@@ -131,101 +162,122 @@ class SubgoalTransform(Transform):
         reward_key: NestedKey = "reward",
         task_reward_key: NestedKey = "task_reward",
     ) -> None:
+        def key(name: str, value: NestedKey) -> NestedKey:
+            return nested_key("SubgoalTransform", name, value)
+
+        def number(name: str, value: float, **bounds: Any) -> float:
+            return real_number("SubgoalTransform", name, value, **bounds)
+
         plan_goals = getattr(planner, "plan_goals", planner)
         if not callable(plan_goals):
             raise TypeError(
                 f"SubgoalTransform needs a planner: a callable planner(td) -> (goals, lengths) or "
                 f"an object with such a method plan_goals; got {type(planner).__name__}."
             )
-        if not 0.0 < goal_met_threshold < goal_divergence_threshold:
-            raise ValueError(
-                f"SubgoalTransform needs 0 < goal_met_threshold < goal_divergence_threshold, "
-                f"distances in units of {position_key!r}; got {goal_met_threshold} and "
-                f"{goal_divergence_threshold}. For no divergence pass math.inf."
-            )
-        for name, value in (
-            ("r_tick", r_tick),
-            ("r_goal_met", r_goal_met),
-            ("r_goal_divergence", r_goal_divergence),
-        ):
-            if not math.isfinite(value):
-                raise ValueError(f"SubgoalTransform needs a finite {name}; got {value}.")
-        if r_goal_divergence > 0.0:
-            raise ValueError(
-                f"r_goal_divergence is added to the reward, a punishment is negative; got "
-                f"{r_goal_divergence}. Pass {-r_goal_divergence}."
-            )
-        for name, number in (("num_goals", num_goals), ("max_goals", max_goals)):
-            if number < 1:
-                raise ValueError(f"SubgoalTransform needs {name} >= 1; got {number}.")
-        self.position_key = unravel_key(position_key)
-        self.goals_key = unravel_key(goals_key)
-        self.plan_key = unravel_key(plan_key)
-        self.plan_length_key = unravel_key(plan_length_key)
-        self.goal_index_key = unravel_key(goal_index_key)
+        self.position_key = key("position_key", position_key)
+        self.goals_key = key("goals_key", goals_key)
+        self.plan_key = key("plan_key", plan_key)
+        self.plan_length_key = key("plan_length_key", plan_length_key)
+        self.goal_index_key = key("goal_index_key", goal_index_key)
         self.counter_keys = [
-            unravel_key(key) for key in (num_plans_key, num_goals_met_key, num_divergences_key)
+            key("num_plans_key", num_plans_key),
+            key("num_goals_met_key", num_goals_met_key),
+            key("num_divergences_key", num_divergences_key),
         ]
         # Entries of one number per element.
         self._numbers = [self.plan_length_key, self.goal_index_key, *self.counter_keys]
-        self.reward_key = unravel_key(reward_key)
-        self.task_reward_key = unravel_key(task_reward_key)
+        self.reward_key = key("reward_key", reward_key)
+        self.task_reward_key = key("task_reward_key", task_reward_key)
         super().__init__(
             in_keys=[self.position_key, self.reward_key],
             out_keys=[self.goals_key, self.plan_key, self.task_reward_key, *self._numbers],
         )
         # Past nn.Module.__setattr__: a manager's modules are not to be saved with the env.
         self.__dict__["planner"] = planner
-        self.__dict__["_plan_goals"] = plan_goals
+        self.__dict__["_ask"] = plan_goals
         self._read = getattr(planner, "in_keys", None)
-        self.goal_met_threshold = float(goal_met_threshold)
-        self.goal_divergence_threshold = float(goal_divergence_threshold)
-        self.r_tick = float(r_tick)
-        self.r_goal_met = float(r_goal_met)
-        self.r_goal_divergence = float(r_goal_divergence)
-        self.num_goals = int(num_goals)
-        self.max_goals = int(max_goals)
-        self.relative = bool(relative)
+        self.goal_met_threshold = met = number("goal_met_threshold", goal_met_threshold, above=0.0)
+        self.goal_divergence_threshold = number(
+            "goal_divergence_threshold > goal_met_threshold",
+            goal_divergence_threshold,
+            above=met,
+            finite=False,
+        )
+        self.r_tick = number("r_tick", r_tick)
+        self.r_goal_met = number("r_goal_met", r_goal_met)
+        self.r_goal_divergence = number("r_goal_divergence", r_goal_divergence, most=0.0)
+        self.num_goals = whole_number("SubgoalTransform", "num_goals", num_goals, least=1)
+        self.max_goals = whole_number("SubgoalTransform", "max_goals", max_goals, least=1)
+        self.relative = relative
         self._ahead = np.arange(self.num_goals)
 
     # ------------------------------------------------------------------ planning
 
-    def plan(self, tensordict: TensorDictBase, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Ask the manager for plans from the elements ``rows`` of a tensordict.
+    def _plan(self, tensordict: TensorDictBase, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Ask the manager for plans from some elements, counted in row-major order.
 
-        Args:
-            tensordict (TensorDictBase): states, any batch shape.
-            rows (array): int64 ``[m]``, which of its elements, counted in row-major order.
-
-        Returns:
-            the goals, float32 ``[m, G, D]`` with the last one repeated to the end, and the lengths,
-            int64 ``[m]``.
+        Return the goals ``[m, G, D]``, the last one repeated to the end, and the lengths ``[m]``.
         """
-        return ask_for_goals(
-            self._plan_goals,
-            tensordict,
-            rows,
-            in_keys=self._read,
-            position_key=self.position_key,
-            max_goals=self.max_goals,
-        )
+        td = tensordict if self._read is None else tensordict.select(*self._read)
+        td = td.reshape(-1) if len(td.batch_size) != 1 else td
+        if len(rows) != len(td):
+            td = td[torch.from_numpy(rows)]
+        with torch.no_grad():
+            goals, lengths = self.__dict__["_ask"](td)
+        path = goals.numpy(force=True).astype(np.float32, copy=False)
+        length = lengths.numpy(force=True).astype(np.int64, copy=False)
+        m, dims = len(rows), tensordict.get(self.position_key).shape[-1]
+        if path.ndim != 3 or path.shape[::2] != (m, dims) or length.shape != (m,):
+            raise ValueError(
+                f"The planner returned goals {list(path.shape)} and lengths {list(length.shape)} "
+                f"for {m} states with positions of {dims} coordinates; it must return goals "
+                f"[{m}, any, {dims}] and lengths [{m}]."
+            )
+        bad = (length < 1) | (length > path.shape[1])
+        if bad.any():
+            at = _rows(tensordict.get(self.position_key))[rows[bad.argmax()]].tolist()
+            raise ValueError(
+                f"The planner returned a plan of {length[bad][0]} goals, in an array of "
+                f"{path.shape[1]}, from {self.position_key!r} = {at}; a plan needs at least one. "
+                "If it found none, give the search more budget, or return a goal to explore."
+            )
+        length = np.minimum(length, self.max_goals)
+        path = path[np.arange(m)[:, None], _within(np.arange(self.max_goals), length)]
+        if not np.isfinite(path).all():
+            raise ValueError(
+                f"The planner returned a goal of {path[~np.isfinite(path)][0]}. Goals must be "
+                f"finite, in the units of {self.position_key!r}."
+            )
+        return path, length
 
     def _shown(
         self, path: np.ndarray, length: np.ndarray, index: np.ndarray, position: np.ndarray
     ) -> np.ndarray:
-        """The next K goals, ``[m, K, D]``."""
-        ahead = np.minimum(index[:, None] + self._ahead, length[:, None] - 1)
+        """Return the next K goals, ``[m, K, D]``."""
+        ahead = _within(index[:, None] + self._ahead, length)
         shown: np.ndarray = path[np.arange(len(path))[:, None], ahead]
         if self.relative:
             shown -= position[:, None]
         return shown
+
+    def _write(
+        self,
+        td: TensorDictBase,
+        entries: dict[NestedKey, np.ndarray],
+        numbers: Iterable[np.ndarray],
+    ) -> TensorDictBase:
+        """Write arrays of ``[m, ...]`` and the numbers ``[m]``, in the shape of a tensordict."""
+        for key, array in (*entries.items(), *zip(self._numbers, numbers, strict=True)):
+            array = array.reshape(*td.batch_size, *(array.shape[1:] or (1,)))
+            tensor = torch.from_numpy(array)
+            put(td, key, tensor if td.device is None else tensor.to(td.device))
+        return td
 
     # ------------------------------------------------------------------ in an env
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        shape, device = tensordict_reset.batch_size, tensordict_reset.device
         position = _rows(tensordict_reset.get(self.position_key))
         m, dims = position.shape
         fresh = self._needs_plan(tensordict, tensordict_reset)
@@ -239,50 +291,28 @@ class SubgoalTransform(Transform):
             numbers = np.stack([_numbers(tensordict, key, m) for key in self._numbers])
         rows = np.flatnonzero(fresh)
         if len(rows):
-            path[rows], numbers[0, rows] = self.plan(tensordict_reset, rows)
+            path[rows], numbers[0, rows] = self._plan(tensordict_reset, rows)
             numbers[1:, rows] = 0
             numbers[2, rows] = 1
-        entries = {self.plan_key: path.reshape(*shape, self.max_goals, dims)}
-        entries.update(
-            {k: n.reshape(*shape, 1) for k, n in zip(self._numbers, numbers, strict=True)}
-        )
-        shown = self._shown(path, numbers[0], numbers[1], position)
-        entries[self.goals_key] = shown.reshape(*shape, -1)
-        for key, array in entries.items():
-            tensordict_reset.set(key, torch.from_numpy(array).to(device or "cpu"))
-        return tensordict_reset
+        shown = self._shown(path, numbers[0], numbers[1], position).reshape(m, -1)
+        return self._write(tensordict_reset, {self.plan_key: path, self.goals_key: shown}, numbers)
 
     def _needs_plan(self, before: TensorDictBase, after: TensorDictBase) -> np.ndarray:
-        """Which elements a reset gives a new plan, bool ``[m]``."""
-        shape = after.batch_size
-        keys = list(before.keys(True, True))
-        masks = [before.get(k) for k in keys if _last(k) == "_reset"]
+        """Return which elements a reset gives a new plan, bool ``[m]``."""
+        m = after.numel()
+        given = set(map(unravel_key, before.keys(True, True)))
+        masks = [before.get(key) for key in given if parts(key)[-1] == "_reset"]
         if masks:
-            return np.logical_or.reduce(
-                [mask.numpy(force=True).reshape(shape.numel(), -1).any(-1) for mask in masks]
-            )
+            return np.logical_or.reduce([_any(mask, m) for mask in masks])
         mine = {self.plan_key, self.goals_key, *self._numbers}
-        state = [unravel_key(k) for k in self.parent.full_state_spec.keys(True, True)]
-        state = [k for k in state if k not in mine]
-        given = set(map(unravel_key, keys))
+        state = set(map(unravel_key, self.parent.full_state_spec.keys(True, True))) - mine
         if not state or not {self.plan_key, *self._numbers, *state} <= given:
-            return np.ones(shape.numel(), np.bool_)
+            return np.ones(m, np.bool_)
         # The plan is for the state it was made in: one that the reset did not set needs another.
-        changed = np.zeros(shape.numel(), np.bool_)
-        for key in state:
-            unequal = before.get(key) != after.get(key)
-            changed |= unequal.numpy(force=True).reshape(shape.numel(), -1).any(-1)
-        return changed
+        return np.logical_or.reduce([_any(before.get(k) != after.get(k), m) for k in state])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        plan = tensordict.get(self.plan_key, None)
-        if plan is None:
-            raise KeyError(
-                f"SubgoalTransform carries the plan in the tensordict, but {self.plan_key!r} is "
-                f"missing from the one to step. Start from env.reset(), or env.reset(td, "
-                f"set_state=True) for a state of your own."
-            )
-        shape, device = next_tensordict.batch_size, next_tensordict.device
+        plan = self._carried(tensordict, self.plan_key)
         position = _rows(next_tensordict.get(self.position_key))
         m, dims = position.shape
         # Small arrays: numpy does in one microsecond what torch does in three.
@@ -293,48 +323,29 @@ class SubgoalTransform(Transform):
         met = distance < self.goal_met_threshold
         diverged = distance > self.goal_divergence_threshold
         reward = self.r_tick + self.r_goal_met * met + self.r_goal_divergence * diverged
-        skipped = _skipped(tensordict, m)
-        if skipped is not None:  # the env below did not step them: what they hold is no state
-            met, diverged = met & ~skipped, diverged & ~skipped
-            reward = reward * ~skipped
+        stepped = tensordict.get("_step", None)
+        if stepped is not None:  # the env below did not step all: what others hold is no state
+            moved = _any(stepped, m)
+            met, diverged, reward = met & moved, diverged & moved, reward * moved
         index = index + met
         replan = diverged | (index >= length)
         index = np.minimum(index, length - 1)
         if replan.any():
-            terminated = next_tensordict.get(self._terminated_key)
-            replan &= ~terminated.numpy(force=True).reshape(m)
+            replan &= ~_any(next_tensordict.get(self._terminated_key), m)
             rows = np.flatnonzero(replan)
             if len(rows):
                 path, length = path.copy(), length.copy()
-                path[rows], length[rows] = self.plan(next_tensordict, rows)
+                path[rows], length[rows] = self._plan(next_tensordict, rows)
                 index[rows] = 0
-                plan = torch.from_numpy(path.reshape(*shape, *path.shape[1:])).to(plan.device)
-        shown = self._shown(path, length, index, position)
-        numbers = (
-            length,
-            index,
-            *(count + new for count, new in zip(counters, (replan, met, diverged), strict=True)),
-        )
-        _put(next_tensordict, self.task_reward_key, next_tensordict.get(self.reward_key))
-        _put(next_tensordict, self.plan_key, plan)
-        entries: dict[NestedKey, np.ndarray] = {
-            self.reward_key: reward.astype(np.float32).reshape(*shape, 1),
-            self.goals_key: shown.reshape(*shape, -1),
-        }
-        entries.update(
-            {k: n.reshape(*shape, 1) for k, n in zip(self._numbers, numbers, strict=True)}
-        )
-        for key, array in entries.items():
-            tensor = torch.from_numpy(array)
-            _put(next_tensordict, key, tensor if device is None else tensor.to(device))
-        return next_tensordict
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not defined: plans follow an env from step to step."""
-        raise RuntimeError(
-            "SubgoalTransform follows an env from step to step; stored data hold the goals and the "
-            "worker's reward already. Append it to a TransformedEnv instead of a replay buffer."
-        )
+                plan = torch.from_numpy(path.reshape(plan.shape)).to(plan.device)
+        shown = self._shown(path, length, index, position).reshape(m, -1)
+        put(next_tensordict, self.task_reward_key, next_tensordict.get(self.reward_key))
+        put(next_tensordict, self.plan_key, plan)
+        counted = [
+            count + new for count, new in zip(counters, (replan, met, diverged), strict=True)
+        ]
+        entries = {self.reward_key: reward.astype(np.float32), self.goals_key: shown}
+        return self._write(next_tensordict, entries, (length, index, *counted))
 
     # ------------------------------------------------------------------ specs
 
@@ -343,27 +354,20 @@ class SubgoalTransform(Transform):
         spec[self.plan_key] = Unbounded(
             (*shape, self.max_goals, dims), dtype=torch.float32, device=device
         )
-        for key, high in (
-            (self.plan_length_key, self.max_goals),
-            (self.goal_index_key, self.max_goals - 1),
-        ):
+        for key in self._numbers:
+            spec[key] = count_spec(spec)
+        for key, high in ((self.plan_length_key, 0), (self.goal_index_key, -1)):
+            high += self.max_goals
             spec[key] = Bounded(0, high, shape=(*shape, 1), dtype=torch.int64, device=device)
-        for key in self.counter_keys:
-            spec[key] = Unbounded((*shape, 1), dtype=torch.int64, device=device)
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        if self.position_key not in set(map(unravel_key, observation_spec.keys(True, True))):
-            raise KeyError(
-                f"SubgoalTransform compares {self.position_key!r} with the goals, which the env "
-                f"before it does not write; it writes "
-                f"{sorted(map(str, observation_spec.keys(True, True)))}. Pass one of them as "
-                f"position_key."
-            )
+        self._require(observation_spec.keys(True, True), self.position_key)
         position = observation_spec[self.position_key]
-        shape, device = observation_spec.shape, observation_spec.device
         observation_spec[self.goals_key] = Unbounded(
-            (*shape, self.num_goals * position.shape[-1]), dtype=torch.float32, device=device
+            (*observation_spec.shape, self.num_goals * position.shape[-1]),
+            dtype=torch.float32,
+            device=observation_spec.device,
         )
         return self._add_specs(observation_spec, position)
 
@@ -371,12 +375,7 @@ class SubgoalTransform(Transform):
         return self._add_specs(state_spec, self.parent.full_observation_spec[self.position_key])
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        if self.reward_key not in set(map(unravel_key, reward_spec.keys(True, True))):
-            raise KeyError(
-                f"SubgoalTransform rewards the worker under {self.reward_key!r}; the env before it "
-                f"has the rewards {sorted(map(str, reward_spec.keys(True, True)))}. Pass one of "
-                f"them as reward_key."
-            )
+        self._require(reward_spec.keys(True, True), self.reward_key)
         task = reward_spec[self.reward_key]
         reward_spec[self.task_reward_key] = task.clone()
         reward_spec[self.reward_key] = Unbounded(
@@ -386,9 +385,8 @@ class SubgoalTransform(Transform):
 
     @property
     def _terminated_key(self) -> NestedKey:
-        keys = [unravel_key(k) for k in self.parent.done_keys]
-        found = [k for k in keys if _last(k) == "terminated"] or keys
-        return found[0]
+        keys = list(map(unravel_key, self.parent.done_keys))
+        return next((key for key in keys if parts(key)[-1] == "terminated"), keys[0])
 
     def __repr__(self) -> str:
         return (
@@ -408,19 +406,12 @@ def _numbers(tensordict: TensorDictBase, key: NestedKey, m: int) -> np.ndarray:
     return np.zeros(m, np.int64) if value is None else value.numpy(force=True).reshape(m)
 
 
-def _put(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> None:
-    """Set an entry of the right shape and device; TensorDict.set checks at five times the cost."""
-    if isinstance(key, str):
-        tensordict._set_str(key, value, validated=True, inplace=False, non_blocking=False)
-    else:
-        tensordict.set(key, value)
+def _any(value: Tensor, m: int) -> np.ndarray:
+    """Return in which elements an entry is true anywhere, bool ``[m]``."""
+    found: np.ndarray = value.numpy(force=True).reshape(m, -1).any(-1)
+    return found
 
 
-def _skipped(tensordict: TensorDictBase, m: int) -> np.ndarray | None:
-    """Elements that a batched env below was told not to step, bool ``[m]``, or None."""
-    stepped: Any = tensordict.get("_step", None)
-    return None if stepped is None else ~stepped.numpy(force=True).reshape(m)
-
-
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]
+def _within(index: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Return indices ``[m, K]`` into plans, at most the last goal of each."""
+    return np.minimum(index, length[:, None] - 1)

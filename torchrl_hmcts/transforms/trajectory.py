@@ -16,16 +16,12 @@ from torchrl.envs import EnvBase
 
 
 class OptionTrajectory:
-    """Collects chosen entries of an option's base transitions into a tensordict ``[*B, T]``.
-
-    Args:
-        keys: entries of a base transition, the env's or the worker's, e.g. ``"position"``,
-            ``"action"``, ``"action_log_prob"`` or ``("next", "reward")``.
-        max_steps: T.
-    """
+    """Collects chosen entries of an option's base transitions into a tensordict ``[*B, T]``."""
 
     KEY = "trajectory"
     MASK_KEY = "mask"
+
+    data: TensorDictBase
 
     def __init__(self, keys: Sequence[NestedKey], max_steps: int) -> None:
         self.keys = [unravel_key(key) for key in keys]
@@ -42,33 +38,23 @@ class OptionTrajectory:
         root: TensorDictBase,
         memory: Mapping[NestedKey, tuple[torch.Size, torch.dtype]],
     ) -> Composite:
-        """Return the spec of the block, ``[*B, T]``.
-
-        Args:
-            env: the env that takes the base steps.
-            root: what a base step begins with, after the worker has acted.
-            memory: what the worker itself writes under ``"next"``: shapes and types.
-        """
+        """Return the spec of the block, ``[*B, T]``, of the env's and the worker's entries."""
         after = env.full_observation_spec.clone()
         after.update(env.full_reward_spec)
         after.update(env.full_done_spec)
-        shape = (*env.batch_size, self.max_steps)
-        ndim = len(env.batch_size)
-        events = {unravel_key(k): (v.shape[ndim:], v.dtype) for k, v in root.items(True, True)}
-        nexts = {unravel_key(k): (v.shape[ndim:], v.dtype) for k, v in after.items(True, True)}
-        nexts.update(memory)
+        shape, ndim = (*env.batch_size, self.max_steps), len(env.batch_size)
+        known = {unravel_key(k): (v.shape[ndim:], v.dtype) for k, v in root.items(True, True)}
+        for key, leaf in after.items(True, True):
+            known[unravel_key(("next", key))] = (leaf.shape[ndim:], leaf.dtype)
+        known.update({unravel_key(("next", key)): entry for key, entry in memory.items()})
         spec = Composite(shape=shape, device=env.device)
         for key in self.keys:
-            is_next = isinstance(key, tuple) and key[0] == "next"
-            source, name = (nexts, unravel_key(key[1:])) if is_next else (events, key)
-            if name not in source:
-                before = sorted(str(k) for k in events if k[0] != "next")
+            if key not in known:
                 raise ValueError(
                     f"trajectory_keys names {key!r}, which is no entry of a base transition of "
-                    f"{type(env.base_env).__name__}. Entries: {before}, and under 'next' "
-                    f"{sorted(map(str, nexts))}."
+                    f"{type(env.base_env).__name__}. Entries: {sorted(map(str, known))}."
                 )
-            event, dtype = source[name]
+            event, dtype = known[key]
             # Not the entry's own bounds: the zeros after an option's end need not lie in them.
             kind = Binary if dtype == torch.bool else Unbounded
             spec[key] = kind(shape=(*shape, *event), dtype=dtype, device=env.device)
@@ -79,48 +65,22 @@ class OptionTrajectory:
         """Return a trajectory of its own with a block of zeros for ``batch_size`` options."""
         new = OptionTrajectory(self.keys, self.max_steps)
         ndim = len(spec.shape) - 1  # the options need not have the batch size of the env
-        new.data = TensorDict(
-            {
-                key: torch.zeros(
-                    (*batch_size, *leaf.shape[ndim:]), dtype=leaf.dtype, device=leaf.device
-                )
-                for key, leaf in spec.items(True, True)
-            },
-            batch_size=(*batch_size, self.max_steps),
-            device=spec.device,
-        )
+        new.data = TensorDict(batch_size=(*batch_size, self.max_steps), device=spec.device)
+        for key, leaf in spec.items(True, True):
+            shape = (*batch_size, *leaf.shape[ndim:])
+            new.data.set(key, torch.zeros(shape, dtype=leaf.dtype, device=leaf.device))
         return new
-
-    data: TensorDictBase
 
     def write(
         self, taken: int, rows: Tensor | None, root: TensorDictBase, after: TensorDictBase
     ) -> None:
-        """Write the transition ``taken`` steps into the option.
-
-        Args:
-            taken: base steps taken before this one.
-            rows: where it belongs: indices, a mask over the batch (whose other rows are then left
-                out), or None for all.
-            root: entries before the step.
-            after: entries after it.
-        """
-        is_mask = rows is not None and rows.dtype == torch.bool
+        """Write what ``taken`` steps into the option happened; ``rows``: indices, a mask or all."""
         lead = self.data.batch_dims - 1
-        for key in (*self.keys, self.MASK_KEY):
-            block = self.data.get(key)
-            slot = block.select(lead, taken)
-            if key == self.MASK_KEY:
-                value = torch.ones((), dtype=torch.bool, device=block.device).expand(
-                    slot.shape if rows is None or is_mask else (rows.numel(),)
-                )
-            elif isinstance(key, tuple) and key[0] == "next":
-                value = after.get(key[1:])
-            else:
-                value = root.get(key)
-            if rows is None:
-                slot.copy_(value)
-            elif is_mask:
-                slot[rows] = value[rows]
-            else:
-                slot[rows] = value
+        index = ... if rows is None else rows
+        for key in self.keys:
+            is_next = isinstance(key, tuple) and key[0] == "next"
+            value = after.get(key[1:]) if is_next else root.get(key)
+            if rows is not None and rows.dtype == torch.bool:
+                value = value[rows]
+            self.data.get(key).select(lead, taken)[index] = value
+        self.data.get(self.MASK_KEY).select(lead, taken)[index] = True

@@ -43,7 +43,8 @@ from torchrl_hmcts.trainers.saving.checkpoints import (
     plain_checkpoint,
 )
 from torchrl_hmcts.trainers.saving.locking import folder_locked
-from torchrl_hmcts.trainers.saving.resume import FIRST_SAVE_SECONDS, SAVE_SECONDS, HistoryState
+from torchrl_hmcts.trainers.saving.resume import FIRST_SAVE_SECONDS, SAVE_SECONDS
+from torchrl_hmcts.trainers.saving.run_state import HistoryState
 from torchrl_hmcts.trainers.saving.stopping import patient, raise_if_asked, unbroken
 
 MakeOptimizer = Callable[[list[nn.Parameter]], Optimizer]

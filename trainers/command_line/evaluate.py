@@ -10,15 +10,17 @@ from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import split_words
+from torchrl_hmcts.trainers.experiments.registry import load_config, recognise
 from torchrl_hmcts.trainers.runs.config import home, parse_overrides
-from torchrl_hmcts.trainers.runs.folder import (
-    add_evaluation,
-    load_config,
-    read_run,
-    shown_word,
-)
 from torchrl_hmcts.trainers.saving.files import left_out
 from torchrl_hmcts.trainers.saving.locking import is_locked
+from torchrl_hmcts.trainers.saving.run_folder import (
+    add_evaluation,
+    machine,
+    read_run,
+    shown_word,
+    versions,
+)
 
 
 def evaluate(words: Sequence[str]) -> int:
@@ -51,7 +53,7 @@ def evaluate(words: Sequence[str]) -> int:
         return refuse("evaluate", error)
     if is_locked(run.path):
         print(f"{run.path} is still running: its newest checkpoint is tested.", file=sys.stderr)
-    from torchrl_hmcts.trainers.figures.report import machine, versions, write_run_page
+    from torchrl_hmcts.trainers.figures.run_page import write_run_page
     from torchrl_hmcts.trainers.saving.files import finite
 
     try:
@@ -76,5 +78,5 @@ def evaluate(words: Sequence[str]) -> int:
     with left_out("evaluation.json"):
         print(f"Figures: {add_evaluation(run.path, evaluation)}")
     with left_out("index.html"):
-        print(f"With all others: {write_run_page(run.path)}")
+        print(f"With all others: {write_run_page(recognise(read_run(run.path)))}")
     return 0

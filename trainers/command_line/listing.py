@@ -6,8 +6,8 @@ import textwrap
 from collections.abc import Sequence
 
 from torchrl_hmcts.trainers.command_line.running import missing, refuse
+from torchrl_hmcts.trainers.experiments.dissertation import FIGURES
 from torchrl_hmcts.trainers.experiments.registry import DEMO, EXPERIMENTS, find_experiment
-from torchrl_hmcts.trainers.figures.dissertation import FIGURES
 
 
 def show(words: Sequence[str]) -> int:

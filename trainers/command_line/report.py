@@ -7,7 +7,9 @@ from pathlib import Path
 
 from torchrl_hmcts.trainers.command_line.running import fail, missing, refuse, said
 from torchrl_hmcts.trainers.command_line.words import folders_of, split_words
+from torchrl_hmcts.trainers.experiments.registry import recognise
 from torchrl_hmcts.trainers.runs.config import home
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 _OWN = ("figure", "out", "results")
 
@@ -38,27 +40,24 @@ def _pages(own: dict[str, str], folders: list[str]) -> int:
             "say which runs, e.g. hmcts report runs/one (or several, to compare them), or which "
             "figure of the dissertation, e.g. figure=3.6 (all: hmcts list figures)."
         )
-    if len(folders) == 1:
-        from torchrl_hmcts.trainers.figures.report import write_run_page
+    runs = [recognise(read_run(folder)) for folder in folders]
+    if len(runs) == 1:
+        from torchrl_hmcts.trainers.figures.run_page import write_run_page
 
         out = own.get("out")
         if out is not None and not out.lower().endswith((".html", ".htm")):
             out = str(Path(out) / "index.html")
-        print(f"Page: {write_run_page(folders[0], out)}")
+        print(f"Page: {write_run_page(runs[0], out)}")
         return 0
     from torchrl_hmcts.trainers.figures.comparison_page import write_comparison
 
-    print(f"Page: {write_comparison(folders, own.get('out', 'runs/report'))}")
+    print(f"Page: {write_comparison(runs, own.get('out', 'runs/report'))}")
     return 0
 
 
 def _figure(own: dict[str, str], folders: list[str]) -> int:
-    from torchrl_hmcts.trainers.figures.dissertation import (
-        MissingData,
-        draw_all,
-        draw_figure,
-        find_results,
-    )
+    from torchrl_hmcts.trainers.experiments.dissertation import MissingData, find_results
+    from torchrl_hmcts.trainers.experiments.dissertation_figures import draw_all, draw_figure
 
     results = find_results(own.get("results"))
     out = Path(own.get("out", "figures"))
@@ -69,8 +68,8 @@ def _figure(own: dict[str, str], folders: list[str]) -> int:
         print(f"Page: {page}")
         return 0
     try:
-        drawn = draw_figure(own["figure"], folders, results, out)
+        path, caption = draw_figure(own["figure"], folders, results, out)
     except MissingData as error:
         return fail("report", error)
-    print(f"{drawn.caption}\n{drawn.path}")
+    print(f"{caption}\n{path}")
     return 0

@@ -16,10 +16,10 @@ from torchrl_hmcts.trainers.experiments.registry import (
     find_experiment,
 )
 from torchrl_hmcts.trainers.runs.config import parse_overrides, read_value
-from torchrl_hmcts.trainers.runs.folder import shown_word
 from torchrl_hmcts.trainers.runs.sweep_space import parse_space
 from torchrl_hmcts.trainers.saving.files import left_out, write_json
 from torchrl_hmcts.trainers.saving.locking import FolderInUse
+from torchrl_hmcts.trainers.saving.run_folder import shown_word
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled
 
 _OWN = ("experiment", "trials", "objective", "storage", "prune", "out")
@@ -100,6 +100,7 @@ def _page(plan: object, study: object, command: str) -> str:
     with left_out("index.html"):
         write_sweep_page(
             plan.folder,
+            study=study,  # type: ignore[arg-type]
             experiment=plan.experiment.name,
             objective=plan.objective,
             rows=rows,

@@ -16,10 +16,11 @@ from torchrl_hmcts.trainers.experiments.registry import (
     EXPERIMENTS,
     Experiment,
     find_experiment,
+    load_config,
 )
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, home, parse_overrides
-from torchrl_hmcts.trainers.runs.folder import load_config, read_run
 from torchrl_hmcts.trainers.runs.run import resume_command, run_files
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 
 def demo(words: Sequence[str]) -> int:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.record.loggers import Logger
 from tqdm import tqdm
@@ -22,11 +21,11 @@ from torchrl_hmcts.planners import MCTSPlanner, Plan, RadiusNovelty, SearchBudge
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.waterworld.worker import make_option_env, make_training_env
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.runs.worker_file import save_worker
+from torchrl_hmcts.trainers.saving.run_folder import versions
 
 
 def run_demo(config: DemoConfig) -> dict[str, Any]:
@@ -99,10 +98,10 @@ def _run_demo(config: DemoConfig, run: Run) -> dict[str, Any]:
     title = "Solving random mazes by planning over learned skills"
     with run.finish(metrics, title=title) as pictures:
         print("Drawing ...")
-        maze = test_mazes[int(starts["maze_index"][shown])]
         planner.plan(starts[shown : shown + 1])
         _draw_episode(pictures, planner, real.base_env, starts[shown], episodes[shown])
-        _draw_worker(pictures, config, trainer, loss, maze)
+        maze = int(starts["maze_index"][shown])
+        _draw_worker(pictures, config, trainer, loss, real.base_env, maze)
     print(format_table(metrics))
     return metrics
 
@@ -121,28 +120,37 @@ def _draw_episode(
             "how far the worker came."
         )
     with pictures.one("episode.gif", words) as path:
-        from torchrl_hmcts.trainers.figures.animation import write_episode_gif
+        from torchrl_hmcts.trainers.figures.maps import WaterworldMap, write_episode_gif
 
-        write_episode_gif(env, start, episode, path)
+        positions = torch.from_numpy(episode.positions)
+        states = [start.clone().set("position", position) for position in positions]
+        write_episode_gif(WaterworldMap(env), states, episode.options.tolist(), episode.plan, path)
     words = "The search for that plan: every place an option led to in the maze (grey: refused by "
     with pictures.one("search.png", words + "the novelty test), and the tree.") as path:
-        from torchrl_hmcts.trainers.figures.plots import plot_search
+        from torchrl_hmcts.trainers.figures.maps import WaterworldMap, plot_search
 
         assert planner.last_search is not None
-        plot_search(planner.last_search, env, path)
+        plot_search(WaterworldMap(env), planner.last_search, path)
 
 
 def _draw_worker(
-    pictures: Pictures, config: DemoConfig, trainer: DIAYNTrainer, loss: Any, maze: Tensor
+    pictures: Pictures,
+    config: DemoConfig,
+    trainer: DIAYNTrainer,
+    loss: Any,
+    env: WaterworldMazeEnv,
+    maze: int,
 ) -> None:
     words = "The skills: 10 mini-episodes of 100 base steps for each, in an open room and in the "
     with pictures.one("skills.png", words + "maze above.") as path:
-        from torchrl_hmcts.trainers.figures.plots import plot_skill_fan
+        from torchrl_hmcts.trainers.figures.maps import WaterworldMap, plot_skill_fan
 
-        plot_skill_fan(SkillPolicy(loss.actor_network), config.num_skills, maze, path)
+        rooms = WaterworldMap(env).rooms(10 * config.num_skills, maze)
+        policy = SkillPolicy(loss.actor_network)
+        plot_skill_fan(policy, rooms, path, num_skills=config.num_skills)
     words = "Training of the worker: actor, both critics, discriminator."
     with pictures.one("losses.png", words) as path:
-        from torchrl_hmcts.trainers.figures.plots import plot_losses
+        from torchrl_hmcts.trainers.figures.curves import plot_losses
 
         plot_losses(trainer.history, config.train_base_steps, path)
 

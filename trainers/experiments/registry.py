@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
+from torchrl_hmcts.trainers.saving.run_folder import RunFolder
+
 
 class ExperimentError(ValueError):
     """What an experiment was asked for does not fit what is there; the message says it all."""
@@ -183,6 +185,72 @@ def field_docs(config_class: type) -> dict[str, str]:
                 assert isinstance(field.target, ast.Name)
                 docs[field.target.id] = " ".join(ast.literal_eval(below.value).split())
     return docs
+
+
+def recognise(run: RunFolder) -> RunFolder:
+    """Return a run with what its experiment says of its keys, for its page.
+
+    The experiment of a run without ``run.json`` is the one that has the keys of its config.
+
+    Args:
+        run: of :func:`~torchrl_hmcts.trainers.saving.run_folder.read_run`; changed in place.
+    """
+    if not run.experiment and run.config:
+        known = (
+            (len(keys), name)
+            for name in ALL_EXPERIMENTS
+            if set(run.config) <= set(keys := config_keys(name))
+        )
+        run.record["experiment"] = min(known, default=(0, ""))[1]
+    if run.experiment in ALL_EXPERIMENTS:
+        run.keys = config_keys(run.experiment)
+    return run
+
+
+def config_keys(experiment: str) -> dict[str, tuple[Any, str]]:
+    """Return the default and the meaning of each key of an experiment.
+
+    Args:
+        experiment: its name.
+
+    Example:
+        >>> config_keys("demo")["gamma"][1]
+        'Discount per base step.'
+    """
+    config_class = ALL_EXPERIMENTS[experiment].config_class
+    meanings = field_docs(config_class)
+    return {key.name: (key.default, meanings.get(key.name, "")) for key in fields(config_class)}
+
+
+def load_config(run: RunFolder) -> tuple[Experiment, Any]:
+    """Return the experiment of a run and its configuration, with ``out`` at the folder.
+
+    Args:
+        run: of :func:`read_run`.
+
+    Raises:
+        ValueError: if ``run.json`` is damaged, or the experiment is unknown or no longer has one of
+            the keys.
+    """
+    for sentence in run.damage:
+        if "run.json" in sentence:
+            raise ValueError(sentence)
+    run = recognise(run)
+    if run.experiment not in ALL_EXPERIMENTS:
+        raise ValueError(
+            f"{run.path} does not say which experiment it is of (run.json). Experiments: "
+            f"{', '.join(ALL_EXPERIMENTS)}."
+        )
+    experiment = ALL_EXPERIMENTS[run.experiment]
+    known = {field.name for field in fields(experiment.config_class)}
+    unknown = sorted(set(run.config) - known)
+    if unknown:
+        raise ValueError(
+            f"{run.path} was made with keys that experiment={experiment.name} no longer has: "
+            f"{', '.join(unknown)}. Use the version that made it: {run.record.get('versions')}."
+        )
+    config = experiment.config_class(**{**run.config, "out": str(run.path)})
+    return experiment, config
 
 
 def _load(path: str) -> Any:

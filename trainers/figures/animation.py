@@ -5,53 +5,24 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from tensordict import TensorDictBase
 
-from torchrl_hmcts.trainers.figures.plots import option_rgb
 from torchrl_hmcts.trainers.saving.files import left_out, replacing
-
-if TYPE_CHECKING:
-    from torchrl_hmcts.envs import WaterworldMazeEnv
-    from torchrl_hmcts.trainers.experiments.demo import Episode
 
 _VIDEO_SECONDS = 300  # after which ffmpeg is given up
 
 
-def write_episode_gif(
-    env: WaterworldMazeEnv,
-    start: TensorDictBase,
-    episode: Episode,
-    path: Path,
-    *,
-    steps_per_frame: int = 2,
-) -> None:
-    """Write an episode as a GIF, the plan drawn in with one colour per option.
+def steps_to_show(last: int, every: int) -> list[int]:
+    """Return the base steps of an episode of which there is a picture.
 
-    Args:
-        env: draws the frames.
-        start: first state, without batch dimensions.
-        episode: plan and positions.
-        path: file to write.
-        steps_per_frame: base steps from one frame to the next.
+    Example:
+        >>> steps_to_show(5, 2)
+        [0, 2, 4, 5]
     """
-    plan_points = episode.plan.states["position"][: int(episode.plan.lengths) + 1].numpy()
-    plan_colors = [
-        _pale(option_rgb(int(o))) for o in episode.plan.options[: int(episode.plan.lengths)]
-    ]
-    plan = [(plan_points, np.array(plan_colors))] if plan_colors else []
-    frames = []
-    last = len(episode.positions) - 1
-    for step in [*range(0, last, steps_per_frame), last]:
-        trail = episode.positions[: step + 1]
-        colors = np.array([option_rgb(int(o)) for o in episode.options[:step]])
-        state = start.clone().set("position", start["position"].new_tensor(trail[-1]))
-        paths = [*plan, (trail, colors)] if step else plan
-        frames.append(env.render(state, paths=paths))
-    rate = 1.0 / (env.TIME_STEP * steps_per_frame)
-    write_gif(frames, path, milliseconds=1000.0 / (2.0 * rate))  # twice real time
+    if every < 1:
+        raise ValueError(f"a GIF needs steps_per_frame >= 1; got {every}.")
+    return [*range(0, last, every), last]
 
 
 def write_gif(
@@ -95,26 +66,20 @@ def write_gif(
 
 
 def _write_video(frames: Sequence[np.ndarray], path: Path, milliseconds: float) -> None:
-    """Write pictures as a video; ones of odd height or width get a row or column more."""
+    """Write a video with ffmpeg itself: imageio overlooks that it failed, and waits without end."""
     import imageio_ffmpeg
 
     height, width = frames[0].shape[:2]
-    room = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 halves the colours' resolution
-    shown = [np.pad(frame, room, mode="edge") for frame in frames]
+    even = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 shares the colours of two pixels
     size = f"{width + width % 2}x{height + height % 2}"
     pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{1000.0 / milliseconds}"]
     h264 = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "25", "-v", "error"]
     done = subprocess.run(
         [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *pictures, "-i", "-", "-an", *h264, str(path)],
-        input=b"".join(np.ascontiguousarray(frame).tobytes() for frame in shown),
+        input=b"".join(np.pad(frame, even, mode="edge").tobytes() for frame in frames),
         capture_output=True,
         timeout=_VIDEO_SECONDS,
     )
     if done.returncode:
         words = done.stderr.decode(errors="replace").split()
         raise RuntimeError(f"ffmpeg ended with {done.returncode}: {' '.join(words)}")
-
-
-def _pale(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    red, green, blue = (round(255 - 0.35 * (255 - channel)) for channel in color)
-    return red, green, blue

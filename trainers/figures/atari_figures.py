@@ -19,13 +19,7 @@ _EVERY = 3  # base steps between two pictures
 
 
 def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: str) -> None:
-    """Plot the score of each episode, and the best so far, against emulated frames.
-
-    Args:
-        episodes: with ``"frames"`` (emulated so far, at their end) and ``"score"``.
-        path: PNG to write.
-        title: e.g. the game.
-    """
+    """Plot the score of each episode, and the best so far, against emulated frames."""
     frames = np.array([row["frames"] for row in episodes])
     scores = np.array([row["score"] for row in episodes])
     figure = Figure(figsize=(7.0, 4.0), layout="constrained")
@@ -43,17 +37,7 @@ def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: s
 def write_atari_gif(
     recorder: AtariOptionPool, options: Sequence[int], path: Path, *, real_steps: int = 450
 ) -> tuple[int, float]:
-    """Carry the options of an episode out once more and write what the screen shows.
-
-    Args:
-        recorder: a pool with ``record=True``, seeded as the one in which they were carried out.
-        options: of the episode's decisions, in their order.
-        path: GIF to write.
-        real_steps: base steps to show at most.
-
-    Returns:
-        How many base steps are shown, and their score.
-    """
+    """Carry the options of an episode out once more and write what the screen shows."""
     env = AtariRAMEnv(recorder.game, repeat_action_probability=0.0)
     pictures = []
     shown, score = 0, 0.0

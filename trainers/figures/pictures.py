@@ -1,4 +1,7 @@
-"""Pictures of a run. Each is drawn on its own: one that fails is left out, and the run goes on."""
+"""Pictures of a run, each drawn on its own: one that fails is left out, and the run continues.
+
+Pages and pictures replace older versions of their own, never a file of somebody else's.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,17 @@ from torchrl_hmcts.trainers.saving.files import left_out, replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+COLORS = ("#1d4ed8", "#e66100", "#00798c", "#5d3a9b", "#d41159", "#8c6e00", "#5a5a5a")
+"""Of curves and groups of runs, in their order; the colour-blind can tell them apart."""
+STAMP = {"Source": "torchrl_hmcts"}
+"""Metadata of our PNGs, by which :func:`refuse_foreign` knows them."""
+PAGE_MARK = '<meta name="generator" content="torchrl_hmcts">'
+_MARKS = (
+    b"Source\0torchrl_hmcts",
+    PAGE_MARK.encode(),
+    b'<link rel="icon" href="data:,">',  # of pages before that mark
+)
 
 
 class Pictures:
@@ -28,7 +42,7 @@ class Pictures:
         >>> with pictures.one("search.png", "The tree.") as path:
         ...     _ = path.write_bytes(b"...")
         >>> with pictures.one("episode.gif", "An episode.") as path:
-        ...     raise ImportError("No module named 'imageio'")  # said on stderr
+        ...     raise ImportError("No module named 'imageio'")  # printed on stderr
         >>> pictures.captions
         {'search.png': 'The tree.'}
     """
@@ -53,12 +67,23 @@ class Pictures:
 
 
 def save_figure(figure: Figure, path: str | Path, *, dpi: int = 110) -> None:
-    """Write a figure of matplotlib as PNG in one move.
-
-    Args:
-        figure: to write.
-        path: file.
-        dpi: pixels of an inch.
-    """
+    """Write a figure of matplotlib as PNG in one move."""
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=dpi)
+        figure.savefig(temporary, dpi=dpi, metadata=STAMP)
+
+
+def refuse_foreign(file: str | Path) -> None:
+    """Refuse to replace a file that this package did not write.
+
+    Example:
+        >>> refuse_foreign("nothing_there.html")
+    """
+    file = Path(file)
+    if file.is_dir():
+        raise ValueError(f"{file} is a folder. Name a file with out=.")
+    content = file.read_bytes() if file.exists() else b""
+    if content and not any(mark in content for mark in _MARKS):
+        raise ValueError(
+            f"{file} exists and was not written by hmcts report, so it is not replaced. Move it, "
+            "or choose another place with out=."
+        )

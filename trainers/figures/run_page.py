@@ -1,99 +1,171 @@
-"""What stands on the page of one run."""
+"""The page of a run: its figures, pictures, curves and config in one HTML file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+import contextlib
+import json
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, field_docs
-from torchrl_hmcts.trainers.figures.curve_panels import panel
-from torchrl_hmcts.trainers.figures.page_parts import (
-    Html,
+from torchrl_hmcts.trainers.figures.pages import (
+    Cell,
+    Section,
+    Table,
     drawing,
-    grid,
-    page,
     picture,
     plain,
-    section,
-    table,
-    text,
+    write_sections,
 )
-from torchrl_hmcts.trainers.runs.folder import RunFolder, shown_path
-from torchrl_hmcts.trainers.saving.files import left_out
+from torchrl_hmcts.trainers.figures.pictures import Pictures, refuse_foreign
+from torchrl_hmcts.trainers.saving.files import left_out, write_json
+from torchrl_hmcts.trainers.saving.run_folder import RunFolder, is_run, read_run, shown_path
+
+Keys = Mapping[str, tuple[Any, str]]
+"""Default and meaning of each key of an experiment."""
 
 
-def run_page(run: RunFolder, *, embed: bool = False) -> str:
-    """Return the page of a run.
+@contextlib.contextmanager
+def finish(
+    out: Path, title: str, metrics: Mapping[str, Any], keys: Keys | None = None
+) -> Iterator[Pictures]:
+    """Write what a run leaves: ``metrics.json`` first, then pictures, then the page.
+
+    What cannot be drawn or written is left out, with a line on stderr; the figures are printed
+    where ``metrics.json`` cannot be written, e.g. to a full disk.
 
     Args:
-        run: the run.
-        embed: put its pictures into the page; otherwise the page must lie beside them.
+        out: folder of the run.
+        title: heading of the page.
+        metrics: figures by name.
+        keys: default and meaning of the config's keys. Default: unknown.
 
-    Returns:
-        HTML.
+    Yields:
+        The pictures to draw.
     """
-    pictures = [
-        picture(run.path / file, words, embed=embed) for file, words in run.pictures.items()
-    ]
-    panels: list[Html] = []
+    written = False
+    with left_out("metrics.json"):
+        write_json(out / "metrics.json", metrics)
+        written = True
+    if not written:
+        print(json.dumps(metrics, indent=1, default=str))
+    pictures = Pictures(out)
+    with left_out("what was still to be drawn"):
+        yield pictures
+    with left_out("index.html"):
+        file = out / "index.html"
+        write_page(file, title=title, metrics=metrics, pictures=pictures.captions, keys=keys)
+        print(f"Pictures and figures: {file}")
+
+
+def write_page(
+    path: Path,
+    *,
+    title: str,
+    metrics: Mapping[str, Any],
+    pictures: Mapping[str, str],
+    keys: Keys | None = None,
+) -> None:
+    """Write a run's page, and beside it what it takes to write it again; everything is escaped."""
+    write_json(path.parent / "page.json", {"title": title, "pictures": dict(pictures)})
+    run = read_run(path.parent) if is_run(path.parent) else RunFolder(path.parent)
+    for name in ("config", "versions"):
+        run.record.setdefault(name, metrics.get(name, {}))
+    run.metrics = {k: v for k, v in metrics.items() if k not in ("config", "versions")}
+    run.title, run.pictures, run.keys = title, dict(pictures), keys or {}
+    write_sections(path, title, run_sections(run))
+
+
+def write_run_page(run: RunFolder, out: str | Path | None = None) -> Path:
+    """Write the page of a run from what is in its folder, finished or not."""
+    say_damage(run)
+    file = run.path / "index.html" if out is None else Path(out)
+    if out is not None and file.name == "index.html" and is_run(file.parent):
+        if not file.parent.samefile(run.path):
+            raise ValueError(f"{file} is the page of another run. Choose another place with out=.")
+    refuse_foreign(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_sections(file, run.title or run.name, run_sections(run, embed=out is not None))
+    return file
+
+
+def say_damage(*runs: RunFolder) -> None:
+    """Say on stderr which files of runs cannot be read; their pages say so too."""
+    for run in runs:
+        for sentence in run.damage:
+            print(sentence, file=sys.stderr)
+
+
+def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
+    """Return what stands on the page of a run."""
+    panels = []
     with left_out("the curves of the page"):
+        from torchrl_hmcts.trainers.figures.curves import panel  # loads matplotlib
+
         panels += [
-            drawing(panel(name, {"": [curve]}), name)
+            drawing(panel(name, [[(curve.steps, curve.values)]], curve.step_label), name)
             for name, curve in run.curves.items()
             if len(curve.steps) > 1
         ]
-    return page(
-        run.title or run.name,
-        Html(f'<p class="lead">{text(_lead(run))}</p>'),
-        damage_of(run),
-        grid(pictures, "pictures"),
-        section("Figures", result_tables(run.metrics)),
-        section("Evaluated again", *map(_evaluation, run.evaluations)),
-        section("Curves", grid(panels, "panels")),
-        section("Config", config_table(run.experiment, run.config)),
-        section("How it was made", made_by(run)),
-    )
+    files = run.pictures.items()
+    machine = run.record.get("machine") or {}
+    facts = {
+        "versions": ", ".join(f"{k} {v}" for k, v in (run.record.get("versions") or {}).items()),
+        "machine": f"{machine['cpus']} CPUs, {machine['platform']}" if machine else "",
+        "status": run.status,
+    }
+    resume = []
+    if not run.finished and "out" in run.config:
+        resume = [f"hmcts train {shlex.quote('resume=' + shown_path(str(run.config['out'])))}"]
+    known = [(name, value) for name, value in facts.items() if value]
+    return [
+        Section(
+            words=[_lead(run), *damage_of(run)],
+            pictures=[picture(run.path / file, words, embed=embed) for file, words in files],
+        ),
+        Section("Figures", columns=result_tables(run.metrics)),
+        Section("Evaluated again", inside=[_evaluation(e) for e in run.evaluations]),
+        Section("Curves", panels=panels),
+        Section("Config", tables=config_tables(run)),
+        Section("Continue it with", code=resume),
+        Section(
+            "How it was made",
+            code=run.record.get("commands", []),
+            tables=[Table(known)] if known else [],
+        ),
+    ]
 
 
-def damage_of(run: RunFolder) -> Html:
+def damage_of(run: RunFolder) -> list[str]:
     """Return a sentence for each file of a run that cannot be read."""
-    return Html("".join(f'<p class="lead">Damaged: {text(words)}</p>' for words in run.damage))
+    return [f"Damaged: {words}" for words in run.damage]
 
 
-def result_tables(metrics: Mapping[str, Any]) -> Html:
+def result_tables(metrics: Mapping[str, Any], prefix: str = "") -> list[Table]:
     """Return figures as tables, one for each group; a mean with its quantiles is one row."""
-    return grid((f"<div>{part}</div>" for part in _tables(metrics, "")), "groups")
-
-
-def _tables(metrics: Mapping[str, Any], prefix: str) -> list[Html]:
-    """The table of a group, and those of the groups in it; ``prefix`` ends with a dot."""
     rows: list[tuple[Any, Any]] = []
-    inner: list[Html] = []
+    inner: list[Table] = []
+    heading = (prefix[:-1]).replace(".", ": ").replace("_", " ")
     for name, value in metrics.items():
-        key = Html(f'<span title="{text(prefix + name)}">{text(name.replace("_", " "))}</span>')
+        words = name.replace("_", " ")
+        key = Cell(words, title=prefix + name)
         if is_spread(value):
             others = ", ".join(f"{k} {plain(v)}" for k, v in value.items() if k != "mean")
-            rows.append((key, Html(f"{text(value['mean'])} <small>{text(others)}</small>")))
+            rows.append((key, Cell(value["mean"], beside=others)))
         elif name == "unsolved" and isinstance(value, list):  # which mazes, not how many
             rows.append((key, len(value)))
             rows.append(("indices of the unsolved mazes", value))
         elif isinstance(value, Mapping):
-            inner += _tables(value, f"{prefix}{name}.")
+            inner += result_tables(value, f"{prefix}{name}.")
         elif _are_records(value):
             head = [column.replace("_", " ") for column in value[0]]
-            title = (prefix + name).replace(".", ": ").replace("_", " ")
-            cells = [
-                [x if isinstance(x, int | float) else plain(x) for x in row.values()]
-                for row in value
-            ]
-            shown = table(cells, head)
-            inner.append(Html(f"<h3>{text(title)}</h3>" + shown))
+            title = f"{heading}: {words}" if heading else words
+            inner.append(Table([list(row.values()) for row in value], head, title))
         else:
             rows.append((key, value))
-    heading = prefix.rstrip(".").replace(".", ": ").replace("_", " ")
-    own = [Html((f"<h3>{text(heading)}</h3>" if heading else "") + table(rows))] if rows else []
-    return own + inner
+    return ([Table(rows, title=heading)] if rows else []) + inner
 
 
 def _are_records(value: Any) -> bool:
@@ -120,53 +192,15 @@ def is_spread(value: Any) -> bool:
     )
 
 
-def flatten(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return nested figures as one list, names joined by dots.
-
-    Example:
-        >>> flatten({"seed": 1, "test": {"solved": 3}})
-        [('seed', 1), ('test.solved', 3)]
-    """
-    rows: list[tuple[str, Any]] = []
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            rows += flatten(value, f"{prefix}{name}.")
-        else:
-            rows.append((f"{prefix}{name}", value))
-    return rows
-
-
-def config_table(experiment: str, config: Mapping[str, Any]) -> Html:
-    """Return the keys with their values and meaning; what is not the default stands out."""
-    defaults: dict[str, Any] = {}
-    meanings: dict[str, str] = {}
-    if experiment in ALL_EXPERIMENTS:
-        config_class = ALL_EXPERIMENTS[experiment].config_class
-        defaults = {field.name: field.default for field in fields(config_class)}
-        meanings = field_docs(config_class)
+def config_tables(run: RunFolder) -> list[Table]:
+    """Return the keys of a run with values and meaning; what is not the default stands out."""
     rows = []
-    for key, value in config.items():
-        shown = text(shown_path(value) if isinstance(value, str) else _exact(value))
-        if key in defaults and value != defaults[key]:
-            was = text(_exact(defaults[key]))
-            shown = f'<span class="changed" title="default: {was}">{shown}</span>'
-        rows.append((Html(f"<code>{text(key)}</code>"), Html(shown), meanings.get(key, "")))
-    return table(rows, ("key", "value", "meaning"), "stack") if rows else Html("")
-
-
-def made_by(run: RunFolder) -> Html:
-    """Return command, versions and machine."""
-    commands = "".join(f"<pre>{text(c)}</pre>" for c in run.record.get("commands", []))
-    facts = []
-    versions = run.record.get("versions") or {}
-    if versions:
-        facts.append(("versions", ", ".join(f"{k} {v}" for k, v in versions.items())))
-    machine = run.record.get("machine") or {}
-    if machine:
-        facts.append(("machine", f"{machine.get('cpus')} CPUs, {machine.get('platform')}"))
-    if run.status:
-        facts.append(("status", run.status))
-    return Html(commands + (table(facts) if facts else ""))
+    for key, value in run.config.items():
+        default, meaning = run.keys.get(key, (value, ""))
+        shown = shown_path(value) if isinstance(value, str) else _exact(value)
+        was = "" if value == default else f"default: {_exact(default)}"
+        rows.append((Cell(key, code=True), Cell(shown, kind="changed", title=was), meaning))
+    return [Table(rows, ("key", "value", "meaning"), kind="stack")] if rows else []
 
 
 def _lead(run: RunFolder) -> str:
@@ -180,11 +214,13 @@ def _lead(run: RunFolder) -> str:
     return ", ".join(words)
 
 
-def _evaluation(evaluation: Mapping[str, Any]) -> Html:
+def _evaluation(evaluation: Mapping[str, Any]) -> Section:
     changes = ", ".join(f"{k}={_exact(v)}" for k, v in evaluation.get("changes", {}).items())
-    heading = f"<h3>{text(changes or 'with the config of the run')}</h3>"
-    command = f"<pre>{text(evaluation.get('command', ''))}</pre>"
-    return Html(heading + command + result_tables(evaluation.get("results", {})))
+    return Section(
+        changes or "with the config of the run",
+        code=[evaluation.get("command", "")],
+        columns=result_tables(evaluation.get("results", {})),
+    )
 
 
 def _exact(value: Any) -> str:

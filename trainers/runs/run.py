@@ -16,16 +16,22 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, ExperimentError
+from torchrl_hmcts.trainers.experiments.registry import (
+    ALL_EXPERIMENTS,
+    ExperimentError,
+    config_keys,
+)
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS
-from torchrl_hmcts.trainers.runs.folder import (
+from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
+from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
     end_record,
+    machine,
     read_run,
     start_record,
+    versions,
 )
-from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled, stop_asked
 
 _RECORDS = ("run.json", "metrics.json", "evaluation.json", "page.json", "curves.csv", "index.html")
@@ -89,9 +95,10 @@ class Run:
         Yields:
             The pictures to draw.
         """
-        from torchrl_hmcts.trainers.figures.report import finish
+        from torchrl_hmcts.trainers.figures.run_page import finish
 
-        with finish(self.path, title, metrics) as pictures:
+        keys = config_keys(self.experiment) if self.experiment in ALL_EXPERIMENTS else {}
+        with finish(self.path, title, metrics, keys) as pictures:
             end_record(self.path, "finished")
             yield pictures
 
@@ -143,8 +150,6 @@ def open_run(
         run = Run(config, name, resumes)
         if getattr(config, "overwrite", False):
             clear(run.path)
-        from torchrl_hmcts.trainers.figures.report import machine, versions
-
         start_record(name, config, command, {"versions": versions(), "machine": machine()})
         token = _current.set(run)
         stack.callback(_current.reset, token)

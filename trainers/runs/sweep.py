@@ -20,11 +20,11 @@ from sqlalchemy.pool import NullPool  # Optuna depends on it
 
 from torchrl_hmcts.trainers.experiments.registry import Experiment
 from torchrl_hmcts.trainers.runs.config import home
-from torchrl_hmcts.trainers.runs.folder import read_run
 from torchrl_hmcts.trainers.runs.journal import CheckedJournal
 from torchrl_hmcts.trainers.runs.loggers import observed
 from torchrl_hmcts.trainers.runs.run import next_free, open_run, run_files
 from torchrl_hmcts.trainers.runs.sweep_space import Choice, Dimension
+from torchrl_hmcts.trainers.saving.run_folder import flat, read_run
 
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 _SPACE = "space"  # attribute of a study
@@ -281,7 +281,7 @@ def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
     for part in objective.removeprefix("-").split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        numbers = sorted(name for name, number in _flat(metrics) if isinstance(number, int | float))
+        numbers = sorted(name for name, number in flat(metrics) if isinstance(number, int | float))
         raise ValueError(f"The run has no figure {objective!r}. It has: {', '.join(numbers)}.")
     worst = math.inf if objective.startswith("-") else -math.inf
     return float(value) if math.isfinite(value) else worst
@@ -335,13 +335,3 @@ def importances(study: optuna.Study) -> dict[str, float]:
     except (ValueError, RuntimeError):  # e.g. a key that took one value only
         return {}
     return {key: float(value) for key, value in found.items()}
-
-
-def _flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            rows += _flat(value, f"{prefix}{name}.")
-        else:
-            rows.append((prefix + name, value))
-    return rows

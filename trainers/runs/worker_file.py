@@ -10,13 +10,13 @@ from pathlib import Path
 
 from torchrl.objectives import LossModule
 
-from torchrl_hmcts.trainers.runs.folder import read_run
 from torchrl_hmcts.trainers.saving.checkpoints import (
     find_damage,
     newest_checkpoint,
     plain_checkpoint,
 )
 from torchrl_hmcts.trainers.saving.files import replacing
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.stopping import unbroken
 
 _NAME = re.compile(r"worker-(\d+)\.torchrl")

@@ -1,10 +1,10 @@
 """Checkpoints that a crash, a full disk or a damaged file cannot turn into a lost run.
 
 TorchRL's ``Checkpoint`` decides what is saved; here is how it reaches the disk. A checkpoint is one
-file: it is written under another name, flushed to the disk, and only then given its name, so that a
-file with that name is whole, whenever the process was killed. A digest tells damage, and the newest
-whole checkpoint is taken. What is inside are JSON and plain arrays; nothing in a checkpoint can be
-executed.
+file: it is written under another name, sealed with a digest, flushed to the disk, and only then
+given its name. A file with that name is whole, whenever the process was killed; a digest that
+differs tells damage, and the newest whole checkpoint is taken. Inside are JSON and plain arrays:
+nothing in a checkpoint can be executed.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ __all__ = [
     "read_state",
 ]
 
-_PLAIN = {".json", ".memmap"}
+_PREFIX = "checkpoint"
 
 
 class PlainStateAdapter(StateDictCheckpointAdapter):
@@ -66,17 +66,6 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
 
     Raises:
         CheckpointError: on loading, if there is a file of another kind.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> import torch
-        >>> from torchrl_hmcts.trainers.saving.checkpoints import PlainStateAdapter
-        >>> one, two = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
-        >>> _ = PlainStateAdapter().save(one, Path("linear"), args=(), kwargs={})
-        >>> PlainStateAdapter().load(two, Path("linear"), map_location=None,
-        ...                          tensor_load_kwargs={}, args=(), kwargs={})
-        >>> torch.equal(one.weight, two.weight)
-        True
     """
 
     def save(
@@ -87,34 +76,25 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
         schema = _encode_state_dict_value(state, tensors)
         folder = path / self.state_directory
         folder.mkdir(parents=True, exist_ok=True)
-        meta: dict[str, Any] = {}
+        meta: dict[str, Any] = {
+            "shape": [],
+            "device": "cpu",
+            "_type": "<class 'tensordict._td.TensorDict'>",
+        }
         for key, tensor in tensors.items():
             plain = tensor.detach().cpu().contiguous()
-            (folder / f"{key}.memmap").write_bytes(_bytes(plain))
-            meta[key] = {
-                "device": "cpu",
-                "shape": list(plain.shape),
-                "dtype": str(plain.dtype),
-                "is_nested": False,
-            }
-        meta.update(shape=[], device="cpu", _type="<class 'tensordict._td.TensorDict'>")
+            data = plain.reshape(-1).view(torch.uint8).numpy().tobytes() if plain.numel() else b"\0"
+            (folder / f"{key}.memmap").write_bytes(data)
+            kind = {"dtype": str(plain.dtype), "is_nested": False}
+            meta[key] = {"device": "cpu", "shape": list(plain.shape), **kind}
         (folder / "meta.json").write_text(json.dumps(meta), encoding="utf-8")
         text = json.dumps(schema, separators=(",", ":")) + "\n"
         (path / self.schema_filename).write_text(text, encoding="utf-8")
         return state
 
-    def load(
-        self,
-        component: Any,
-        path: Path,
-        *,
-        map_location: Any,
-        tensor_load_kwargs: Mapping[str, Any],
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> Any:
+    def load(self, component: Any, path: Path, *, map_location: Any, **options: Any) -> Any:
         for file in path.rglob("*"):
-            if file.is_symlink() or (file.is_file() and file.suffix not in _PLAIN):
+            if file.is_symlink() or (file.is_file() and file.suffix not in (".json", ".memmap")):
                 raise CheckpointError(
                     f"the checkpoint holds {file.name!r}, and only JSON and plain arrays are "
                     "read: other files could execute code. It was not written by this package."
@@ -122,11 +102,7 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
         schema = json.loads((path / self.schema_filename).read_text(encoding="utf-8"))
         arrays = read_arrays(path / self.state_directory)
         state = _decode_state_dict_value(schema, arrays, map_location)
-        component.load_state_dict(state, *args, **kwargs)
-
-
-def _bytes(tensor: torch.Tensor) -> bytes:
-    return tensor.reshape(-1).view(torch.uint8).numpy().tobytes() if tensor.numel() else b"\0"
+        component.load_state_dict(state, *options["args"], **options["kwargs"])
 
 
 class _PlainCheckpoint(Checkpoint):
@@ -135,20 +111,12 @@ class _PlainCheckpoint(Checkpoint):
     def save(
         self, path: str | Path, *, metadata: Mapping[str, Any] | None = None, **kwargs: Any
     ) -> Path:
-        if (kwargs.get("format") or self.format) != "archive":
-            return super().save(path, metadata=metadata, **kwargs)
-        metadata = dict(metadata or {})
-        ours = {"version": __version__, "checkpoint_version": CHECKPOINT_VERSION, "sealed": True}
-        metadata["torchrl_hmcts"] = {**ours, **metadata.get("torchrl_hmcts", {})}
-        final = self._local_path(path)
-        final.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(final) as temporary:
-            super().save(temporary, metadata=metadata, **kwargs)
-            seal(temporary)
-        return final
+        if (kwargs.pop("format", None) or self.format) != "archive":
+            return super().save(path, metadata=metadata, format="directory", **kwargs)
+        return _write(self, Path(path).expanduser(), metadata or {}, **kwargs)
 
     def load(self, path: str | Path, **kwargs: Any) -> Any:
-        _check_whole(self._local_path(path))
+        _check_whole(Path(path).expanduser())
         return super().load(path, **kwargs)
 
 
@@ -172,7 +140,7 @@ def plain_checkpoint(**components: Any) -> Checkpoint:
 
 
 def read_state(path: str | Path, name: str) -> Any:
-    """Return what a component of a checkpoint was saved with, without building the component.
+    """Return the saved state of a component, without building the component.
 
     Args:
         path (path): of a checkpoint.
@@ -180,13 +148,6 @@ def read_state(path: str | Path, name: str) -> Any:
 
     Raises:
         CheckpointError: if the checkpoint is damaged, or has no such component.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint, read_state
-        >>> path = plain_checkpoint(net=torch.nn.Linear(2, 1)).save("linear.torchrl")
-        >>> list(read_state(path, "net"))
-        ['weight', 'bias']
     """
     held = _Held()
     plain_checkpoint(**{name: held}).load(path, map_location="cpu")
@@ -231,13 +192,22 @@ class DurableRotation(CheckpointRotation):
     def __init__(
         self, directory: str | Path, *, keep_last: int = 2, overwrite: bool = False
     ) -> None:
-        super().__init__(directory, keep_last=keep_last)
+        super().__init__(directory, keep_last=keep_last, prefix=_PREFIX)
         self.settings: dict[str, Any] = {}
         self.overwrite = overwrite
         self._began = False
         self._others: tuple[Path, ...] = ()  # of another run, which is overwritten
         self._good: dict[Path, tuple[int, ...]] = {}  # which files were found whole
-        _check_writable(self.directory)
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.directory):
+                pass
+        except OSError as error:
+            raise OSError(
+                error.errno,
+                f"checkpoints cannot be written to {str(self.directory)!r} ({error.strerror}). "
+                "Choose a save_dir that can be written to",
+            ) from error
 
     def continue_from(self, path: Path) -> None:
         """Note that the run continues from a checkpoint, perhaps one of those in this folder."""
@@ -273,28 +243,12 @@ class DurableRotation(CheckpointRotation):
         Raises:
             OSError: if it cannot be written, e.g. to a full disk. What was there is still there.
         """
-        self._validate_step(step)
-        final = self._checkpoint_path(step, "archive")
-        ours = {
-            "version": __version__,
-            "checkpoint_version": CHECKPOINT_VERSION,
-            "settings": self.settings,
-            "serial": 1 + max((serial for serial, _ in self._ordered()), default=0),
-            "sealed": True,
-        }
+        final = self.directory / f"{_PREFIX}-{step:012d}.torchrl"
+        serial = 1 + max((number for number, _ in _ordered(self.directory)), default=0)
+        ours = {"settings": self.settings, "serial": serial}
+        chosen = {"components": components, "component_options": component_options}
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
-            remove_leftovers(self.directory)
-            with replacing(final) as temporary:
-                Checkpoint.save(
-                    checkpoint,
-                    temporary,
-                    components=components,
-                    component_options=component_options,
-                    format="archive",
-                    metadata={**(metadata or {}), "torchrl_hmcts": ours},
-                )
-                seal(temporary)
+            _write(checkpoint, final, {**(metadata or {}), "torchrl_hmcts": ours}, **chosen)
         except OSError as error:
             raise OSError(error.errno, self._not_written(step, error)) from error
         self._good[final] = _identity(final)
@@ -309,41 +263,11 @@ class DurableRotation(CheckpointRotation):
 
         Each has a number one above those that it found. No clock is read: it may be set back.
         """
-        return tuple(path for _, path in self._ordered())
-
-    def _ordered(self) -> list[tuple[int, Path]]:
-        """Number and path of each; a number that cannot be read is the one before in steps."""
-        if not self.directory.is_dir():
-            return []
-        name = re.compile(rf"{re.escape(self.prefix)}-(\d+)(\.torchrl)?")
-        steps = {
-            path: int(match[1])
-            for path in self.directory.iterdir()
-            if (match := name.fullmatch(path.name))
-        }
-        found, before = [], 0
-        for path in sorted(steps, key=lambda path: (steps[path], path.name)):
-            with contextlib.suppress(CheckpointError):
-                before = read_manifest(path)["metadata"]["torchrl_hmcts"].get("serial", 0)
-            found.append((before, path))
-        return sorted(found, key=lambda entry: entry[0])  # stable: by step where numbers are equal
+        return tuple(path for _, path in _ordered(self.directory))
 
     def latest(self) -> Path | None:
         """Return the newest checkpoint that is whole; a line on stderr names damaged ones."""
-        damaged: list[str] = []
-        for path in reversed(self.checkpoints()):
-            damage = find_damage(path)
-            if damage is None:
-                if damaged:
-                    print(f"{' '.join(damaged)} Continuing from {path.name}.", file=sys.stderr)
-                return path
-            damaged.append(f"Checkpoint {path.name} is damaged ({damage}).")
-        if damaged:
-            raise CheckpointError(
-                f"No checkpoint in {str(self.directory)!r} is whole. {' '.join(damaged)} Start "
-                "again in another folder, or restore one from a backup."
-            )
-        return None
+        return _newest_whole(self.directory)
 
     def prune(self) -> tuple[Path, ...]:
         """Remove what is older than the ``keep_last`` newest whole checkpoints; return it."""
@@ -383,8 +307,8 @@ def newest_checkpoint(path: str | Path) -> Path:
     """Return the checkpoint that a path names.
 
     Args:
-        path (path): a checkpoint, or a folder of checkpoints, of which the newest whole one is
-            taken; a line on stderr names damaged ones.
+        path (path): a checkpoint, or a folder of checkpoints, which may be read-only, of which the
+            newest whole one is taken; a line on stderr names damaged ones.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -394,7 +318,7 @@ def newest_checkpoint(path: str | Path) -> Path:
     if path.is_file() or (path / "manifest.json").exists():
         _check_whole(path)
         return path
-    found = _Reader(path).latest() if path.is_dir() else None
+    found = _newest_whole(path)
     if found is None:
         raise FileNotFoundError(
             f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to continue, "
@@ -403,11 +327,50 @@ def newest_checkpoint(path: str | Path) -> Path:
     return found
 
 
-class _Reader(DurableRotation):
-    """A folder of checkpoints that may be read-only."""
+def _write(checkpoint: Checkpoint, path: Path, metadata: Mapping[str, Any], **kwargs: Any) -> Path:
+    """Write a checkpoint of one file and its seal in one move."""
+    ours = {"version": __version__, "checkpoint_version": CHECKPOINT_VERSION, "sealed": True}
+    ours = {**ours, **metadata.get("torchrl_hmcts", {})}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(path.parent)
+    with replacing(path) as temporary:
+        content = {**metadata, "torchrl_hmcts": ours}
+        Checkpoint.save(checkpoint, temporary, format="archive", metadata=content, **kwargs)
+        seal(temporary)
+    return path
 
-    def __init__(self, directory: Path) -> None:
-        CheckpointRotation.__init__(self, directory, keep_last=1)
+
+def _ordered(directory: Path) -> list[tuple[int, Path]]:
+    """Number and path of each checkpoint; one that cannot be read has that of the step before."""
+    name = re.compile(rf"{_PREFIX}-(\d+)(\.torchrl)?")
+    steps = {
+        path: int(match[1])
+        for path in (directory.iterdir() if directory.is_dir() else ())
+        if (match := name.fullmatch(path.name))
+    }
+    found, before = [], 0
+    for path in sorted(steps, key=lambda path: (steps[path], path.name)):
+        with contextlib.suppress(CheckpointError):
+            before = read_manifest(path)["metadata"]["torchrl_hmcts"].get("serial", 0)
+        found.append((before, path))
+    return sorted(found, key=lambda entry: entry[0])  # stable: by step where numbers are equal
+
+
+def _newest_whole(directory: Path) -> Path | None:
+    damaged: list[str] = []
+    for _, path in reversed(_ordered(directory)):
+        damage = find_damage(path)
+        if damage is None:
+            if damaged:
+                print(f"{' '.join(damaged)} Continuing from {path.name}.", file=sys.stderr)
+            return path
+        damaged.append(f"Checkpoint {path.name} is damaged ({damage}).")
+    if damaged:
+        raise CheckpointError(
+            f"No checkpoint in {str(directory)!r} is whole. {' '.join(damaged)} Start again in "
+            "another folder, or restore one from a backup."
+        )
+    return None
 
 
 def _check_whole(path: Path) -> None:
@@ -417,19 +380,6 @@ def _check_whole(path: Path) -> None:
             f"The checkpoint {str(path)!r} is damaged ({damage}). Pass its folder to continue from "
             "the newest one that is whole."
         )
-
-
-def _check_writable(directory: Path) -> None:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=directory):
-            pass
-    except OSError as error:
-        raise type(error)(
-            error.errno,
-            f"checkpoints cannot be written to {str(directory)!r} ({error.strerror}). Choose a "
-            "save_dir that can be written to",
-        ) from error
 
 
 def _identity(path: Path) -> tuple[int, ...]:

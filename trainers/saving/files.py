@@ -1,7 +1,7 @@
 """Files that are written in one move, and files that a run can do without.
 
 Whoever reads a file finds the old content or the new one, never half of it. A picture that cannot
-be drawn or written is left out, with a line on stderr; the run goes on.
+be drawn or written is left out, with a line on stderr; the run continues.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ def replacing(path: str | Path) -> Iterator[Path]:
         OSError: if the file cannot be written, e.g. to a full disk.
 
     Example:
-        >>> from torchrl_hmcts.trainers.saving.files import replacing
         >>> with replacing("numbers.txt") as temporary:
         ...     _ = temporary.write_text("1 2 3", encoding="utf-8")
         >>> temporary.exists(), Path("numbers.txt").exists()
@@ -59,19 +58,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text as UTF-8 in one move.
-
-    Args:
-        path (path): file.
-        text (str): its content.
-
-    Raises:
-        OSError: if it cannot be written.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.saving.files import write_text
-        >>> write_text("metrics.json", "{}")
-    """
+    """Write a text as UTF-8 in one move; raises ``OSError`` if it cannot."""
     with replacing(path) as temporary:
         # A name from a locale without UTF-8 holds bytes as surrogates: they become bytes again.
         temporary.write_bytes(text.encode("utf-8", "surrogateescape"))
@@ -87,8 +74,9 @@ def write_json(path: str | Path, content: Any, *, checksum: bool = False) -> Non
             damage. Default ``False``.
 
     Example:
-        >>> from torchrl_hmcts.trainers.saving.files import write_json
-        >>> write_json("metrics.json", {"solved": 0, "frames": float("nan")})
+        >>> write_json("trials.json", {"seed": 1, "frames": float("nan")}, checksum=True)
+        >>> read_json("trials.json")
+        {'seed': 1, 'frames': None}
     """
     content = finite(content)
     if checksum:
@@ -104,12 +92,6 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
     Raises:
         ValueError: if it is cut off, no JSON, no dict, or differs from its checksum.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.saving.files import read_json, write_json
-        >>> write_json("trials.json", {"seed": 1}, checksum=True)
-        >>> read_json("trials.json")
-        {'seed': 1}
     """
     try:
         content = json.loads(Path(path).read_bytes().decode("utf-8"))
@@ -125,9 +107,6 @@ def read_json(path: str | Path) -> dict[str, Any]:
 def digest(content: Any) -> str:
     """Return the SHA-256 of numbers and texts as they come back from JSON, in any layout.
 
-    Args:
-        content: dicts, lists, texts and numbers.
-
     Example:
         >>> digest({"a": 1, "b": (2,)}) == digest({"b": [2], "a": 1})
         True
@@ -137,19 +116,7 @@ def digest(content: Any) -> str:
 
 
 def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table as CSV in one move.
-
-    Args:
-        path (path): file.
-        head (list of str): names of the columns.
-        rows: their values.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.saving.files import write_csv
-        >>> write_csv("curves.csv", ("step", "value"), [(0, 0.5)])
-        >>> Path("curves.csv").read_text(encoding="utf-8").splitlines()
-        ['step,value', '0,0.5']
-    """
+    """Write a table as CSV in one move: names of the columns, and rows of values."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([head, *rows])
     write_text(path, text.getvalue())
@@ -175,11 +142,7 @@ def left_out(name: str) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder, if it is there.
-
-    Args:
-        path (path): of the file or folder; a link is removed, not what it leads to.
-    """
+    """Remove a file or a folder, if it is there; of a link, the link and not its target."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -203,11 +166,7 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
 def finite(content: Any) -> Any:
     """Return content with None in place of a number that is not finite: JSON has no other.
 
-    Args:
-        content: dicts, lists, texts and numbers, NumPy's as well.
-
     Example:
-        >>> from torchrl_hmcts.trainers.saving.files import finite
         >>> finite({"frames": [float("inf"), 2]})
         {'frames': [None, 2]}
     """

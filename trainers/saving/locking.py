@@ -44,10 +44,8 @@ def folder_locked(
 ) -> Iterator[None]:
     """Keep other processes, and other threads of this one, from writing to a folder.
 
-    The lock is the operating system's (``flock`` on the file ``.lock`` in the folder): it vanishes
-    with the process, however that ends. Children do not inherit it: one that outlives the run does
-    not keep the folder. Where a file system has no such locks, a line on stderr says so and the
-    context is entered without.
+    The lock is the operating system's (``flock``): it vanishes with the process, however that ends,
+    and children do not inherit it. Where a file system has no such locks, a line on stderr says so.
 
     Args:
         folder: that exists.
@@ -58,9 +56,8 @@ def folder_locked(
         FolderInUse: if another holds it.
 
     Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder, folder_locked(folder):
-        ...     is_locked(folder)
+        >>> with folder_locked("."):
+        ...     is_locked(".")
         True
     """
     path = Path(folder, name)
@@ -77,15 +74,7 @@ def folder_locked(
 
 
 def is_locked(folder: str | Path) -> bool:
-    """Return whether a process holds the lock of a folder; changes nothing.
-
-    Args:
-        folder: that may not exist.
-
-    Example:
-        >>> is_locked("nowhere")
-        False
-    """
+    """Return whether a process holds the lock of a folder, which may not exist."""
     if fcntl is None:
         return False
     try:
@@ -117,11 +106,8 @@ def _take(path: Path, wait: bool) -> int | None:
             raise FolderInUse(path.parent, holder) from None
         except OSError as error:
             os.close(handle)
-            print(
-                f"{path.parent} cannot be locked ({error}): see to it yourself that no other run "
-                "writes to it.",
-                file=sys.stderr,
-            )
+            words = "see to it yourself that no other run writes to it"
+            print(f"{path.parent} cannot be locked ({error}): {words}.", file=sys.stderr)
             return None
         with contextlib.suppress(OSError):  # whoever held it may have removed the file meanwhile
             if os.fstat(handle).st_ino == os.stat(path).st_ino:

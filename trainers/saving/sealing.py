@@ -28,9 +28,9 @@ CHECKPOINT_VERSION = 1
 MAX_UNPACKED_BYTES = 2**31
 """Bytes to which a checkpoint may unpack: 2 GiB, or its own size on the disk if that is more (what
 is written here is not compressed). The variable ``TORCHRL_HMCTS_MAX_UNPACKED_BYTES`` raises it."""
-MANIFEST = "manifest.json"
 _SEAL = b"torchrl_hmcts sha256 "
 _HEX = 64  # digits of the digest
+_TYPES = {"settings": dict, "checkpoint_version": int, "serial": int}  # of what is read here
 
 
 class NewerCheckpointError(CheckpointError):
@@ -46,15 +46,7 @@ def seal(path: Path) -> None:
 
 
 def read_manifest(path: str | Path) -> dict[str, Any]:
-    """Return the manifest of a checkpoint; what of it is read here has its right type.
-
-    Args:
-        path (path): of a checkpoint, a file or a folder.
-
-    Raises:
-        FileNotFoundError: if there is nothing.
-        CheckpointError: if it is damaged, of a newer version, or would unpack to too much.
-    """
+    """Return the manifest of a checkpoint; what of it is read here has its right type."""
     path = Path(path)
     try:
         if path.is_file():
@@ -62,10 +54,8 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
                 _check_size(path, archive)
         manifest = Checkpoint.manifest(path)
         ours = manifest.setdefault("metadata", {}).setdefault("torchrl_hmcts", {})
-        if not isinstance(ours, dict):
-            raise TypeError(f"torchrl_hmcts is {ours!r}")
-        for name, kind in (("settings", dict), ("checkpoint_version", int), ("serial", int)):
-            if name in ours and type(ours[name]) is not kind:
+        for name, kind in _TYPES.items():
+            if type(ours.get(name, kind())) is not kind:
                 raise TypeError(f"{name} is {ours[name]!r}")
     except FileNotFoundError:
         raise
@@ -131,23 +121,7 @@ def find_damage(path: str | Path) -> str | None:
 
 
 def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint of a run with other settings.
-
-    Args:
-        path (path): of a checkpoint.
-        settings (mapping): of this run. Names that only one of the two has are not compared.
-
-    Raises:
-        CheckpointError: naming each value that differs.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_hmcts.trainers.saving.checkpoints import check_settings, plain_checkpoint
-        >>> checkpoint = plain_checkpoint(net=torch.nn.Linear(2, 1))
-        >>> path = checkpoint.save(
-        ...     "linear.torchrl", metadata={"torchrl_hmcts": {"settings": {"batch_size": 64}}})
-        >>> check_settings(path, {"batch_size": 64})
-    """
+    """Refuse a checkpoint of a run with other settings; names that one lacks are skipped."""
     other = read_manifest(path)["metadata"]["torchrl_hmcts"].get("settings", {})
     here = json.loads(json.dumps(dict(settings)))
     differing = [
@@ -165,11 +139,7 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
 def read_arrays(folder: Path) -> dict[str, torch.Tensor]:
     """Read the arrays of a component, as TorchRL writes them, with ordinary reads.
 
-    Args:
-        folder (path): with ``meta.json`` and a file for each array.
-
-    Raises:
-        CheckpointError: if a file is shorter than its array.
+    TorchRL's own reader picks a class by a name in ``meta.json`` and may unpickle other files.
     """
     arrays = {}
     for key, (dtype, shape, file, size) in _array_files(folder).items():
@@ -196,10 +166,7 @@ def _digest(file: Any, end: int) -> bytes:
     """Digest of the first bytes of an open file, in hexadecimal digits; leaves it at their end."""
     found, left = hashlib.sha256(), end
     file.seek(0)
-    while left:
-        block = file.read(min(left, 2**20))
-        if not block:
-            break
+    while block := file.read(min(left, 2**20)):
         found.update(block)
         left -= len(block)
     return found.hexdigest().encode()
@@ -207,8 +174,7 @@ def _digest(file: Any, end: int) -> bytes:
 
 def _is_sealed(path: Path) -> bool | None:
     """Whether the digest at the end is right; None if there is none."""
-    size = path.stat().st_size
-    end = size - _HEX
+    end = path.stat().st_size - _HEX
     if end < len(_SEAL):
         return None
     with path.open("rb") as file:
@@ -239,7 +205,7 @@ def _inventory(manifest: Mapping[str, Any]) -> list[str]:
 
 def _archive_damage(archive: zipfile.ZipFile, manifest: Mapping[str, Any]) -> str | None:
     names = Counter(archive.namelist())
-    expected = {MANIFEST, *_inventory(manifest)}
+    expected = {"manifest.json", *_inventory(manifest)}
     for name, number in names.items():
         if number > 1:
             return f"{name} is in it {number} times"

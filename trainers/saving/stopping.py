@@ -88,15 +88,10 @@ def _say(words: str) -> None:
 
 @contextlib.contextmanager
 def signals_handled() -> Iterator[None]:
-    """Make Ctrl-C and SIGTERM raise :class:`Stopped` while in the context.
+    """Make Ctrl-C and SIGTERM raise :class:`Stopped` while in the context; may be nested.
 
     Handlers that the program set itself stay, and so does a signal that is ignored. Without effect
-    in other threads than the main one, where Python calls no handlers. May be nested.
-
-    Example:
-        >>> with signals_handled():
-        ...     stop_asked()
-        False
+    in other threads than the main one, where Python calls no handlers.
     """
     if _state.before or threading.current_thread() is not threading.main_thread():
         yield
@@ -122,63 +117,38 @@ if hasattr(os, "register_at_fork"):
 
 
 def stop_asked() -> bool:
-    """Return whether a signal has asked this process to stop.
-
-    Example:
-        >>> stop_asked()
-        False
-    """
+    """Return whether a signal has asked this process to stop."""
     return bool(_state.signum)
 
 
 def raise_if_asked() -> None:
-    """Raise :class:`Stopped` if a signal has asked for it; call it where a run has been saved.
-
-    Example:
-        >>> raise_if_asked()
-    """
+    """Raise :class:`Stopped` if a signal has asked for it; call it where a run has been saved."""
     if _state.signum:
         _state.raised_at = time.monotonic()
         raise Stopped(_state.signum)
 
 
-@contextlib.contextmanager
-def patient() -> Iterator[None]:
+def patient() -> contextlib.AbstractContextManager[None]:
     """Let the first signal only ask, since the code inside looks at :func:`stop_asked`.
 
     A second one, a second later or more, raises :class:`Stopped` at once.
-
-    Example:
-        >>> with patient():
-        ...     raise_if_asked()
     """
-    with signals_handled():
-        _state.patient += 1
-        try:
-            yield
-        finally:
-            _state.patient = max(0, _state.patient - 1)
-        _raise_what_waited()
+    return _counted("patient")
+
+
+def unbroken() -> contextlib.AbstractContextManager[None]:
+    """Let signals wait for the end of the context, e.g. of the writing of a checkpoint."""
+    return _counted("unbroken")
 
 
 @contextlib.contextmanager
-def unbroken() -> Iterator[None]:
-    """Let signals wait for the end of the context, e.g. of the writing of a checkpoint.
-
-    Example:
-        >>> with unbroken():
-        ...     stop_asked()
-        False
-    """
+def _counted(name: str) -> Iterator[None]:
+    """Count a context while it is open; at the end of the outermost, raise what has waited."""
     with signals_handled():
-        _state.unbroken += 1
+        setattr(_state, name, getattr(_state, name) + 1)
         try:
             yield
         finally:
-            _state.unbroken = max(0, _state.unbroken - 1)
-        _raise_what_waited()
-
-
-def _raise_what_waited() -> None:
-    if not (_state.raised_at or _state.patient or _state.unbroken):
-        raise_if_asked()
+            setattr(_state, name, max(0, getattr(_state, name) - 1))
+        if not (_state.raised_at or _state.patient or _state.unbroken):
+            raise_if_asked()

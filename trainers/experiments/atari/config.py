@@ -5,19 +5,28 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.trainers.experiments.registry import ExperimentError
 from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
 
-GUIDES = ("none", "prior", "prior_value")
-PROTOCOLS = ("deterministic", "sticky")
-SOURCES = (
-    "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
-    "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable", "diayn_retrained",
+_CHOICES = {
+    "protocol": ("deterministic", "sticky"),
+    "source": (
+        "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
+        "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable",
+        "diayn_retrained",
+    ),
+    "tune_with": ("grid", "optuna"),
+    "tree_policy": ("puct", "uct"),
+    "guide": ("none", "prior", "prior_value"),
+}  # fmt: skip
+_AT_LEAST_ONE = (
+    "frames", "max_episode_frames", "tune_trials", "num_skills", "skill_base_steps",
+    "leaves_per_wave", "waves_in_flight", "trial_steps", "replant_every",
 )  # fmt: skip
+_LEAST = {"option_steps": 0, "rollout_options": 0, "num_processes": -1}
 
 
-@name_arguments
 @dataclass
 class AtariConfig(RunConfig):
     """What ``hmcts train experiment=atari`` does.
@@ -35,32 +44,33 @@ class AtariConfig(RunConfig):
     out: str = "runs/atari"
     """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
     protocol: str = "deterministic"
-    """"deterministic" (comparable with the source and the planning papers) or "sticky" (actions
-    stick with probability 0.25, and the planner is given no random generator)."""
+    """"deterministic" (comparable with the dissertation and the planning papers) or "sticky"
+    (actions stick with probability 0.25, and the planner is given no random generator)."""
     source: str = "best"
-    """Where options come from: "best" ("action_sets", "actions" or "goals", whichever a planner's
-    trials score best with), "goals" (found by a probe and trials), "goals_network" (the
-    same, carried out by one network that learned them), "goals_fine_tuned" (that network, trained
-    further by SAC on its goals and the game), "goals_retrained" (the same on what searches
-    simulated, Algorithm 3), "repeat" (one for each action), "actions"
-    (some of these, chosen by trials), "action_sets" (all of these, those that fire or those that do
-    not, chosen by trials), "diayn" (the source's worker), "diayn_displacement",
-    "diayn_controllable" (with other discriminators), "diayn_retrained" (Algorithm 3)."""
+    """Where options come from. Rules: "best" ("action_sets", "actions" or "goals", with which a
+    planner's trials score best), "goals" (found by a probe and trials), "repeat" (one for each
+    action), "actions" (some of these, chosen by trials), "action_sets" (all of these, those that
+    fire or those that do not, chosen by trials). Networks: "goals_network" (has learned the goals),
+    "goals_fine_tuned" (that network, trained further by SAC on its goals and the game),
+    "goals_retrained" (the same on what searches simulated, Algorithm 3), "diayn" (the
+    dissertation's worker), "diayn_displacement", "diayn_controllable" (with other discriminators),
+    "diayn_retrained" (Algorithm 3)."""
     frames: int = 40_000_000
-    """Emulated frames in all, the source's 10 million base steps; the last episode is finished."""
+    """Emulated frames in all, 10 million base steps as in the dissertation; the last episode is
+    finished."""
     max_episode_frames: int = 108_000
     """Real frames after which an episode ends, the community's half an hour."""
     options_from: str = ""
     """Folder of another run of the game, whose options and their length are taken over; what it
     spent on finding them counts."""
     option_steps: int = 0
-    """Base steps of an option (the source's N_worker_samples); 0: chosen by trials."""
+    """Base steps of an option (the dissertation's N_worker_samples); 0: chosen by trials."""
     tune_trials: int = 4
     """Lengths of options that are tried where `option_steps=0`, of 5, 10, 20, 30."""
     tune_with: str = "grid"
     """"grid" tries the lengths one by one; "optuna" draws lengths and PUCT's c (needs optuna)."""
     num_skills: int = 3
-    """Skills of a DIAYN worker (the source's N_policies)."""
+    """Skills of a DIAYN worker (the dissertation's N_policies)."""
     skill_base_steps: int = 40_000
     """Base steps of a DIAYN worker's training."""
     ratio: float = 25.0
@@ -89,8 +99,8 @@ class AtariConfig(RunConfig):
     trial_ratio: float = 10.0
     """Simulated base steps per real one in such a trial."""
     replant_every: int = 100
-    """Decisions between checkpoints, at which the tree is planted anew so that a resumed run goes
-    on exactly."""
+    """Decisions between checkpoints, at which a new tree begins so that a resumed run continues
+    exactly."""
     toy: bool = False
     """A run of seconds, to see that everything works."""
 
@@ -127,26 +137,12 @@ class AtariConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, value, choices in (
-            ("protocol", self.protocol, PROTOCOLS),
-            ("source", self.source, SOURCES),
-            ("tune_with", self.tune_with, ("grid", "optuna")),
-            ("tree_policy", self.tree_policy, ("puct", "uct")),
-            ("guide", self.guide, GUIDES),
-        ):
+        for name, choices in _CHOICES.items():
+            value = getattr(self, name)
             if value not in choices:
                 raise ValueError(f"{name} is one of {', '.join(choices)}; got {value!r}.")
-        for name in (
-            "frames", "max_episode_frames", "tune_trials", "num_skills", "skill_base_steps",
-            "leaves_per_wave", "waves_in_flight", "trial_steps", "replant_every",
-        ):  # fmt: skip
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
-        for name, low in (("option_steps", 0), ("rollout_options", 0), ("num_processes", -1)):
-            if getattr(self, name) < low:
-                raise ValueError(f"{name} must be at least {low}; got {getattr(self, name)}.")
+        for name, least in (dict.fromkeys(_AT_LEAST_ONE, 1) | _LEAST).items():
+            whole_number("AtariConfig", name, getattr(self, name), least=least)
         for name in ("ratio", "c", "trial_ratio"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}.")
-        if not 0.0 < self.gamma <= 1.0:
-            raise ValueError(f"gamma must be in (0, 1]; got {self.gamma}.")
+            real_number("AtariConfig", name, getattr(self, name), above=0.0)
+        real_number("AtariConfig", "gamma", self.gamma, above=0.0, most=1.0)

@@ -6,7 +6,6 @@ Letters: K examples, Z options.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import index
 from typing import Any
 
 import torch
@@ -15,9 +14,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torchrl_hmcts.arguments import name_arguments
+from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.objectives import ExpertIterationLoss
-from torchrl_hmcts.planners import PolicyValueEvaluator, Search, search_examples
+from torchrl_hmcts.planners import Evaluation, PolicyValueEvaluator, Search, search_examples
 
 
 class _TwoHeads(nn.Module):
@@ -26,9 +25,8 @@ class _TwoHeads(nn.Module):
     def __init__(self, num_options: int, hidden: Sequence[int]) -> None:
         super().__init__()
         widths = [128, *hidden]
-        layers: list[nn.Module] = []
-        for n, m in zip(widths[:-1], widths[1:], strict=True):
-            layers += [nn.Linear(n, m), nn.ReLU()]
+        pairs = zip(widths[:-1], widths[1:], strict=True)
+        layers = [layer for n, m in pairs for layer in (nn.Linear(n, m), nn.ReLU())]
         self.shared = nn.Sequential(*layers)
         self.heads = nn.Linear(widths[-1], num_options + 1)
         nn.init.zeros_(self.heads.weight)  # at first a uniform prior, and all values 0
@@ -39,7 +37,6 @@ class _TwoHeads(nn.Module):
         return out[..., :-1], out[..., -1:]
 
 
-@name_arguments
 class SearchGuide:
     r"""Learns from every search of an agent, and guides the ones after it.
 
@@ -57,10 +54,8 @@ class SearchGuide:
         min_visits (int): of the nodes that are learned from. Default 8.
         learn_every (int): decisions between two trainings. Default 10.
         updates (int): of each training. Default 20.
-        batch_size (int): examples of an update. Default 256.
         buffer_size (int): examples kept. Default 20,000.
         lr (float): Adam's learning rate. Default 1e-3.
-        uniform_share (float): share of the prior that is spread over all options. Default 0.25.
         seed (int): of the initial weights and of the batches. Default 0.
 
     Attributes:
@@ -95,59 +90,46 @@ class SearchGuide:
         min_visits: int = 8,
         learn_every: int = 10,
         updates: int = 20,
-        batch_size: int = 256,
         buffer_size: int = 20_000,
         lr: float = 1e-3,
-        uniform_share: float = 0.25,
         seed: int = 0,
     ) -> None:
-        for name, value in (
-            ("num_options", num_options),
-            ("min_visits", min_visits),
-            ("learn_every", learn_every),
-            ("updates", updates),
-            ("batch_size", batch_size),
-            ("buffer_size", buffer_size),
-        ):
-            if value < 1:
-                raise ValueError(f"SearchGuide needs {name} >= 1; got {value}.")
-        self.values = bool(values)
         self.min_visits, self.learn_every, self.updates = min_visits, learn_every, updates
-        self.batch_size = batch_size
+        for name in ("min_visits", "learn_every", "updates"):
+            whole_number("SearchGuide", name, getattr(self, name), least=1)
+        whole_number("SearchGuide", "num_options", num_options, least=1)
+        whole_number("SearchGuide", "buffer_size", buffer_size, least=1)
+        seed = whole_number("SearchGuide", "seed", seed)
+        instance("SearchGuide", "hidden", hidden, Sequence)
+        self.values = bool(values)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(index(seed))
+            torch.manual_seed(seed)
             network = _TwoHeads(num_options, hidden)
         self._module = TensorDictModule(network, ["ram"], ["logits", "state_value"])
         self._loss = ExpertIterationLoss(self._module, value_loss="smooth_l1")
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=lr)
-        self._generator = torch.Generator().manual_seed(index(seed))
+        self._generator = torch.Generator().manual_seed(seed)
         self._buffer = ReplayBuffer(
-            storage=LazyTensorStorage(buffer_size),
-            batch_size=batch_size,
-            generator=self._generator,
+            storage=LazyTensorStorage(buffer_size), batch_size=256, generator=self._generator
         )
-        self._evaluator = PolicyValueEvaluator(self._module, uniform_share=uniform_share)
+        self._evaluator = PolicyValueEvaluator(self._module, uniform_share=0.25)
+        self.in_keys = self._evaluator.in_keys
         self.scale = 1.0
         self.num_examples = 0
         self._searches = 0
-        self.last: dict[str, float] = {}
-        """Means of the losses and diagnostics of the latest training."""
 
-    @property
-    def prior(self) -> Any:
-        """For a planner's ``option_prior``."""
-        return self._evaluator.prior
-
-    @property
-    def value(self) -> Any:
-        """For a planner's ``leaf_evaluator``; None if leaves are not valued."""
-        return _Scaled(self) if self.values else None
+    @torch.no_grad()
+    def __call__(self, td: TensorDictBase) -> Evaluation:
+        """Return priors ``[K, Z]`` of states with ``"ram"``, and their values in units of the
+        reward if leaves are valued: for a planner's ``leaf_evaluator``."""
+        priors, values = self._evaluator(td)
+        return Evaluation(priors, values * self.scale if self.values else None)
 
     def learn(self, search: Search, scale: float) -> None:
-        """Take examples from a search, and train if it is time.
+        """Take examples from a search of one root, and train if it is time.
 
         Args:
-            search: of one root, before its subtree is taken.
+            search: before its subtree is taken.
             scale: the greatest reward of an option so far, which a value of 1 is worth from now on.
         """
         examples = search_examples(
@@ -165,22 +147,18 @@ class SearchGuide:
         if self._searches % self.learn_every == 0:
             self._train()
 
+    @torch.enable_grad()
     def _train(self) -> None:
-        rows = []
-        with torch.enable_grad():
-            for _ in range(self.updates):
-                batch = self._buffer.sample()
-                batch["value_target"] = batch["value_target"] / self.scale
-                out = self._loss(batch)
-                loss = out["loss_policy"] + (out["loss_value"] if self.values else 0.0)
-                if not torch.isfinite(loss):
-                    raise FloatingPointError(f"The guide's loss is {loss.item()}. Lower its lr.")
-                self._optimizer.zero_grad()
-                loss.backward()
-                self._optimizer.step()
-                rows.append(out.detach())
-        stacked: Any = torch.stack(rows)  # type: ignore[call-overload]
-        self.last = {key: float(value) for key, value in stacked.mean(0).items()}
+        for _ in range(self.updates):
+            batch = self._buffer.sample()
+            batch["value_target"] = batch["value_target"] / self.scale
+            out = self._loss(batch)
+            loss = out["loss_policy"] + (out["loss_value"] if self.values else 0.0)
+            if not torch.isfinite(loss):
+                raise FloatingPointError(f"The guide's loss is {loss.item()}. Lower its lr.")
+            self._optimizer.zero_grad()
+            loss.backward()
+            self._optimizer.step()
 
     def state_dict(self) -> dict[str, Any]:
         """Return weights, optimiser, examples and counters, plain data and tensors."""
@@ -190,7 +168,7 @@ class SearchGuide:
             "network": self._module.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "examples": dict(stored.items()),
-            "cursor": int(self._buffer.writer._cursor),
+            "cursor": int(self._buffer.writer.state_dict()["_cursor"]),
             "generator": self._generator.get_state(),
             "scale": self.scale,
             "num_examples": self.num_examples,
@@ -198,26 +176,15 @@ class SearchGuide:
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from where :meth:`state_dict` was called."""
+        """Continue from where :meth:`state_dict` was called."""
         self._module.load_state_dict(state_dict["network"])
         self._optimizer.load_state_dict(state_dict["optimizer"])
         self._buffer.empty()
         examples = state_dict["examples"]
         if examples:
             self._buffer.extend(TensorDict(examples, [len(examples["ram"])]))
-        self._buffer.writer._cursor = state_dict["cursor"]
+        self._buffer.writer.load_state_dict({"_cursor": state_dict["cursor"]})
         self._generator.set_state(state_dict["generator"])
         self.scale = float(state_dict["scale"])
         self.num_examples = int(state_dict["num_examples"])
         self._searches = int(state_dict["searches"])
-
-
-class _Scaled:
-    """A guide's values in units of the reward."""
-
-    def __init__(self, guide: SearchGuide) -> None:
-        self._guide = guide
-        self.in_keys = list(guide._evaluator.in_keys)
-
-    def __call__(self, td: TensorDictBase) -> Tensor:
-        return self._guide._evaluator.value(td) * self._guide.scale

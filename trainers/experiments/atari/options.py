@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import (
-    AtariOptionPool,
     ByteGoal,
     FollowGoals,
     JoinedWorkers,
@@ -19,20 +17,13 @@ from torchrl_hmcts.envs import (
     SharedMLP,
 )
 from torchrl_hmcts.objectives import DiscreteSkillSACLoss
-
-MakePool = Callable[..., AtariOptionPool]
-"""``make_pool(worker, max_steps)``; sources that record what is simulated add ``record=True``."""
+from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 
 
 @dataclass
 class Training:
-    """What a network worker was trained with.
-
-    Attributes:
-        loss: with the live parameters of actor, critics and objective.
-        data: transitions ``[n]`` it was trained on.
-        bytes_seen: bytes of RAM whose displacement the objective reads; None if it reads the state.
-    """
+    """What a network worker was trained with: the live loss, transitions ``[n]`` of its data, and
+    the bytes whose displacement its objective reads (None if it reads the state)."""
 
     loss: DiscreteSkillSACLoss
     data: TensorDictBase
@@ -44,66 +35,67 @@ class Options:
     """The options a source has found.
 
     Attributes:
-        worker: carries them out.
+        worker: executes them.
         names: one for each.
         num_frames: frames emulated to find them.
         report: what was found on the way, as plain data.
-        saved: from which :func:`load_options` builds the worker again: plain data and tensors.
-        training: what a learned worker was trained with, for who trains it further; not saved.
+        teacher: whose options a network has learned; for who trains it further, not saved.
+        training: what a network was trained with; the same.
 
     Example:
         >>> from torchrl_hmcts.envs import RepeatActions
-        >>> Options(RepeatActions(2), ["NOOP", "FIRE"], num_frames=0).report
-        {}
+        >>> from torchrl_hmcts.trainers import Options
+        >>> found = Options(RepeatActions(2), ["NOOP", "FIRE"], num_frames=0)
+        >>> Options.from_plain(found.plain()).worker.num_options
+        2
     """
 
     worker: OptionWorker
     names: list[str]
     num_frames: int
     report: dict[str, Any] = field(default_factory=dict)
-    saved: dict[str, Any] = field(default_factory=dict)
+    teacher: OptionWorker | None = field(default=None, repr=False, compare=False)
     training: Training | None = field(default=None, repr=False, compare=False)
 
+    def plain(self) -> dict[str, Any]:
+        """Return the options as plain data and tensors, without what they were trained with.
 
-class WorkerSource(Protocol):
-    """What gives a game its options: ``find(game, make_pool, seed=..., log=...)``.
+        Raises:
+            TypeError: if the worker is of a kind of your own.
+        """
+        plain = {name: getattr(self, name) for name in ("names", "num_frames", "report")}
+        return {**plain, "saved": {"parts": [plain_worker(self.worker)]}}
 
-    Example:
-        >>> from torchrl_hmcts.envs import RepeatActions
-        >>> from torchrl_hmcts.trainers import DistilledSource, Options
-        >>> class LeftAndRight:
-        ...     def find(self, game, make_pool, *, seed, log):
-        ...         return Options(RepeatActions([2, 3]), ["right", "left"], num_frames=0)
-        >>> DistilledSource(LeftAndRight()).samples
-        20000
-    """
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> Options:
+        """Build options from plain data.
 
-    def find(
-        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
-    ) -> Options:
+        Args:
+            plain: as :meth:`plain` returned it, in this version or an older one.
+
+        Raises:
+            ValueError: if a part of the worker is of no known kind.
+        """
+        workers = [load_worker(part) for part in plain["saved"]["parts"]]
+        worker = workers[0] if len(workers) == 1 else JoinedWorkers(workers)
+        return cls(worker, plain["names"], plain["num_frames"], plain["report"])
+
+
+class OptionSource(Protocol):
+    """What gives a game its options, e.g. a :class:`RuleSource` or one of your own."""
+
+    def find(self, kit: AtariKit) -> Options:
         """Return the options of a game."""
         ...
 
 
 def plain_worker(worker: Any) -> dict[str, Any]:
-    """Return a worker as plain data and tensors, which :func:`load_options` reads.
-
-    Args:
-        worker: repeated actions, goals or a network.
-
-    Raises:
-        TypeError: if it is of another kind.
-    """
+    """Return a worker as plain data and tensors, or raise ``TypeError`` for an unknown kind."""
     if isinstance(worker, RepeatActions):
         return {"kind": "repeat", "actions": list(worker.actions)}
     if isinstance(worker, FollowGoals):
-        goals = [asdict(goal) for goal in worker.goals]
-        return {
-            "kind": "goals",
-            "goals": goals,
-            "fire": worker.fire,
-            "fire_probability": worker.fire_probability,
-        }
+        rest = {"fire": worker.fire, "fire_probability": worker.fire_probability}
+        return {"kind": "goals", "goals": [asdict(goal) for goal in worker.goals], **rest}
     if isinstance(worker, SharedMLP):
         return {
             "kind": "network",
@@ -113,36 +105,15 @@ def plain_worker(worker: Any) -> dict[str, Any]:
             "weights": worker.weights.clone(),
         }
     if isinstance(worker, OccasionalAction):
-        return {
-            "kind": "occasional",
-            "action": worker.action,
-            "probability": worker.probability,
-            "worker": plain_worker(worker.worker),
-        }
+        rest = {"action": worker.action, "probability": worker.probability}
+        return {"kind": "occasional", **rest, "worker": plain_worker(worker.worker)}
     if isinstance(worker, JoinedWorkers):
-        return {"kind": "joined", "parts": [plain_worker(w) for w in worker.workers]}
+        return {"kind": "joined", "parts": [plain_worker(part) for part in worker.workers]}
     raise TypeError(f"{type(worker).__name__} cannot be saved as plain data.")
 
 
-def load_options(saved: dict[str, Any]) -> OptionWorker:
-    """Build a worker from what an :class:`Options` keeps in ``saved``.
-
-    Args:
-        saved: plain data and tensors.
-
-    Raises:
-        ValueError: if a part is of no known kind.
-
-    Example:
-        >>> from torchrl_hmcts.trainers import load_options
-        >>> load_options({"parts": [{"kind": "repeat", "actions": [0, 3]}]}).num_options
-        2
-    """
-    workers = [_load(part) for part in saved["parts"]]
-    return workers[0] if len(workers) == 1 else JoinedWorkers(workers)
-
-
-def _load(part: dict[str, Any]) -> OptionWorker:
+def load_worker(part: dict[str, Any]) -> OptionWorker:
+    """Build a worker from plain data and tensors."""
     kind = part["kind"]
     if kind == "repeat":
         return RepeatActions(part["actions"])
@@ -154,7 +125,32 @@ def _load(part: dict[str, Any]) -> OptionWorker:
         worker.weights.copy_(part["weights"])
         return worker
     if kind == "occasional":
-        return OccasionalAction(_load(part["worker"]), part["action"], part["probability"])
+        return OccasionalAction(load_worker(part["worker"]), part["action"], part["probability"])
     if kind == "joined":
-        return JoinedWorkers([_load(p) for p in part["parts"]])
+        return JoinedWorkers([load_worker(p) for p in part["parts"]])
     raise ValueError(f"Options of the kind {kind!r} are not known.")
+
+
+def network_of(worker: OptionWorker) -> SharedMLP:
+    """Return the network that executes a worker's options, interrupted or not."""
+    inner = worker.worker if isinstance(worker, OccasionalAction) else worker
+    if not isinstance(inner, SharedMLP):
+        raise TypeError(
+            f"Only a network can be trained further; these options are executed by "
+            f"{type(inner).__name__}. Wrap their source: TrainedSource('distilled', source)."
+        )
+    return inner
+
+
+def goals_of(worker: OptionWorker) -> list[ByteGoal | int]:
+    """Return what each option of a rule worker is for: a goal, or the action it repeats."""
+    if isinstance(worker, JoinedWorkers):
+        return [goal for part in worker.workers for goal in goals_of(part)]
+    if isinstance(worker, FollowGoals):
+        return list(worker.goals)
+    if isinstance(worker, RepeatActions):
+        return list(worker.actions)
+    raise TypeError(
+        f"What the options of a {type(worker).__name__} are for is not known. Goals and repeated "
+        f"actions have it: use a RuleSource under TrainedSource('distilled', ...)."
+    )

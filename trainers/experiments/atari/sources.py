@@ -1,246 +1,140 @@
-"""Where the agent's options come from, where nothing is learned; each an object that swaps in."""
+"""Where the agent's options come from: rules, or a network and how it was trained."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import inspect
+from functools import partial
 from typing import Any
 
-from torchrl_hmcts.envs import JoinedWorkers, RepeatActions
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariSearch
-from torchrl_hmcts.trainers.experiments.atari.goals import (
-    Candidate,
-    GoalFinder,
-    GoalSearch,
-    repeat_candidates,
-)
-from torchrl_hmcts.trainers.experiments.atari.options import (
-    MakePool,
-    Options,
-    WorkerSource,
-    plain_worker,
-)
+from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
+from torchrl_hmcts.trainers.experiments.atari.fine_tuning import fine_tune, retrain
+from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
+from torchrl_hmcts.trainers.experiments.atari.options import Options, OptionSource
+from torchrl_hmcts.trainers.experiments.atari.rules import CANDIDATES, RuleSource
+from torchrl_hmcts.trainers.experiments.atari.skills import distil, learn_skills
+
+_TRAININGS: dict[str, Any] = {
+    "diayn": learn_skills,
+    "distilled": distil,
+    "fine_tuned": fine_tune,
+    "retrained": retrain,
+}
 
 
-@dataclass(frozen=True)
-class RepeatSource:
-    """An option for each of the game's actions: to repeat it. Nothing is learned.
+class TrainedSource:
+    r"""Options of a network, and how it is trained.
 
-    Example:
-        >>> from torchrl_hmcts.envs import AtariOptionPool
-        >>> from torchrl_hmcts.trainers import RepeatSource
-        >>> def make_pool(worker, max_steps):
-        ...     return AtariOptionPool("Pong", worker, max_steps=max_steps, num_processes=0)
-        >>> RepeatSource().find("Pong", make_pool, seed=0, log=print).names[:3]
-        ['NOOP', 'FIRE', 'RIGHT']
-    """
+    ``"diayn"`` learns skills by DIAYN on the RAM, before the manager plans: the dissertation's
+    worker, 128 - 3 x 128 - actions with ReLU and a softmax, a head for each skill.
 
-    def find(
-        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
-    ) -> Options:
-        """Return the options of a game."""
-        pool = make_pool(RepeatActions(1), 1)
-        names, frames = list(pool.action_names), pool.num_frames
-        pool.close()
-        worker = RepeatActions(len(names))
-        return Options(worker, names, frames, saved={"parts": [plain_worker(worker)]})
+    ``"distilled"`` learns another source's options,
 
+    .. math:: \min_\theta\; -\mathbb{E}_{s, z}\, \log \pi_\theta\bigl(\mu_z(s) \mid s, z\bigr)
 
-@dataclass(frozen=True)
-class ActionSource:
-    """Actions to repeat, chosen by trials: with fewer options a search looks further ahead.
+    with :math:`\mu_z` the option's own worker, in states on the way of random options of that
+    worker, and in a second round of the network itself, labelled by the worker (DAgger). The
+    network samples its actions, so that it keeps some noise, and takes FIRE in 5 % of its steps,
+    where a game has it: one that has forgotten it waits for ever where a game waits for it.
 
-    Attributes:
-        settings: how much to try; what it says of goals and screening is not used.
-        search: the planner of the trials.
+    ``"fine_tuned"`` trains a distilled network further by soft actor-critic, with the goals' reward
+    of :class:`OptionGoals` plus the sign of the game's. The critics learn alone first, and the
+    policy is kept near where it began (``policy_prior`` of
+    :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`): critics of a policy that hardly varies
+    know little of other actions, and would spoil it.
 
-    Example:
-        >>> from torchrl_hmcts.envs import AtariOptionPool
-        >>> from torchrl_hmcts.trainers import ActionSource, GoalSearch
-        >>> def make_pool(worker, max_steps):
-        ...     return AtariOptionPool("Pong", worker, max_steps=max_steps, num_processes=0)
-        >>> small = GoalSearch(min_options=1, options=1, trial_steps=4, trial_ratio=1.0)
-        >>> len(ActionSource(small).find("Pong", make_pool, seed=0, log=lambda text: None).names)
-        1
-    """
+    ``"retrained"`` is Algorithm 3, for skills and for a distilled or fine-tuned network: rounds of
+    planning with the worker as it is, every base step of every option that is simulated being kept
+    as S; then updates of its own loss on :math:`S \cup D`, with D what it was trained on before,
+    and
 
-    settings: GoalSearch = field(default_factory=GoalSearch)
-    search: AtariSearch = field(default_factory=AtariSearch)
+    .. math:: r = c_i\, r_\phi(s, z, s') + \mathrm{sign}(r_{game}).
 
-    def find(
-        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
-    ) -> Options:
-        """Return the options of a game."""
-        finder = GoalFinder(make_pool, self.settings, search=self.search, seed=seed, log=log)
-        pool = make_pool(RepeatActions(1), 1)
-        candidates = repeat_candidates(pool)
-        finder.num_frames += pool.num_frames
-        pool.close()
-        return _joined(finder.choose(candidates), finder.num_frames, finder.report)
-
-
-@dataclass(frozen=True)
-class ActionSetSource:
-    """Actions to repeat: all, those that fire, or those that do not, whichever trials score best.
-
-    In games where an action can move and fire at once, the firing ones lose nothing and are a third
-    of all, so that a search looks further ahead; where fire is lost or costs, the others may be
-    better. The names of the actions are all that is known of the game.
-
-    Attributes:
-        settings: how much to try; what it says of goals and screening is not used.
-        search: the planner of the trials.
-        trials: starts and searches over which the score of a set is averaged.
+    Args:
+        training (str): as above.
+        source (OptionSource, optional): whose options the training begins with; needed by all but
+            ``"diayn"``.
+        num_skills (int): Z of ``"diayn"`` (the dissertation's N_policies). Default 3.
+        discriminator (str): of ``"diayn"``. ``"state"`` (default) tells skills by the RAM,
+            ``"displacement"`` by how it changed since the option began, ``"controllable"`` by how
+            its controllable bytes did.
+        base_steps (int): of training. Default 40,000 for ``"diayn"``, 20,000 for ``"fine_tuned"``.
+        skill_steps, num_envs (int): in both, base steps for which an option is kept, and emulators
+            that play at a time. Default 40 and 8.
+        hidden (sequence of int): widths of the shared layers of a new network. Default: three of
+            128.
+        samples, epochs, batch_size (int): of ``"distilled"``: labelled states of each round, passes
+            over all of them, and labels of an update. Default 20,000, 8 and 256.
+        lr (float): Adam's learning rate (of the actor). Default 1e-3 for ``"distilled"``, 1e-4 for
+            ``"fine_tuned"``, 3e-4 for ``"retrained"``.
+        warm_up (float): share of the training (default 0.25), or of the first round's updates
+            (default 0.75), in which new critics learn alone.
+        updates_per_batch (int): of ``"fine_tuned"``, for 64 base steps. Default 16.
+        search (AtariSearch): of ``"retrained"``, the planner. Default: with a ratio of 10.
+        rounds, round_steps, option_steps (int): of ``"retrained"``, real base steps of a round and
+            base steps of an option among them. Default 3, 300 and 10.
+        intrinsic_weight (float): :math:`c_i`. Default 1.
 
     Raises:
-        ValueError: if ``trials`` is below 1.
+        TypeError: if a keyword is unknown, or a source is missing or not needed; when searching, if
+            the source's options cannot be trained like this.
+        ValueError: if the training is unknown; when searching, if a number is out of range, or no
+            byte of the game can be controlled.
+
+    Reference:
+        Dissertation, chapter 5 and algorithm 3; Eysenbach et al., "Diversity is All You Need",
+        2018, arXiv 1802.06070; Ross, Gordon and Bagnell, "A reduction of imitation learning and
+        structured prediction to no-regret online learning", 2011, arXiv 1011.0686; Christodoulou,
+        "Soft Actor-Critic for Discrete Action Settings", 2019, arXiv 1910.07207.
 
     Example:
-        >>> from torchrl_hmcts.envs import AtariOptionPool
-        >>> from torchrl_hmcts.trainers import ActionSetSource, GoalSearch
-        >>> def make_pool(worker, max_steps):
-        ...     return AtariOptionPool("Pong", worker, max_steps=max_steps, num_processes=0)
-        >>> small = GoalSearch(trial_steps=4, trial_ratio=1.0)
-        >>> source = ActionSetSource(small, trials=1)
-        >>> found = source.find("Pong", make_pool, seed=0, log=lambda text: None)
-        >>> list(found.report["action_sets"])
-        ['all', 'firing', 'not firing']
+        >>> from torchrl_hmcts.trainers import RuleSource, TrainedSource
+        >>> network = TrainedSource("distilled", RuleSource("repeat"), samples=5_000)
+        >>> TrainedSource("fine_tuned", network, base_steps=2_000).settings
+        {'base_steps': 2000}
     """
 
-    settings: GoalSearch = field(default_factory=GoalSearch)
-    search: AtariSearch = field(default_factory=AtariSearch)
-    trials: int = 2
-
-    def __post_init__(self) -> None:
-        if self.trials < 1:
-            raise ValueError(f"ActionSetSource needs trials >= 1; got {self.trials}.")
-
-    def find(
-        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
-    ) -> Options:
-        """Return the options of a game."""
-        finder = GoalFinder(make_pool, self.settings, search=self.search, seed=seed, log=log)
-        pool = make_pool(RepeatActions(1), 1)
-        every = repeat_candidates(pool)
-        finder.num_frames += pool.num_frames
-        pool.close()
-        sets = {
-            "all": every,
-            "firing": [c for c in every if "FIRE" in c.name],
-            "not firing": [c for c in every if "FIRE" not in c.name],
-        }
-        scores: dict[str, float] = {}
-        for name, options in sets.items():
-            if len(options) < 2 or (name != "all" and len(options) == len(every)):
-                continue
-            seeds = [seed * 10_000 + i for i in range(self.trials)]
-            scores[name] = sum(finder.trial(options, seed=s) for s in seeds) / self.trials
-            log(f"{name}, {[c.name for c in options]}: {scores[name]:g}")
-        finder.report["action_sets"] = scores
-        best = max(scores, key=lambda name: scores[name])
-        return _joined(sets[best], finder.num_frames, finder.report)
-
-
-@dataclass(frozen=True)
-class GoalSource:
-    """Goals on controllable bytes and actions to repeat, chosen by trials: :class:`GoalFinder`.
-
-    Attributes:
-        settings: how much to try.
-        search: the planner of the trials.
-
-    Example:
-        >>> from torchrl_hmcts.envs import AtariOptionPool
-        >>> from torchrl_hmcts.trainers import GoalSearch, GoalSource
-        >>> def make_pool(worker, max_steps):
-        ...     return AtariOptionPool("Breakout", worker, max_steps=max_steps, num_processes=0)
-        >>> small = GoalSearch(probe_states=8, max_goals=4, screen_steps=5, shortlist=2,
-        ...                    min_options=1, options=1, trial_steps=10, trial_ratio=1.0)
-        >>> found = GoalSource(small).find("Breakout", make_pool, seed=0, log=lambda text: None)
-        >>> found.worker.num_options
-        1
-    """
-
-    settings: GoalSearch = field(default_factory=GoalSearch)
-    search: AtariSearch = field(default_factory=AtariSearch)
-
-    def find(
-        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
-    ) -> Options:
-        """Return the options of a game."""
-        finder = GoalFinder(make_pool, self.settings, search=self.search, seed=seed, log=log)
-        chosen = finder.find()
-        return _joined(chosen, finder.num_frames, finder.report)
-
-
-@dataclass(frozen=True)
-class BestSource:
-    r"""The options of whichever source a planner's trials score best with.
-
-    .. math:: \arg\max_i \frac{1}{n} \sum_{j < n} \mathrm{score}_j(\text{options of source } i)
-
-    Every source looks for its options first; the frames of all of them count.
-
-    Attributes:
-        sources: by name.
-        settings: real steps, ratio and length of options of the trials.
-        search: the planner of the trials.
-        trials: starts and searches over which the score of a source is averaged; n.
-
-    Raises:
-        ValueError: if there is no source, or ``trials`` is below 1.
-
-    Example:
-        >>> from torchrl_hmcts.envs import AtariOptionPool
-        >>> from torchrl_hmcts.trainers import ActionSource, BestSource, GoalSearch, RepeatSource
-        >>> def make_pool(worker, max_steps):
-        ...     return AtariOptionPool("Pong", worker, max_steps=max_steps, num_processes=0)
-        >>> small = GoalSearch(min_options=1, options=1, trial_steps=4, trial_ratio=1.0)
-        >>> best = BestSource({"all": RepeatSource(), "some": ActionSource(small)}, small, trials=1)
-        >>> found = best.find("Pong", make_pool, seed=0, log=lambda text: None)
-        >>> list(found.report["sources"])
-        ['all', 'some']
-    """
-
-    sources: Mapping[str, WorkerSource]
-    settings: GoalSearch = field(default_factory=GoalSearch)
-    search: AtariSearch = field(default_factory=AtariSearch)
-    trials: int = 2
-
-    def __post_init__(self) -> None:
-        if not self.sources:
-            raise ValueError("BestSource chooses among sources; got none.")
-        if self.trials < 1:
-            raise ValueError(f"BestSource needs trials >= 1; got {self.trials}.")
-
-    def find(
-        self, game: str, make_pool: MakePool, *, seed: int, log: Callable[[str], None]
-    ) -> Options:
-        """Return the options of a game."""
-        finder = GoalFinder(make_pool, self.settings, search=self.search, seed=seed, log=log)
-        seeds = [seed * 10_000 + i for i in range(self.trials)]
-        found: dict[str, Options] = {}
-        scores: dict[str, float] = {}
-        for name, source in self.sources.items():
-            options = source.find(game, make_pool, seed=seed, log=log)
-            found[name] = options
-            scores[name] = sum(finder.try_worker(options.worker, seed=s) for s in seeds) / len(
-                seeds
+    def __init__(self, training: str, source: OptionSource | None = None, **settings: Any) -> None:
+        if training not in _TRAININGS:
+            raise ValueError(
+                f"TrainedSource: training is one of {', '.join(_TRAININGS)}; got {training!r}."
             )
-            log(f"source {name}, {options.names}: {scores[name]:g}")
-        best = max(scores, key=lambda name: scores[name])
-        chosen = found[best]
-        report = {
-            **chosen.report,
-            "source": best,
-            "sources": {n: {"score": scores[n], "options": o.names} for n, o in found.items()},
-        }
-        frames = finder.num_frames + sum(options.num_frames for options in found.values())
-        return dataclasses.replace(chosen, num_frames=frames, report=report)
+        if (source is None) != (training == "diayn"):
+            needs = "begins with no other" if training == "diayn" else "needs another source"
+            raise TypeError(f"TrainedSource({training!r}) {needs}; got {source!r}.")
+        self.training, self.source, self.settings = training, source, settings
+        begin = [] if source is None else [None]
+        inspect.signature(_TRAININGS[training]).bind(*begin, None, **settings)
+
+    def find(self, kit: AtariKit) -> Options:
+        """Return the options of a game."""
+        begin = [] if self.source is None else [self.source.find(kit)]
+        options: Options = _TRAININGS[self.training](*begin, kit, **self.settings)
+        return options
 
 
-def _joined(chosen: Sequence[Candidate], frames: int, report: dict[str, Any]) -> Options:
-    workers = [c.worker for c in chosen]
-    saved = {"parts": [plain_worker(w) for w in workers]}
-    return Options(JoinedWorkers(workers), [c.name for c in chosen], frames, report, saved)
+def make_source(config: AtariConfig, search: AtariSearch) -> OptionSource:
+    """Return the source that a configuration names, with the planner of its trials."""
+    rules = partial(
+        RuleSource,
+        search=search,
+        min_options=2,
+        trial_steps=config.trial_steps,
+        trial_ratio=config.trial_ratio,
+    )
+    if config.source in CANDIDATES:
+        return rules(candidates=config.source)
+    steps: dict[str, Any] = {"base_steps": config.skill_base_steps}
+    rounds: dict[str, Any] = {"round_steps": config.trial_steps}
+    network = TrainedSource("distilled", rules(candidates="goals"))
+    skills = partial(TrainedSource, "diayn", num_skills=config.num_skills, **steps)
+    networks = {
+        "goals_network": network,
+        "goals_fine_tuned": TrainedSource("fine_tuned", network, **steps),
+        "goals_retrained": TrainedSource("retrained", network, **rounds),
+        "diayn": skills(),
+        "diayn_displacement": skills(discriminator="displacement"),
+        "diayn_controllable": skills(discriminator="controllable"),
+        "diayn_retrained": TrainedSource("retrained", skills(), intrinsic_weight=0.1, **rounds),
+    }
+    return networks[config.source]

@@ -17,8 +17,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.planners import (
+    HierarchicalPolicy,
     MCTSPlanner,
-    ModelBasedControl,
     RadiusNovelty,
     SearchBudget,
 )
@@ -223,7 +223,7 @@ def solve_with_wrong_model(
     starts = make_starts(real.base_env, config.seed)
     planner = make_planner(config, model)
     blind = plan_and_execute(planner, real, starts, group=GROUP)
-    policy = ModelBasedControl(planner, env=real, replan_every=replan_every)
+    policy = HierarchicalPolicy(planner, env=real, replan_every=replan_every)
     episodes = [_act(policy, real, group) for group in starts.split(GROUP)]
     ok, gone, made = (torch.cat(column).numpy() for column in zip(*episodes, strict=True))
     return {
@@ -239,7 +239,7 @@ def solve_with_wrong_model(
 
 @torch.no_grad()
 def _act(
-    policy: ModelBasedControl, real: TransformedEnv, starts: TensorDict
+    policy: HierarchicalPolicy, real: TransformedEnv, starts: TensorDict
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Whether each episode met the goal, its frames, and the plans that were made."""
     base = real.base_env

@@ -34,11 +34,11 @@ from torchrl_hmcts.trainers.experiments.lab.training import (
 )
 from torchrl_hmcts.trainers.experiments.lab.worker import held_out_seeds, make_starts
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.runs.worker_file import save_worker
 from torchrl_hmcts.trainers.saving.files import left_out, replacing, write_csv
+from torchrl_hmcts.trainers.saving.run_folder import versions
 
 TOY: dict[str, Any] = {
     "mazes": 4,
@@ -185,36 +185,39 @@ def draw(
         return pictures.one(name, captions[name])
 
     with picture("episode.gif") as path:
-        from torchrl_hmcts.trainers.figures.lab_figures import write_episode_gif
+        from torchrl_hmcts.trainers.figures.maps import LabMap, write_episode_gif
 
-        write_episode_gif(env, states, options, plan, path)
+        write_episode_gif(LabMap(env), states, options, plan, path)
     with picture("solving.png") as path:
-        from torchrl_hmcts.trainers.figures.lab_figures import plot_frames_curves
+        from torchrl_hmcts.trainers.figures.curves import plot_training, solving_panels
 
-        plot_frames_curves(
-            [frames_curve(trained.tests, config.frames_per_step, env.max_frames)],
+        name = "Algorithm 3" if config.algorithm == "hmcts" else "DIAYN"
+        plot_training(
+            {name: [frames_curve(trained.tests, config.frames_per_step, env.max_frames)]},
+            solving_panels(curve_script_frames(config)),
             path,
-            title=f"{'Algorithm 3' if config.algorithm == 'hmcts' else 'DIAYN'}: "
-            f"{config.curve_mazes} held-out mazes of 9 x 9",
-            script=curve_script_frames(config),
+            title=f"{name}: {config.curve_mazes} held-out mazes of 9 x 9",
+            x_label="frames of training",
         )
     with picture("skills.png") as path:
-        from torchrl_hmcts.trainers.figures.lab_figures import plot_skill_fan
+        from torchrl_hmcts.trainers.figures.maps import LabMap, plot_skill_fan
 
         generator = torch.Generator().manual_seed(config.seed)
         sampling = SkillPolicy(trained.loss.actor_network, generator=generator)
-        plot_skill_fan(sampling, env, path, num_skills=config.num_skills)
+        rooms = LabMap(env).rooms(10 * config.num_skills)
+        steps = 100 // config.frames_per_step
+        plot_skill_fan(sampling, rooms, path, num_skills=config.num_skills, steps=steps)
     with picture("losses.png") as path:
-        from torchrl_hmcts.trainers.figures.plots import plot_losses
+        from torchrl_hmcts.trainers.figures.curves import plot_losses
 
         plot_losses(trained.history, trained.steps, path)
     with picture("search.png") as path:
-        from torchrl_hmcts.trainers.figures.lab_figures import plot_search
+        from torchrl_hmcts.trainers.figures.maps import LabMap, plot_search
 
         assert planner.last_search is not None
-        plot_search(planner.last_search, env, path)
+        plot_search(LabMap(env), planner.last_search, path)
     with picture("mazes.png") as path:
-        from torchrl_hmcts.trainers.figures.lab_figures import plot_mazes
+        from torchrl_hmcts.trainers.figures.maps import plot_mazes
 
         plot_mazes(env, path)
     with picture("view.png") as path, replacing(path) as temporary:

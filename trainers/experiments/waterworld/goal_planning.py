@@ -17,13 +17,12 @@ from torchrl.envs import TransformedEnv
 from torchrl_hmcts.arguments import name_arguments
 from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv
 from torchrl_hmcts.planners import (
-    UCT,
     GoalPlanner,
     MCTSPlanner,
-    MeanBackup,
     RadiusNovelty,
     Search,
     SearchBudget,
+    SearchSettings,
 )
 from torchrl_hmcts.planners.search import Outcomes, RootStates
 from torchrl_hmcts.planners.tree import EXPANDED, PRUNED, TERMINAL
@@ -154,18 +153,17 @@ class TilePlanner:
         search = Search(
             m,
             num_options,
-            tree_policy=UCT(),
-            backup=MeanBackup(),
-            novelty=RadiusNovelty("tile", 0.5, shorter_paths=True, max_relaxations=0),
-            leaves_per_wave=self.leaves_per_wave,
+            SearchSettings(
+                novelty=RadiusNovelty("tile", 0.5, shorter_paths=True, max_relaxations=0),
+                leaves_per_wave=self.leaves_per_wave,
+            ),
             capacity=512,
         )
         priors = np.zeros((0, num_options), np.float32)
         masks = np.zeros((0, num_options), np.bool_)
         tiles = np.zeros((m, search.tree.capacity), np.int64)
         tiles[:, 0] = start
-        search.begin()
-        search.start(
+        search.plant(
             RootStates(
                 values=np.zeros(m, np.float32),
                 done=np.zeros(m, np.bool_),

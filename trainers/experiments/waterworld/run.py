@@ -30,13 +30,16 @@ from torchrl_hmcts.trainers.experiments.waterworld.config import (
     WaterworldGoalsConfig,
 )
 from torchrl_hmcts.trainers.experiments.waterworld.goal_episodes import run_goal_episodes
-from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
+from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
+    make_goal_env,
+    make_tile_planner,
+)
 from torchrl_hmcts.trainers.figures.pictures import Pictures
-from torchrl_hmcts.trainers.figures.report import versions
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.runs.worker_file import save_worker
 from torchrl_hmcts.trainers.saving.files import left_out, write_csv
+from torchrl_hmcts.trainers.saving.run_folder import versions
 
 _GOAL_KEYS = (
     "num_goals",
@@ -179,13 +182,13 @@ def _run_waterworld(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
     with run.finish(metrics, title=f"Random mazes: {name}") as pictures:
         words = "Test mazes solved and base steps of an episode while it learns."
         with pictures.one("learning.png", words) as path:
-            from torchrl_hmcts.trainers.figures.learning_curves import plot_learning_curves
+            from torchrl_hmcts.trainers.figures.curves import learning_panels, plot_training
 
-            plot_learning_curves(
+            plot_training(
                 {name: [learning_curve(history)]},
+                learning_panels(config.max_episode_steps),
                 path,
                 title=f"{name[0].upper()}{name[1:]}, seed {config.seed}",
-                max_steps=config.max_episode_steps,
             )
         if with_goals:
             draw_episode(policy, tests, starts, greedy, pictures)
@@ -219,23 +222,27 @@ def draw_episode(
         steps = len(track.positions) - 1
         words = words.replace("maze", f"maze that was NOT solved in {steps} base steps")
     with pictures.one("episode.gif", words) as path:
-        from torchrl_hmcts.trainers.figures.goal_figures import write_goal_gif
+        from torchrl_hmcts.trainers.figures.goals import write_goal_gif
 
         write_goal_gif(env.base_env, start, track, path)
     words = "The same episode: the manager's goals, half way, and at the end."
     with pictures.one("goals.png", words) as path:
-        from torchrl_hmcts.trainers.figures.goal_figures import plot_goals
+        from torchrl_hmcts.trainers.figures.goals import plot_goals
 
         plot_goals(env.base_env, start, track, path)
     words = "The manager's tree over tiles, and the path it found."
     with pictures.one("search.png", words) as path:
-        from torchrl_hmcts.trainers.figures.goal_figures import plot_tile_search
+        from torchrl_hmcts.trainers.figures.goals import plot_tile_search
 
-        plot_tile_search(env.base_env, start, path)
+        manager = make_tile_planner(env.base_env)
+        goals, lengths = manager.plan_goals(start[None])
+        search = manager.planner.last_search
+        assert search is not None
+        plot_tile_search(env.base_env, start, search, goals[0, : int(lengths[0])], path)
 
 
 def learning_curve(history: dict[str, list[float]]) -> dict[str, list[float]]:
-    """Return the test curve of a training, with the names of :func:`plot_learning_curves`.
+    """Return the test curve of a training, with the names of its panels.
 
     Args:
         history: of an :class:`A3CTrainer` that evaluated.

@@ -1,0 +1,48 @@
+"""Trainers that take a moment, for the tests of what may go wrong with them."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.modules import ProbabilisticActor, ValueOperator
+
+from torchrl_hmcts.envs import WaterworldMazeEnv
+from torchrl_hmcts.objectives import A3CLoss
+from torchrl_hmcts.testing import ChainEnv
+from torchrl_hmcts.trainers import A3CTrainer, DIAYNTrainer
+from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+
+
+def make_diayn(folder: Path | None, total: int = 48, hidden: int = 8, **other: Any) -> DIAYNTrainer:
+    """Four skills in eight mazes, in batches of 16 base steps."""
+    torch.manual_seed(1)
+    base = WaterworldMazeEnv(batch_size=[8], observation=False, max_steps=10)
+    env = TransformedEnv(base, Compose(SkillTransform(4, 5, seed=3), DisplacementTransform()))
+    loss = DIAYNTrainer.make_loss(env, 4, hidden=(hidden,), seed=0)
+    sizes = {"frames_per_batch": 16, "batch_size": 8, "buffer_size": 64, "seed": 5, **other}
+    return DIAYNTrainer(env, loss, total_frames=total, save_dir=folder, **sizes)
+
+
+def make_a3c(folder: Path, total: int = 800, length: int = 4, **other: Any) -> A3CTrainer:
+    """One learner in this process, in a chain."""
+    torch.manual_seed(1)
+    actor = ProbabilisticActor(
+        TensorDictModule(torch.nn.Embedding(length, 2), ["state"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
+    )
+    critic = ValueOperator(torch.nn.Embedding(length, 1), in_keys=["state"])
+    return A3CTrainer(
+        partial(ChainEnv, length=length, batch_size=[8]),
+        A3CLoss(actor, critic, gamma=0.9),
+        total_frames=total,
+        segment_steps=5,
+        num_learners=0,
+        save_dir=folder,
+        **other,
+    )

@@ -1,0 +1,177 @@
+"""The evaluation of new nodes: what a planner's parts say of them, in one checked call.
+
+Letters: m nodes, A options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_hmcts.planners.tree import LARGEST
+
+# Entry with a seed for each state, int64 [m], given to evaluators that draw random numbers.
+SEED_KEY = "_seed"
+
+
+class Evaluation(NamedTuple):
+    """Priors and values of states; None for what is not known.
+
+    Attributes:
+        priors (Tensor): ``[m, A]`` probabilities of the options. Default: uniform.
+        values (Tensor): ``[m]`` or ``[m, 1]`` values. Default: 0.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_hmcts.planners import Evaluation, MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> def to_the_right(td):  # priors and values of states, together
+        ...     priors = torch.tensor([0.1, 0.9]).expand(len(td), 2)
+        ...     return Evaluation(priors, td["state"].float() / 10)
+        >>> env = ChainEnv(length=4)
+        >>> MCTSPlanner(env, leaf_evaluator=to_the_right).plan(env.reset()).options.tolist()
+        [1, 1, 1]
+    """
+
+    priors: Tensor | None = None
+    values: Tensor | None = None
+
+
+Evaluator = Callable[[TensorDictBase], Any]
+"""``evaluator(td [m])`` returns a tensor or an :class:`Evaluation`."""
+
+
+class NodeEvaluator:
+    """Asks for the priors and values of new nodes, and checks the answers.
+
+    Args:
+        leaf_evaluator: returns values, or an :class:`Evaluation`.
+        option_prior: returns priors, which count before those of ``leaf_evaluator``.
+        num_options: A.
+    """
+
+    def __init__(
+        self, leaf_evaluator: Evaluator | None, option_prior: Evaluator | None, num_options: int
+    ) -> None:
+        self.leaf_evaluator, self.option_prior = leaf_evaluator, option_prior
+        self.num_options = num_options
+        self._parts = [part for part in (leaf_evaluator, option_prior) if part is not None]
+        for name, part in (("leaf_evaluator", leaf_evaluator), ("option_prior", option_prior)):
+            if part is not None and not callable(part):
+                raise TypeError(f"{name} must be callable on a tensordict; got {part!r}.")
+
+    def bind(self, simulator: Any, gamma: float) -> None:
+        """Give the simulator and the discount to the parts that simulate."""
+        for part in self._parts:
+            if hasattr(part, "bind"):
+                part.bind(simulator, gamma)
+
+    def __call__(
+        self, td: TensorDictBase, terminated: np.ndarray, seeds: Callable[[], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate nodes.
+
+        Args:
+            td: state and observation of the nodes, ``[m]``; it is not changed.
+            terminated: which are terminal, bool ``[m]``: their value is 0.
+            seeds: called for the seeds of the nodes, int64 ``[m]``, if a part draws numbers.
+
+        Returns:
+            priors, float32 ``[m, A]``, or ``[0, A]`` if all are equal, which the search scales to
+            sum to 1 over the options that may be taken; and values, float32 ``[m]``.
+
+        Raises:
+            TypeError: if a part returns no tensor.
+            ValueError: if a part returns another shape, or numbers that no search can use.
+        """
+        if not self._parts:
+            m = td.batch_size[0]
+            return np.zeros((0, self.num_options), np.float32), np.zeros(m, np.float32)
+        td = td.clone()  # what is stored must not depend on what the parts do with it
+        found = Evaluation()
+        if self.leaf_evaluator is not None:
+            answer = self.leaf_evaluator(_with_seeds(self.leaf_evaluator, td, seeds))
+            found = answer if isinstance(answer, Evaluation) else Evaluation(values=answer)
+        if self.option_prior is not None:
+            answer = self.option_prior(_with_seeds(self.option_prior, td, seeds))
+            found = found._replace(
+                priors=answer.priors if isinstance(answer, Evaluation) else answer
+            )
+        m, priors, values = td.batch_size[0], found.priors, found.values
+        return (
+            np.zeros((0, self.num_options), np.float32)
+            if priors is None
+            else check_priors(priors, (m, self.num_options), "option prior").float().numpy(),
+            np.zeros(m, np.float32)
+            if values is None
+            else np.where(
+                terminated, np.float32(0.0), check_values(values, m, "leaf evaluator").numpy()
+            ),
+        )
+
+
+def check_priors(priors: Any, shape: tuple[int, int], reader: str) -> Tensor:
+    """Return probabilities, contiguous on the CPU; refuse what is none."""
+    _check_tensor(priors, reader)
+    if tuple(priors.shape) != shape:
+        raise ValueError(
+            f"The {reader} returned shape {list(priors.shape)}; it must give one probability per "
+            f"state and option, {list(shape)}."
+        )
+    good = (priors >= 0) & (priors < LARGEST)
+    if not good.all():
+        raise ValueError(
+            f"The {reader} returned {priors[~good][0].item()}. Probabilities must be finite and "
+            f"not negative; apply a softmax to logits."
+        )
+    return priors.detach().cpu().contiguous()
+
+
+def check_values(values: Any, num_states: int, reader: str) -> Tensor:
+    """Return values, float32 ``[m]`` on the CPU; refuse what no search can use."""
+    _check_tensor(values, reader)
+    if tuple(values.shape) not in ((num_states,), (num_states, 1)):
+        raise ValueError(
+            f"The {reader} returned shape {list(values.shape)}; it must give one value per state, "
+            f"[{num_states}] or [{num_states}, 1]."
+        )
+    found: Tensor = values.detach().reshape(-1).to("cpu", torch.float32)
+    good = found.abs() < LARGEST
+    if not good.all():
+        raise ValueError(
+            f"The {reader} returned {found[~good][0].item()}. Values must be finite and smaller "
+            f"than {LARGEST:g}; check the network's input and weights."
+        )
+    return found
+
+
+def _with_seeds(
+    part: Evaluator, td: TensorDictBase, seeds: Callable[[], np.ndarray]
+) -> TensorDictBase:
+    if not getattr(part, "is_random", False):
+        return td
+    return td.copy().set(SEED_KEY, torch.from_numpy(seeds()))
+
+
+def _check_tensor(value: Any, reader: str) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(
+            f"The {reader} must return a tensor; got {type(value).__name__}. Wrap a module in "
+            f"ModulePrior or ValueEvaluator."
+        )
+
+
+def wave_seeds(
+    seeds: np.ndarray, counted: np.ndarray, nodes: np.ndarray, options: np.ndarray
+) -> np.ndarray:
+    """Return seeds that depend on root, node, option and order of outcomes, int64 ``[m]``."""
+    mixed = seeds.astype(np.uint64) * np.uint64(0xBF58476D1CE4E5B9)
+    for part in (nodes, options, counted):
+        mixed = (mixed ^ part.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return (mixed >> np.uint64(1)).astype(np.int64)

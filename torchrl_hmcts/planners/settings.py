@@ -1,0 +1,211 @@
+"""All that a search is set to, in one object that a planner and its searches share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
+
+from torchrl_hmcts.checks import instance, whole_number
+from torchrl_hmcts.planners.budget import ProgressiveWidening, TreeRollout
+from torchrl_hmcts.planners.novelty import NoveltyTest
+from torchrl_hmcts.planners.transpositions import Transpositions
+from torchrl_hmcts.planners.tree import MAX_BACKUP, MEAN_BACKUP, PYTHON_SCORE, RECORD
+from torchrl_hmcts.planners.tree_policies import UCT, CompiledPolicy, Gumbel, TreePolicy
+
+_MOST_HALVED = 2**24  # simulations of Gumbel, whose schedule holds counts in float32
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    r"""The parts and numbers of a search, checked once and never changed.
+
+    A planner builds one of its keywords, ``planner.settings``; to assign a part, as in
+    ``planner.tree_policy = UCT(c=5.0)``, replaces it. A search holds the one it was planted with
+    and takes a new one over when it is resumed.
+
+    Args:
+        tree_policy: :class:`UCT` (default, ``c=1``), :class:`PUCT`, :class:`Gumbel`,
+            :class:`TorchRLScore`, or a callable over :class:`NodeStatistics`.
+        backup: how the value of a node follows from what was found below it. ``"mean"`` (default)
+            of its own evaluation and all returns through it,
+            :math:`V \leftarrow V + (R + D\,V' - V) / N` (Coulom 2006; dissertation, section
+            2.4.2); ``"max"``, the value of its best option, :math:`V = \max_o R + D\,V'`, exact in
+            a deterministic simulator.
+        novelty: which new nodes are worth searching, e.g. ``RadiusNovelty("position", 0.35)``.
+            Default: all.
+        transpositions: which states are the same. Default: none are.
+        chance: for a stochastic simulator, how often an option is simulated in a node. Default:
+            once.
+        rollout: continue from every new leaf for some options and keep them in the tree. Needs
+            ``expand="one"``. Default: none.
+        expand: ``"all"`` simulates every option of a leaf at once (default), ``"one"`` only the
+            option that the tree policy chooses, as in the textbook.
+        leaves_per_wave: leaves of each root that share a simulator call. More are faster for few
+            roots and search less selectively. At most 255; default 1.
+        waves_in_flight: waves that are simulated at a time, the next one chosen before the
+            outcomes of those before it are known. For a simulator that works beside the planner,
+            such as :class:`~torchrl_hmcts.envs.AtariOptionPool` with processes: with 2 it has work
+            while the planner inserts and selects. Outcomes are inserted in the order of the waves,
+            whichever is ready first, so that the tree is the same each time (but for a budget of
+            seconds) and on every simulator. Times ``leaves_per_wave`` at most 255; default 1.
+        exhausted: what a descent does with an option behind which nothing is left to simulate:
+            ``"skip"`` it (default: every simulation finds something new), or ``"revisit"`` it and
+            back its known value up once more, at no simulator's cost, so that visits and mean
+            values are those of the textbook. Always ``"revisit"`` with ``chance`` or ``Gumbel``.
+
+    Raises:
+        ValueError: if a number is out of range, or two parts do not go together.
+        TypeError: if a part is of another kind.
+
+    Example:
+        >>> from torchrl_hmcts.planners import UCT, MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> planner = MCTSPlanner(ChainEnv(length=6), expand="one")
+        >>> planner.tree_policy = UCT(c=5.0)
+        >>> planner.settings.tree_policy, planner.settings.expand
+        (UCT(c=5.0), 'one')
+    """
+
+    tree_policy: TreePolicy = field(default_factory=UCT)
+    backup: Literal["mean", "max"] = "mean"
+    novelty: NoveltyTest | None = None
+    transpositions: Transpositions | None = None
+    chance: ProgressiveWidening | None = None
+    rollout: TreeRollout | None = None
+    expand: Literal["all", "one"] = "all"
+    leaves_per_wave: int = 1
+    waves_in_flight: int = 1
+    exhausted: Literal["skip", "revisit"] = "skip"
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("backup", ("mean", "max")),
+            ("expand", ("all", "one")),
+            ("exhausted", ("skip", "revisit")),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in allowed:
+                raise ValueError(f"{name} is {allowed[0]!r} or {allowed[1]!r}; got {value!r}.")
+        for name in ("leaves_per_wave", "waves_in_flight"):
+            object.__setattr__(self, name, whole_number("A search", name, getattr(self, name)))
+        leaves, waves = self.leaves_per_wave, self.waves_in_flight
+        if not 1 <= leaves <= 255:
+            raise ValueError(f"A search needs leaves_per_wave from 1 to 255; got {leaves}.")
+        if waves < 1 or leaves * waves > 255:
+            raise ValueError(
+                f"A search needs waves_in_flight >= 1, with leaves_per_wave * waves_in_flight <= "
+                f"255; got waves_in_flight={waves}, leaves_per_wave={leaves}."
+            )
+        if not callable(self.tree_policy) and not isinstance(self.tree_policy, CompiledPolicy):
+            raise TypeError(
+                f"A search needs a tree policy: UCT(), PUCT(), Gumbel(), TorchRLScore(...) or a "
+                f"callable over NodeStatistics; got {self.tree_policy!r}."
+            )
+        for name, kind in (
+            ("transpositions", Transpositions),
+            ("chance", ProgressiveWidening),
+            ("rollout", TreeRollout),
+        ):
+            instance("A search", name, getattr(self, name), kind, type(None))
+        if self.novelty is not None and not hasattr(self.novelty, "accept"):
+            raise TypeError(f"novelty needs the members of NoveltyTest; got {self.novelty!r}.")
+        if self.rollout is not None and (self.expand != "one" or self.is_gumbel):
+            raise ValueError(
+                f"A TreeRollout continues from the one option that was simulated; got "
+                f"expand={self.expand!r} and tree_policy={self.tree_policy!r}. Pass expand='one' "
+                f"and UCT, PUCT or a policy of your own."
+            )
+        if self.chance is not None and self.transpositions is not None:
+            raise ValueError(
+                "Transpositions share what follows a state, which chance redraws; leave one of "
+                "transpositions and chance out."
+            )
+
+    @property
+    def is_gumbel(self) -> bool:
+        """Whether the search follows a schedule of simulations."""
+        return isinstance(self.tree_policy, Gumbel)
+
+    @property
+    def revisit(self) -> bool:
+        """Whether descents land on what they know: chance never closes, Gumbel counts visits."""
+        return self.exhausted == "revisit" or self.chance is not None or self.is_gumbel
+
+    def check_simulations(self, num_simulations: int | None) -> None:
+        """Refuse a number of simulations that ``Gumbel`` cannot plan.
+
+        Raises:
+            ValueError: if it is not known or very large, or comes with several options at a time.
+        """
+        if not self.is_gumbel:
+            return
+        at_once = self.leaves_per_wave * self.waves_in_flight
+        if num_simulations is None or self.expand != "one" or at_once != 1:
+            raise ValueError(
+                f"Gumbel halves a known number of simulations of one option each; got "
+                f"budget.simulations={num_simulations}, expand={self.expand!r}, "
+                f"leaves_per_wave={self.leaves_per_wave}, waves_in_flight={self.waves_in_flight}. "
+                f"Pass budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
+                f"leaves_per_wave=1."
+            )
+        if num_simulations > _MOST_HALVED:
+            raise ValueError(
+                f"Gumbel plans every simulation ahead, {_MOST_HALVED:,} at most; got "
+                f"{num_simulations:,}."
+            )
+
+    def check_successor(self, new: SearchSettings) -> None:
+        """Refuse settings under which a search that was planted with these cannot continue.
+
+        Constants of the tree policy, the waves and the rollouts may differ.
+
+        Raises:
+            ValueError: if another part differs, since what the tree holds would not fit it.
+        """
+        for part in fields(self):
+            one, other = getattr(self, part.name), getattr(new, part.name)
+            if part.name in ("leaves_per_wave", "waves_in_flight", "rollout"):
+                continue
+            if part.name == "tree_policy" and isinstance(one, CompiledPolicy):
+                same = one.continues(other)
+            elif part.name == "tree_policy":
+                same = not isinstance(other, CompiledPolicy)
+            else:
+                same = _is_same(one, other)
+            if not same:
+                raise ValueError(
+                    f"This search was planted with {part.name}={one!r}; the planner now has "
+                    f"{part.name}={other!r}. What the tree holds does not fit it: plant a new one, "
+                    f"or resume it with a planner like the first."
+                )
+
+    def record(self) -> np.ndarray:
+        """Return what the kernels read, ``[1]`` of ``tree.RECORD``."""
+        record = np.zeros(1, RECORD)
+        numbers: dict[str, Any] = {
+            "backup": MAX_BACKUP if self.backup == "max" else MEAN_BACKUP,
+            "expand_all": self.expand == "all",
+            "leaves": self.leaves_per_wave,
+            "revisit": self.revisit,
+            "twins": self.transpositions is not None,
+            "score": PYTHON_SCORE,
+            "mark": True,
+        }
+        if self.chance is not None:
+            numbers.update(widening=self.chance.k, widening_exponent=self.chance.alpha)
+        if isinstance(self.tree_policy, CompiledPolicy):
+            numbers.update(self.tree_policy.record())
+            # Options on the way down are marked for other descents, and always for those in Python.
+            numbers["mark"] = self.leaves_per_wave * self.waves_in_flight > 1
+        for name, number in numbers.items():
+            record[name] = number
+        return record
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Whether two parts do the same; a copy of a search holds copies of them."""
+    if one is other or type(one) is not type(other):
+        return one is other
+    return type(one).__repr__ is object.__repr__ or one == other or repr(one) == repr(other)

@@ -1,0 +1,165 @@
+"""Networks that learn a game's options: DIAYN's skills, or what rules do.
+
+Letters: Z options, S states. :class:`TrainedSource` tells what the settings are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_hmcts.envs import OccasionalAction, OptionWorker, SharedMLP
+from torchrl_hmcts.modules import SkillMLP
+from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.experiments.atari.kit import (
+    FRAMES_PER_STEP,
+    AtariKit,
+    random_states,
+)
+from torchrl_hmcts.trainers.experiments.atari.options import Options, Training
+from torchrl_hmcts.trainers.experiments.atari.rules import RuleSearch, RuleSource
+
+SLOW: dict[str, Any] = {
+    "critic_lr": 3e-4,
+    "objective_lr": 3e-4,
+    "target_tau": 0.01,
+}  # than in a maze
+_DISCRIMINATORS = ("state", "displacement", "controllable")
+
+
+def learn_skills(
+    kit: AtariKit,
+    *,
+    num_skills: int = 3,
+    base_steps: int = 40_000,
+    skill_steps: int = 40,
+    discriminator: str = "state",
+    num_envs: int = 8,
+    hidden: Sequence[int] = (128, 128, 128),
+) -> Options:
+    """Learn skills by DIAYN on the RAM."""
+    if discriminator not in _DISCRIMINATORS:
+        raise ValueError(f"discriminator is one of {_DISCRIMINATORS}; got {discriminator!r}.")
+    report: dict[str, Any] = {}
+    num_frames = 0
+    bytes_seen = None if discriminator == "state" else list(range(128))
+    if discriminator == "controllable":
+        search = RuleSearch(RuleSource("goals"), kit)
+        probed: dict[str, Any] = {}
+        search.probe(probed)
+        num_frames += search.num_frames
+        report["controllable"] = bytes_seen = probed["controllable"]
+        if not bytes_seen:
+            raise ValueError(
+                f"No byte of {kit.game} was found that actions raise and lower, so that the "
+                f"discriminator has nothing to see. Use discriminator='displacement'."
+            )
+    env = kit.make_training_env(
+        num_skills, option_steps=skill_steps, num_envs=num_envs, bytes_seen=bytes_seen
+    )
+    loss = DIAYNTrainer.make_loss(
+        env,
+        num_skills,
+        in_keys=["observation"],
+        critic_keys=["observation"],
+        discriminator_keys=["observation" if bytes_seen is None else "displacement"],
+        hidden=hidden,
+        discriminator_hidden=(128,),
+        alpha_init=0.1,
+        gamma=0.97,
+        seed=kit.seed,
+    )
+    trainer = DIAYNTrainer(
+        env,
+        loss,
+        total_frames=base_steps,
+        updates_per_batch=8,
+        actor_lr=3e-4,
+        **SLOW,
+        seed=kit.seed,
+    )
+    trainer.train()
+    last = {name: values[-20:] for name, values in trainer.history.items() if len(values)}
+    report["last"] = means = {name: sum(values) / len(values) for name, values in last.items()}
+    kit.log(f"DIAYN: accuracy {means.get('discriminator_accuracy', float('nan')):.2f}")
+    worker = SharedMLP(num_skills, env.action_spec.space.n, hidden=hidden)
+    worker.load(loss.actor_network_params.parameters())
+    return Options(
+        worker,
+        [f"skill {z}" for z in range(num_skills)],
+        num_frames + FRAMES_PER_STEP * base_steps,
+        report,
+        training=Training(loss, trainer.replay_buffer.storage.get(slice(None)), bytes_seen),
+    )
+
+
+def distil(
+    found: Options,
+    kit: AtariKit,
+    *,
+    samples: int = 20_000,
+    epochs: int = 8,
+    hidden: Sequence[int] = (128, 128, 128),
+    batch_size: int = 256,
+    lr: float = 1e-3,
+) -> Options:
+    """Teach options to one network with a head for each, in the states of both (DAgger)."""
+    teacher, num_options, names = found.worker, found.worker.num_options, kit.action_names
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(kit.seed)
+        network = SkillMLP(128, len(names), num_options, hidden=tuple(hidden))
+    student = SharedMLP(num_options, len(names), hidden=hidden)
+    worker: OptionWorker = student
+    if "FIRE" in names:
+        worker = OccasionalAction(student, names.index("FIRE"), 0.05)
+    optimizer = torch.optim.Adam(network.parameters(), lr=lr)
+    generator = torch.Generator().manual_seed(kit.seed)
+    states: list[Tensor] = []
+    labels: list[Tensor] = []
+    num_frames, agreement = found.num_frames, 0.0
+    players: tuple[OptionWorker, ...] = (teacher, worker)
+    for number, player in enumerate(players):
+        pool = kit.make_pool(player, 10)
+        ram = random_states(pool, samples // num_options, kit.seed + number)["ram"]
+        num_frames += pool.num_frames
+        pool.close()
+        states.append(ram / 255.0)
+        labels.append(_labels(ram, teacher, kit.seed))
+        data = torch.cat(states), torch.cat(labels)
+        for _ in range(epochs):
+            agreement = _fit(network, optimizer, *data, batch_size, generator)
+        student.load(network.parameters())
+        kit.log(f"distilled: {agreement:.1%} of {data[1].numel():,} labels")
+    report = {**found.report, "distilled_agreement": agreement}
+    return Options(worker, found.names, num_frames, report, teacher=teacher)
+
+
+def _fit(
+    network: SkillMLP,
+    optimizer: torch.optim.Optimizer,
+    states: Tensor,
+    labels: Tensor,
+    batch_size: int,
+    generator: torch.Generator,
+) -> float:
+    """Pass once over the labels ``[S, Z]`` of states ``[S, 128]``; return the share learned."""
+    num_options, right = labels.shape[1], 0
+    for rows in torch.randperm(labels.numel(), generator=generator).split(batch_size):
+        at, options = rows // num_options, rows % num_options
+        logits, targets = network(states[at], options), labels[at, options]
+        optimizer.zero_grad()
+        torch.nn.functional.cross_entropy(logits, targets).backward()
+        optimizer.step()
+        right += int((logits.argmax(-1) == targets).sum())
+    return right / labels.numel()
+
+
+def _labels(ram: Tensor, teacher: OptionWorker, seed: int) -> Tensor:
+    """Return what a worker does in states ``[S, 128]``, for each of its options ``[S, Z]``."""
+    generator = np.random.default_rng(seed)
+    options = range(teacher.num_options)
+    return torch.tensor([[teacher.act(row, z, generator) for z in options] for row in ram.numpy()])

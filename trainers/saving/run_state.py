@@ -1,0 +1,235 @@
+"""State that the next update of a training depends on and that TorchRL's ``Trainer`` does not save.
+
+Each class has ``state_dict`` and ``load_state_dict``, for any ``torchrl.checkpoint.Checkpoint``.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from torchrl.collectors import BaseCollector, Collector
+from torchrl.trainers import Trainer
+
+from torchrl_hmcts.trainers.saving.checkpoints import PlainStateAdapter
+
+Generator = torch.Generator | np.random.Generator | random.Random
+
+
+class RunningEpisodes:
+    """State of the episodes that a collector is in the middle of.
+
+    A collector's own state dict lacks the tensordict from which it takes its next step, so that a
+    resumed run would begin new episodes. This adds it. The env's whole state must be in the
+    tensordict: ``_supports_set_state`` is True or ``batch_locked`` False, as in
+    ``torchrl_hmcts.envs``. In other envs, e.g. ``GymEnv``, new episodes begin on loading.
+
+    Args:
+        collector (Collector): single-process collector.
+
+    Attributes:
+        new_episodes (bool, optional): whether loading leaves the saved episodes out and begins new
+            ones. Default ``None``: only where the env cannot be set to their states; a line on
+            stderr says so.
+
+    Raises:
+        TypeError: if the collector runs its envs in other processes.
+
+    Examples:
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> from torchrl_hmcts.trainers.saving.run_state import RunningEpisodes
+        >>> collector = Collector(
+        ...     WaterworldMazeEnv(batch_size=[2], observation=False),
+        ...     frames_per_batch=4, total_frames=8, auto_register_policy_transforms=False)
+        >>> RunningEpisodes(collector).state_dict()["entries"]["position"].shape
+        torch.Size([2, 2])
+        >>> collector.shutdown()
+    """
+
+    def __init__(self, collector: BaseCollector) -> None:
+        if not isinstance(collector, Collector):
+            raise TypeError(
+                f"RunningEpisodes saves the episodes of a Collector, which runs in this process; "
+                f"{type(collector).__name__} keeps its own in others. Collect with "
+                "torchrl.collectors.Collector, or do without exact resume."
+            )
+        self.collector = collector
+        self.new_episodes: bool | None = None
+
+    @property
+    def complete(self) -> bool:
+        """True if the env's whole state is in the tensordict."""
+        env = self.collector.env
+        return bool(env._supports_set_state or not env.batch_locked)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the episodes as they stand: their entries, and what the collector counts."""
+        carrier = self.collector._carrier  # nothing public says where the episodes stand
+        state: dict[str, Any] = {
+            "batch_size": list(carrier.batch_size),
+            "entries": carrier.to_dict(convert_tensors=False),
+        }
+        if self.collector.track_traj_ids:
+            # The numbers of episodes; put back once the collector has loaded, see below.
+            state["traj_pool"] = self.collector._traj_pool.state_dict()
+        return state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Let the collector continue the episodes that :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the env has another batch size; or if it cannot be set to a state and
+                ``new_episodes`` is False.
+        """
+        env = getattr(self.collector.env, "base_env", self.collector.env)
+        if self.new_episodes or (self.new_episodes is None and not self.complete):
+            if self.new_episodes is None:
+                words = "keeps state of its own, so the episodes that were under way are left out"
+                print(f"{type(env).__name__} {words}; new ones begin.", file=sys.stderr)
+            return  # a collector that has not collected yet stands at the beginning of some
+        if not self.complete:
+            raise ValueError(
+                f"{type(env).__name__} keeps state of its own, so its episodes "
+                "cannot continue from a checkpoint. Use an env that can be set to any state, or "
+                "load with new_episodes=True."
+            )
+        old = self.collector._carrier
+        saved = torch.Size(state_dict["batch_size"])
+        if saved != old.batch_size:
+            raise ValueError(
+                f"The checkpoint has episodes of an env of batch size {list(saved)}; this one has "
+                f"{list(old.batch_size)}. Resume with as many copies as before."
+            )
+        self.collector._carrier = TensorDict(
+            dict(state_dict["entries"]), batch_size=saved, device=old.device
+        )
+        if "traj_pool" in state_dict and self.collector.track_traj_ids:
+            # The collector's own load has given out numbers for the episodes it would have begun.
+            self.collector._traj_pool.load_state_dict(state_dict["traj_pool"])
+
+
+class GeneratorStates:
+    """States of all random number generators that objects own.
+
+    Looks through the attributes of the owners and of every ``nn.Module`` (env, transform, policy)
+    and list, tuple or dict below them for ``torch.Generator``, ``numpy.random.Generator`` and
+    ``random.Random``. The global generators are ``torchrl.checkpoint.GlobalRNGState``'s.
+
+    Args:
+        **owners: objects to look through, by the names their states get. After loading, owners of
+            the same names must have the same generators.
+
+    Raises:
+        ValueError: on loading, if a generator of the checkpoint is missing here.
+
+    Examples:
+        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
+        >>> from torchrl_hmcts.trainers.saving.run_state import GeneratorStates
+        >>> env = WaterworldMazeEnv(seed=0)
+        >>> states = GeneratorStates(env=env)
+        >>> before = states.state_dict()
+        >>> first = env.reset()["position"]
+        >>> states.load_state_dict(before)
+        >>> bool((env.reset()["position"] == first).all())
+        True
+    """
+
+    def __init__(self, **owners: Any) -> None:
+        self.owners = owners
+
+    def generators(self) -> dict[str, Generator]:
+        """Return the generators by their path, e.g. ``"env._generator"``."""
+        seen: set[int] = set()
+        owners = self.owners.items()
+        return dict(found for name, owner in owners for found in _find(name, owner, seen, True))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of every generator, by the path to it."""
+        states: dict[str, Any] = {}
+        for path, generator in self.generators().items():
+            if isinstance(generator, torch.Generator):
+                states[path] = generator.get_state()
+            elif isinstance(generator, np.random.Generator):
+                states[path] = generator.bit_generator.state
+            else:
+                states[path] = generator.getstate()
+        return states
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Set the generators to the states that :meth:`state_dict` returned."""
+        generators = self.generators()
+        missing = sorted(set(state_dict).difference(generators))
+        if missing:
+            raise ValueError(
+                f"The checkpoint has states of the generators {missing}; found here: "
+                f"{sorted(generators)}. Build env, transforms and policy as in the saved run."
+            )
+        for path, state in state_dict.items():
+            generator = generators[path]
+            if isinstance(generator, torch.Generator):
+                generator.set_state(state)
+            elif isinstance(generator, np.random.Generator):
+                generator.bit_generator.state = state
+            else:
+                generator.setstate(state)
+
+
+def _find(
+    path: str, value: Any, seen: set[int], owner: bool = False
+) -> Iterator[tuple[str, Generator]]:
+    """Yields the generators below a value with their paths."""
+    if id(value) in seen:
+        return
+    if isinstance(value, torch.Generator | np.random.Generator | random.Random):
+        seen.add(id(value))
+        yield path, value
+        return
+    items: Iterable[tuple[Any, Any]] = ()
+    if isinstance(value, dict):
+        items = list(value.items())
+    elif isinstance(value, list | tuple):
+        items = list(enumerate(value))
+    elif isinstance(value, nn.Module) or (owner and hasattr(value, "__dict__")):
+        items = list(vars(value).items())
+    if items:
+        seen.add(id(value))
+        for name, item in items:
+            yield from _find(f"{path}.{name}", item, seen)
+
+
+class HistoryState:
+    """The curves that a ``Trainer`` has logged so far, as part of its checkpoint."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer = trainer
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        log = self.trainer._log_dict  # the only place in which TorchRL keeps its curves
+        return {
+            key: torch.tensor([float(value) for value in values], dtype=torch.float64)
+            for key, values in log.items()
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, torch.Tensor]) -> None:
+        self.trainer._log_dict.clear()
+        for key, values in state_dict.items():
+            self.trainer._log_dict[key] = values.tolist()
+
+
+class BufferAdapter(PlainStateAdapter):
+    """Writes a replay buffer; rows without an entry are zeros, not what the memory held before."""
+
+    def save(self, component: Any, path: Path, **options: Any) -> Any:
+        storage = component.storage
+        rows = getattr(storage, "_storage", None)  # behind the filled part, which storage[:] is
+        if isinstance(rows, torch.Tensor | TensorDictBase) and storage.ndim == 1:
+            rows[len(storage) :].zero_()
+        return super().save(component, path, **options)
