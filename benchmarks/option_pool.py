@@ -23,7 +23,7 @@ from torchrl.envs import GymWrapper
 
 from torchrl_hmcts.envs import OptionPool, SkillWorker
 from torchrl_hmcts.envs.gym.settable import make_gym
-from torchrl_hmcts.modules import GaussianSkillActor, SkillActor
+from torchrl_hmcts.modules import SkillActor
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.processes import cpu_ticks
 
@@ -53,10 +53,9 @@ def make_worker(name: str) -> Any:
         return Balance()
     env = GymWrapper(make_gym(name, **ENVS[name]), categorical_action_encoding=True)
     key = "image" if "image" in env.observation_spec.keys() else "observation"
-    actor = SkillActor if hasattr(env.action_spec.space, "n") else GaussianSkillActor
     torch.manual_seed(0)
     size = env.observation_spec[key].shape.numel()
-    return SkillWorker(actor(size, env.action_spec, NUM_OPTIONS, in_keys=[key]))
+    return SkillWorker(SkillActor(size, env.action_spec, NUM_OPTIONS, in_keys=[key]))
 
 
 def bare(name: str, worker: Any, seconds: float) -> float:

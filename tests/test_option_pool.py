@@ -19,13 +19,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tensordict.nn import NormalParamExtractor
 from torch import nn
 from torchrl.data import Bounded, Categorical
 
 from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv, SkillWorker
 from torchrl_hmcts.envs.gym import processes
 from torchrl_hmcts.envs.gym.processes import NUM_SLOTS
-from torchrl_hmcts.modules import ConcatSkillMLP, GaussianSkillActor, SkillActor, SkillPolicy
+from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, ProgressiveWidening, SearchBudget
 from torchrl_hmcts.testing import check_macro_env
 
@@ -330,7 +331,7 @@ def test_a_skill_worker_acts_as_its_actor(case: str) -> None:
     if case == "gaussian":
         spec = Bounded(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 3.0]))
         torch.manual_seed(0)
-        actor: Any = GaussianSkillActor(4, spec, 3, in_keys=["observation"], hidden=(8,))
+        actor: Any = SkillActor(4, spec, 3, in_keys=["observation"], hidden=(8,))
     else:
         settings = {"concatenated": {"network": ConcatSkillMLP}, "tanh": {"activation": nn.Tanh}}
         actor = leaning(**settings.get(case, {}))
@@ -352,11 +353,11 @@ def test_a_skill_worker_draws_from_the_policy_of_its_actor() -> None:
     drawn = np.mean([worker.act(x, 1, draws) for _ in range(4000)])
     assert drawn == pytest.approx(shares[1].item(), abs=0.03)
     torch.manual_seed(0)
-    gaussian = GaussianSkillActor(4, Bounded(-1, 1, (1,)), 2, in_keys=["observation"], hidden=(8,))
+    gaussian = SkillActor(4, Bounded(-1, 1, (1,)), 2, in_keys=["observation"], hidden=(8,))
     worker = SkillWorker(gaussian)
     actions = np.array([worker.act(x, 1, draws) for _ in range(4000)])
     outputs = gaussian.network(torch.from_numpy(x), torch.tensor(1))
-    loc, scale = (part.item() for part in gaussian.module[0].extractor(outputs))
+    loc, scale = (part.item() for part in NormalParamExtractor()(outputs))
     assert np.arctanh(actions).mean() == pytest.approx(loc, abs=0.05)
     assert np.arctanh(actions).std() == pytest.approx(scale, rel=0.05)
 

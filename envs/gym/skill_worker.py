@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
-from torchrl.modules import ProbabilisticActor
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.envs.gym.shared_network import SharedNetwork, choose, run_network
-from torchrl_hmcts.modules import ConcatSkillMLP, GaussianSkillActor, SkillActor, SkillMLP
+from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillMLP
 from torchrl_hmcts.processes import share
 
 # NormalParamExtractor's mapping of the raw scale: softplus(x + shift) + least, 1 at x = 0.
@@ -23,7 +23,7 @@ _SHIFT = float(np.log(np.expm1(1.0 - _LEAST_SCALE)))
 
 
 class SkillWorker:
-    r"""Acts as a :class:`SkillActor` or :class:`GaussianSkillActor` inside the processes of a pool.
+    r"""Acts as a :class:`SkillActor` inside the processes of a pool.
 
     Its options are the actor's skills. The weights are a copy in shared memory: :meth:`load` writes
     new ones, which the processes use from their next step on. For a ``SkillMLP`` or
@@ -31,13 +31,13 @@ class SkillWorker:
     network runs in torch.
 
     Args:
-        actor (SkillActor or GaussianSkillActor): its ``in_keys`` name entries of the env's
+        actor (SkillActor): of discrete or continuous actions; its ``in_keys`` name entries of the env's
             observation, ``"observation"`` where that is one array.
         deterministic (bool): take the most probable action, or the squashed mean, instead of a
             sample. Default False.
 
     Raises:
-        TypeError: if ``actor`` is none of the two.
+        TypeError: if ``actor`` is something else.
         OSError: if there is too little shared memory.
 
     Reference:
@@ -53,18 +53,13 @@ class SkillWorker:
         3
     """
 
-    def __init__(self, actor: ProbabilisticActor, *, deterministic: bool = False) -> None:
-        if not isinstance(actor, (SkillActor, GaussianSkillActor)):
-            raise TypeError(
-                "SkillWorker acts as a SkillActor or GaussianSkillActor does; got a "
-                f"{type(actor).__name__}. Give a pool any object with num_options and "
-                "act(observation, option, generator) instead."
-            )
+    def __init__(self, actor: SkillActor, *, deterministic: bool = False) -> None:
+        instance("SkillWorker", "actor", actor, SkillActor)
         self.num_options = int(actor.num_skills)
         self.deterministic = bool(deterministic)
         self.keys = [k if isinstance(k, tuple) else (k,) for k in actor.module[0].in_keys[:-1]]
         self._bounds: tuple[np.ndarray, np.ndarray] | None = None
-        if isinstance(actor, GaussianSkillActor):
+        if not hasattr(actor, "num_actions"):  # continuous
             space = actor.spec[actor.action_key].space
             low, high = space.low.cpu().numpy(), space.high.cpu().numpy()
             self._bounds = (high - low) / 2, (high + low) / 2
@@ -84,7 +79,7 @@ class SkillWorker:
             share([*self._module.parameters(), *self._module.buffers()], "SkillWorker")
         self.load(actor)
 
-    def load(self, actor: ProbabilisticActor) -> None:
+    def load(self, actor: SkillActor) -> None:
         """Take over the weights of an actor of the same shape, in the processes too.
 
         Args:
