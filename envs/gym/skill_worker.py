@@ -31,8 +31,8 @@ class SkillWorker:
     network runs in torch.
 
     Args:
-        actor (SkillActor): of discrete or continuous actions; its ``in_keys`` name entries of the env's
-            observation, ``"observation"`` where that is one array.
+        actor (SkillActor): of discrete or continuous actions; its ``in_keys`` name entries of the
+            env's observation, ``"observation"`` where that is one array.
         deterministic (bool): take the most probable action, or the squashed mean, instead of a
             sample. Default False.
 

@@ -5,6 +5,7 @@ Letters: *B batch of the tensordict, n its elements, M mazes, R rows and C colum
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -32,8 +33,9 @@ from torchrl_hmcts.envs.lab.layout import LabLayout
 from torchrl_hmcts.envs.lab.mazes import lab_maze
 from torchrl_hmcts.envs.lab.read_outs import PAIRS, READ_OUTS, LabReadOuts
 from torchrl_hmcts.envs.lab.states import STATE, TRAILING, check_place, state_specs
-from torchrl_hmcts.envs.lab.view import draw_lab_maze, heading_degrees
+from torchrl_hmcts.envs.lab.view import heading_degrees
 from torchrl_hmcts.envs.mazes.maze_env import MazeEnv
+from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, draw_maze
 
 CLOCK_PHASE: Mapping[int, tuple[int, int]] = {
     60: (46, -3),
@@ -412,13 +414,26 @@ class LabMazeEnv(MazeEnv):
         maze, position, _, turned, level = (
             tensordict.get(key).numpy(force=True)[None] for key in STATE
         )
-        degrees = heading_degrees(turned[:, 0], level[:, SPAWN_HEADING])
-        return draw_lab_maze(
-            self.layout,
-            int(maze[0]),
-            position[0],
-            float(degrees[0]),
-            int(level[0, APPLES]),
+        layout = self.layout
+        (degrees,) = heading_degrees(turned[:, 0], level[:, SPAWN_HEADING])
+        angle = math.radians(float(degrees))
+
+        def in_picture(points: np.ndarray) -> np.ndarray:
+            x, y = (points.astype(np.float64) / self.CELL).T
+            return np.stack((x, layout.rows - y), -1)
+
+        player, number = in_picture(position[0]), int(maze[0])
+        nose = np.stack((player, player + 0.38 * np.array((math.cos(angle), -math.sin(angle)))))
+        apples = int(level[0, APPLES])
+        left = [k for k in range(int(layout.num_apples[number])) if apples >> k & 1]
+        goal = layout.goal[number]
+        options = {"dots": in_picture(layout.apples[number, left]), **options}
+        options["paths"] = [*options.get("paths", ()), (nose, PLAYER_COLOR)]
+        return draw_maze(
+            layout.walls[number],
+            player=player.tolist(),
+            player_radius=0.15,
+            target=in_picture(goal).tolist() if goal[0] >= 0 else None,
             **options,
         )
 
