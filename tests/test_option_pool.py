@@ -23,7 +23,13 @@ from tensordict.nn import NormalParamExtractor
 from torch import nn
 from torchrl.data import Bounded, Categorical
 
-from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv, SkillWorker
+from torchrl_hmcts.envs import (
+    OptionPool,
+    RepeatActions,
+    ReplaySnapshot,
+    SettableGymEnv,
+    SkillWorker,
+)
 from torchrl_hmcts.envs.gym import processes
 from torchrl_hmcts.envs.gym.processes import NUM_SLOTS
 from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillPolicy
@@ -94,6 +100,21 @@ def test_an_option_is_what_the_env_gives_step_by_step(name: str, package: str | 
             break
         td = td.exclude("reward")
     assert pool.num_steps > 0
+
+
+def test_a_state_that_is_reached_by_replaying_gives_the_same_outcome() -> None:
+    draws, pools = torch.Generator().manual_seed(0), [local(), local(snapshot=ReplaySnapshot)]
+    states = [pool.reset() for pool in pools]
+    for _ in range(3):
+        option = torch.randint(2, (), generator=draws)
+        states = [
+            p.step(td.set("option", option))["next"] for p, td in zip(pools, states, strict=True)
+        ]
+        for key in ("observation", "reward", "duration", "done"):
+            assert states[0][key].equal(states[1][key])
+        states = [td.exclude("reward") for td in states]
+    again = pools[1].reset(states[1].exclude("option"), set_state=True)
+    assert again["observation"].equal(states[0]["observation"])
 
 
 def test_it_keeps_the_contract_of_a_macro_env() -> None:

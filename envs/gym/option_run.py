@@ -213,7 +213,8 @@ class GymRun(OptionRun):
         self._draws = np.random.Generator(self._bits)
         noting = type(self.snapshot).note_step
         unread = (Snapshot.note_step, AttributeSnapshot.note_step)
-        self.step = self.env.step if noting in unread else self._noted_step
+        self._notes_actions = noting not in unread
+        self.step = self._noted_step if self._notes_actions else self.env.step
         observation = self.first_observation()
         self._paths = _paths(observation)
         self._single = self._paths == [()]
@@ -255,7 +256,7 @@ class GymRun(OptionRun):
             value.copy() if kind is None else kind(value)
             for value, kind in zip(values, self._kinds, strict=True)
         ]
-        if self.step is not self._noted_step:
+        if not self._notes_actions:  # one note is enough
             self.snapshot.note_step(None)
         return (values[0] if self._single else _nested(self._paths, values)), self._draws
 
