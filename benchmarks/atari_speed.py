@@ -25,7 +25,7 @@ import torch
 from torchrl_hmcts.envs import AtariOptionPool, RepeatActions, SharedMLP
 from torchrl_hmcts.envs.atari.emulator import AtariEmulator
 from torchrl_hmcts.modules import SkillMLP
-from torchrl_hmcts.planners.tree import SearchTree
+from torchrl_hmcts.planners.tree import TreeArrays
 from torchrl_hmcts.trainers import AtariAgent, AtariSearch
 
 
@@ -127,7 +127,7 @@ def memory(game: str, nodes: int) -> dict[str, float]:
     pool = AtariOptionPool(game, worker, max_steps=1, num_processes=0, full_action_space=True)
     row = pool.reset().select("emulator_state").unsqueeze(0)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    tree = SearchTree(1, pool.num_options)
+    tree = TreeArrays(1, pool.num_options)
     zero = np.zeros(1, np.int64)
     for node in range(nodes):
         tree.reserve(node + 1)
