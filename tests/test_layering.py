@@ -27,7 +27,7 @@ ROOMS: dict[str, tuple[str, list[str]]] = {
     "all trainers": (r"trainers", ["command line"]),
     "mazes": (r"envs\.mazes", ["shared envs"]),
     "lab": (r"envs\.lab", ["mazes"]),
-    "gym": (r"envs\.(gym|option_pool)", ["shared envs"]),
+    "gym": (r"envs\.gym", ["shared envs", "modules"]),
     "atari": (r"envs\.atari", ["gym"]),
     "shared envs": (r"envs\.\w+", ["base"]),
     "all envs": (r"envs", ["lab", "atari"]),
@@ -53,7 +53,6 @@ KNOWN_CIRCLES = {
     "planners.search planners.scored_descent",
     "planners.tree planners.drawing",
     "planners.tree planners.export",
-    *(f"envs.gym.snapshots envs.gym.{n}" for n in "atari box2d minigrid mujoco tables".split()),
 }
 
 

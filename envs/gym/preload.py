@@ -6,11 +6,13 @@ import contextlib
 
 import numpy as np
 
-from torchrl_hmcts.envs import SharedMLP
 from torchrl_hmcts.envs.gym import processes  # noqa: F401
+from torchrl_hmcts.envs.gym.shared_network import SharedNetwork, choose
 
 with contextlib.suppress(ImportError):
     import ale_py  # noqa: F401
 
 # Loads the compiled network; by itself, a process would need a second for it.
-SharedMLP(1, 1, hidden=(1,)).act(np.zeros(128, np.uint8), 0, np.random.default_rng(0))
+net = SharedNetwork(1, 1, 1, [1])
+for x in (np.zeros(1, np.uint8), np.zeros(1, np.float32)):
+    choose(x, net._array, net._sizes, net._heads[0], net._logits, 0.5, 255.0)
