@@ -27,7 +27,7 @@ ROOMS: dict[str, tuple[str, list[str]]] = {
     "all trainers": (r"trainers", ["command line"]),
     "mazes": (r"envs\.mazes", ["shared envs"]),
     "lab": (r"envs\.lab", ["mazes"]),
-    "gym": (r"envs\.(gym|option_pool)", ["shared envs"]),
+    "gym": (r"envs\.gym", ["shared envs", "modules"]),
     "atari": (r"envs\.atari", ["gym"]),
     "shared envs": (r"envs\.\w+", ["base"]),
     "all envs": (r"envs", ["lab", "atari"]),
@@ -46,9 +46,7 @@ OPTIONAL = {"planners.drawing": "matplotlib", "planners.export": "networkx"}
 KNOWN = {
     "envs.gym_envs": "lab mazes",
 }
-KNOWN_CIRCLES = {
-    f"envs.gym.snapshots envs.gym.{n}" for n in "atari box2d minigrid mujoco tables".split()
-}
+KNOWN_CIRCLES: set[str] = set()
 
 
 def modules() -> dict[str, Path]:
