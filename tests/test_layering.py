@@ -37,7 +37,7 @@ ROOMS: dict[str, tuple[str, list[str]]] = {
     "modules": (r"modules", ["env parts"]),
     "planners": (r"planners", ["env parts"]),
     "env parts": (r"nesting|carried_state|direct_calls", ["base"]),
-    "base": (r"arguments|checks|compiling|processes|", []),
+    "base": (r"checks|compiling|processes|", []),
 }
 DEPENDENCIES = {"torch", "tensordict", "torchrl", "numpy", "numba"}  # of components
 # What a component may import inside a function, for those who have it.
