@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -27,25 +28,14 @@ FOLDERS = {
     "torchrl_hmcts": "torchrl_hmcts",
 }
 COLORS = {"torchrl_hmcts": "#cfe3f5", "envs": "#f8e3c4", "trainers": "#d9ead6"}  # colour-blind safe
-ALGORITHMS = (
-    *(
-        "a3c",
-        "skills",
-        "diayn",
-        "hmcts",
-        "expert_iteration",
-        "evaluation",
-        "collector",
-        "off_policy",
-    ),
-)
+ALGORITHMS = re.compile(r"a3c|skills|diayn|hmcts|expert_iteration|evaluation|collectors|off_policy")
 
 
 def room_of(path: Path) -> str:
     """Return the room of a file: its folder, two levels deep, with the trainers' own joined."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     if parts[0] == "trainers":
-        if any(part in parts[1] for part in ALGORITHMS):
+        if ALGORITHMS.fullmatch(parts[1]):
             return "trainers/algorithms"
         if parts[1] == "parts":
             return "trainers/experiments"
