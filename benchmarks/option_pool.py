@@ -85,7 +85,7 @@ class Planned:
         budget = SearchBudget(base_steps=steps, until_plan=False)
         waves = 2 if processes else 1
         self.planner = MCTSPlanner(
-            self.pool, expand="one", leaves_per_wave=64, waves_in_flight=waves, budget=budget
+            self.pool, expand="one", leaves_per_wave=192, waves_in_flight=waves, budget=budget
         )
         self.planner.search(self.pool.reset())  # starts the processes
 
@@ -110,6 +110,7 @@ def main() -> None:
     rows = []
     for name in args.ids:
         worker = make_worker(name)
+        bare(name, worker, 0.2)  # compiles the worker
         speed = bare(name, worker, 0.5)
         for processes in (0, 1):
             planned = Planned(name, worker, processes, int(speed * args.seconds))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import marshal
 import pickle
 import types
+from itertools import compress
 from typing import Any, ClassVar
 
 import gymnasium
@@ -78,6 +80,9 @@ class AttributeSnapshot(Snapshot):
         self._kinds: list[dict[tuple[str, type], int]] = [{} for _ in self._layers]
         self._clocks = [vars(layer) for layer in self._layers if type(layer) is TimeLimit]
         self._unchanged: bytes | None = None  # attributes of the env, if it took no step since
+        self._known: tuple[bytes | None, bytes] = None, b""  # a mark, and what it stands for
+        self._plans: list[Any] = [None] * len(self._layers)
+        self._num_plans = 0
         content = self._pickled(learning=True)
         self._unpickled(content)  # a class that is not read is named now, not in a search
         self.width = _room_for(len(content), cap, env)
@@ -129,7 +134,9 @@ class AttributeSnapshot(Snapshot):
             clock["_elapsed_steps"] = steps
         content = row[begin : begin + length].tobytes()
         if content != self._unchanged:
-            self._load_attributes(content)
+            mark, known = self._known
+            if content != known or mark is None or self._mark() != mark:
+                self._load_attributes(content)
             self._unchanged = content
 
     def _load_attributes(self, content: bytes) -> None:
@@ -174,6 +181,9 @@ class AttributeSnapshot(Snapshot):
         Plain values need no look at each object, which is slow; all others are pickled together,
         so that what they share stays shared.
         """
+        mark = None if learning else self._mark()
+        if mark is not None and mark == self._known[0]:
+            return self._known[1]
         values, others, generators, with_others = [], [], [], False
         for number, layer in enumerate(self._layers):
             plain, other, kinds = {}, {}, self._kinds[number]
@@ -196,7 +206,43 @@ class AttributeSnapshot(Snapshot):
                 _Pickler(stream, self, learning).dump(others)
             except Exception as error:
                 raise SnapshotError(self._refusal(others, error)) from error
-        return stream.getvalue()
+        self._known = mark, stream.getvalue()
+        return self._known[1]
+
+    def _mark(self) -> bytes | None:
+        """Bytes that are equal only if all attributes are, much cheaper than pickling them.
+
+        None where some are neither plain values nor arrays of numbers.
+        """
+        parts: list[Any] = []
+        arrays: list[np.ndarray] = []
+        for number, layer in enumerate(self._layers):
+            own = vars(layer)
+            form = tuple(own), tuple(map(type, own.values()))
+            if self._plans[number] is None or self._plans[number][0] != form:
+                self._plans[number] = self._plan(number, own, form)
+            _, version, atoms, of_arrays = self._plans[number]
+            generator = _generator_state(layer)
+            if atoms is None or not (generator is None or isinstance(generator, bytes)):
+                return None
+            parts += [version, generator, *compress(own.values(), atoms)]
+            arrays += compress(own.values(), of_arrays)
+        known = [id(array) for array in arrays]
+        for array in arrays:  # two names of one array are not two arrays
+            if array.dtype.kind in "OV":
+                return None
+            parts += [known.index(id(array)), array.dtype.str, array.shape, array.tobytes()]
+        return marshal.dumps(parts, 2)  # the newest version that does not depend on references
+
+    def _plan(self, number: int, own: dict[str, Any], form: Any) -> tuple[Any, ...]:
+        """Which attributes of a layer a mark reads, as long as their names and types stay."""
+        kinds = [self._kind(number, name, value) for name, value in own.items()]
+        plain = [kind == _PLAIN for kind in kinds]
+        arrays = [p and t is np.ndarray for p, t in zip(plain, form[1], strict=True)]
+        atoms = [p and t in _ATOMS for p, t in zip(plain, form[1], strict=True)]
+        self._num_plans += 1
+        readable = plain == [a or b for a, b in zip(atoms, arrays, strict=True)]
+        return form, self._num_plans, atoms if readable and _OTHER not in kinds else None, arrays
 
     def _refusal(self, values: list[dict[str, Any]], error: Exception) -> str:
         """Names the attribute that cannot be pickled."""

@@ -31,7 +31,7 @@ class PendingStep:
     def __init__(self, pool: ProcessPool, tensordict: TensorDictBase) -> None:
         self.pool, self.tensordict = pool, tensordict
         self.slots: list[int] = []  # whose options are under way
-        self.done: list[np.ndarray] = []  # slots [k] of those before them, with their outcomes
+        self.done: list[dict[str, np.ndarray]] = []  # [k, ...] outcomes of those before them
         self.used = False
 
     def __reduce__(self) -> Any:
@@ -107,6 +107,7 @@ class ProcessPool(EnvBase):
         else:
             self._slots = np.zeros(NUM_SLOTS, self._run.slot_type())
         self._fields = fields_of(self._slots)
+        self._inputs = {"option", "seed", *(f"before {key}" for key in self._run.state_keys)}
         self._free = list(range(NUM_SLOTS))  # slots that no step under way uses
         self._under_way: list[PendingStep] = []
 
@@ -190,7 +191,8 @@ class ProcessPool(EnvBase):
                 self._run.write(fields, i, observation)
             for key, rows in given.items():
                 fields[f"after {key}"][:] = rows
-            return self._observed(self._copied(fields), shape)
+            copied = {name: field.copy() for name, field in fields.items()}
+            return self._observed(self._entries_in(copied), shape)
 
     def _rows(self, tensordict: TensorDictBase | None) -> dict[Any, np.ndarray]:
         """Return the entries of the state, ``[m, ...]``, after checking them."""
@@ -299,10 +301,12 @@ class ProcessPool(EnvBase):
             self._settle(ticket)
         finally:
             self._forget(ticket)
-        fields = fields_of(ticket.done[0] if len(ticket.done) == 1 else np.concatenate(ticket.done))
-        out = self._copied(fields)
+        fields, *further = ticket.done
+        if further:
+            fields = {name: np.concatenate([p[name] for p in ticket.done]) for name in fields}
+        out = self._entries_in(fields)
         for key in ("reward", "terminated", "truncated"):
-            out[key] = fields[key].copy()
+            out[key] = fields[key]
         out["done"] = out["terminated"] | out["truncated"]
         result = self._observed(out, ticket.tensordict.batch_size)
         if self.on_step is not None:
@@ -333,7 +337,9 @@ class ProcessPool(EnvBase):
         try:
             if slots and self._processes is not None:
                 self._processes.wait(slots)
-            ticket.done.append(self._slots[slots])
+            at = np.array(slots, np.int64)
+            outcomes = {n: f[at] for n, f in self._fields.items() if n not in self._inputs}
+            ticket.done.append(outcomes)
         finally:
             self._free += slots
 
@@ -348,12 +354,10 @@ class ProcessPool(EnvBase):
         for i in slots:
             self._run.run(self._fields, i)
 
-    def _copied(self, fields: dict[str, np.ndarray]) -> dict[Any, np.ndarray]:
-        """Return what is observed, from slots with an outcome."""
-        out: dict[Any, np.ndarray] = {
-            key: fields[f"after {key}"].copy() for key in self._run.outputs
-        }
-        out["duration"] = fields["duration"].copy()
+    def _entries_in(self, fields: dict[str, np.ndarray]) -> dict[Any, np.ndarray]:
+        """Return what is observed, from the fields of outcomes."""
+        out: dict[Any, np.ndarray] = {key: fields[f"after {key}"] for key in self._run.outputs}
+        out["duration"] = fields["duration"]
         return out
 
     def _observed(self, out: dict[Any, np.ndarray], shape: torch.Size) -> TensorDict:
