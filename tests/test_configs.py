@@ -15,21 +15,25 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig
-from torchrl.envs import EnvBase
+from tensordict import TensorDictBase
+from torchrl.data import Bounded, Composite
+from torchrl.envs import EnvBase, Transform
 
 import torchrl_hmcts.envs
 import torchrl_hmcts.objectives
 import torchrl_hmcts.planners
 import torchrl_hmcts.transforms
+from torchrl_hmcts import objectives
 from torchrl_hmcts.planners import PUCT, UCT, Gumbel, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.command_line.words import expand, parse_config
 from torchrl_hmcts.trainers.configs import COMPONENTS, config_of
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS, find_experiment
 from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.kits.waterworld import WaterworldKit
 from torchrl_hmcts.trainers.experiments.registry import DEMO
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-from torchrl_hmcts.trainers.experiments.skills import learn
+from torchrl_hmcts.trainers.experiments.skills import learn, make_loss
 from torchrl_hmcts.trainers.parts import build, differences, merged, named
 
 CONFIGS = [(f"{g}={n}", named(p)) for g, names in COMPONENTS.items() for n, p in names.items()]
@@ -326,6 +330,23 @@ def test_experiments_compose_too(name: str) -> None:
     assert config.experiment.out == f"runs/{name}"
 
 
+class Pushed(WaterworldKit):
+    """Waterworld whose disc is pushed by two numbers, of which the larger one decides."""
+
+    def make_training_env(self, num_envs: int = 32) -> EnvBase:
+        return super().make_training_env(num_envs).append_transform(_Pushes())
+
+
+class _Pushes(Transform):
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", tensordict["action"].argmax(-1))
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        spec = Bounded(-1.0, 1.0, shape=(*self.parent.batch_size, 2))
+        input_spec["full_action_spec", "action"] = spec
+        return input_spec
+
+
 class TestParts:
     """Parts of an agent over a kit, as they are typed on the command line."""
 
@@ -366,6 +387,11 @@ class TestParts:
             ("planner.waves_in_flihgt=2", "Did you mean: planner.waves_in_flight"),
             ("planner.leaves_per_wave=many", "planner.leaves_per_wave"),
             ("loss.gama=0.9", "Did you mean: loss.gamma"),
+            ("loss.gamma=2", "gamma"),
+            ("loss=skill_sac", "these are: DIAYNLoss, DiscreteSkillSACLoss"),
+            ("loss=a3c", "these are: DIAYNLoss, DiscreteSkillSACLoss"),
+            ("loss=option_model", "these are: DIAYNLoss, DiscreteSkillSACLoss"),
+            ("loss.num_skills=3", "num_skills, not loss.num_skills"),
             ("planner/transpositions=by_key", "planner.transpositions needs key"),
             ("planner.novelty.radius=-1", "radius"),
             ("planner", "no key=value"),
@@ -381,6 +407,31 @@ class TestParts:
         learned = learn(make_kit(config))
         assert learned.steps == 64
         assert learned.loss.objective.num_skills == 4
+
+    @pytest.mark.parametrize(
+        ("words", "expected"),
+        [
+            ([], objectives.DIAYNLoss),
+            (["loss=diayn"], objectives.DIAYNLoss),
+            (["loss=discrete_skill_sac", "loss.alpha_init=0.2"], objectives.DiscreteSkillSACLoss),
+            (["loss=DiscreteSkillSACLoss"], objectives.DiscreteSkillSACLoss),
+            (["objective=metra"], objectives.DiscreteSkillSACLoss),
+            (["objective=metra", "loss=discrete_skill_sac"], objectives.DiscreteSkillSACLoss),
+        ],
+    )
+    def test_the_loss_is_chosen_by_its_name(self, words: list[str], expected: type) -> None:
+        loss = make_loss(make_kit(parse_config(DEMO, words)))
+        assert type(loss) is expected
+        if "loss.alpha_init=0.2" in words:
+            assert loss.log_alpha.exp().item() == pytest.approx(0.2)
+            assert isinstance(loss.objective, objectives.SkillDiscriminatorLoss)
+
+    def test_a_worker_that_acts_within_bounds_learns_with_skill_sac(self) -> None:
+        kit = Pushed(DemoConfig(train_base_steps=64))
+        assert kit.parts()["loss"]["_component_"].endswith(".SkillSACLoss")
+        learned = learn(kit)
+        assert type(learned.loss) is objectives.SkillSACLoss
+        assert (learned.steps, learned.worker.out_keys) == (64, ["action"])
 
     @pytest.mark.parametrize(
         ("other", "changes"),

@@ -6,8 +6,15 @@ import json
 from pathlib import Path
 
 import pytest
+from tensordict.nn import TensorDictModule
 
+from torchrl_hmcts.planners import PUCT, UCT, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.command_line import train
+from torchrl_hmcts.trainers.command_line.words import parse_config
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.registry import DEMO
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 PARTS = ["objective=metra", "planner/tree_policy=puct", "planner/novelty=radius"]
@@ -61,9 +68,38 @@ def test_given_options_need_no_training(tmp_path: Path) -> None:
     assert not (tmp_path / "worker").exists()
 
 
+def test_planner_keys_hold_in_algorithm_3s_rounds() -> None:
+    words = ["algorithm=hmcts", "planner/tree_policy=puct", "planner.novelty.radius=0.4"]
+    kit = make_kit(parse_config(DEMO, [*words, "planner.budget.until_plan=false"]))
+    simulator = kit.make_simulator(TensorDictModule(lambda skill: skill, ["skill"], ["action"]))
+    planner = kit.make_round_planner(simulator, tree_policy=UCT(2.0), seed=5)
+    assert planner.tree_policy == PUCT()
+    assert planner.novelty.radius == 0.4
+    assert (planner.budget.expansions, planner.budget.until_plan) == (2, False)
+    bare = make_kit(DemoConfig()).make_round_planner(simulator, tree_policy=UCT(2.0), seed=5)
+    expected = MCTSPlanner(
+        simulator,
+        tree_policy=UCT(2.0),
+        novelty=RadiusNovelty("position", 1.0),
+        budget=SearchBudget(expansions=2),
+        seed=5,
+    )
+    assert repr(bare) == repr(expected)
+
+
+def test_the_atari_agent_is_found_as_a_kit(tmp_path: Path, monkeypatch) -> None:
+    taken = []
+    monkeypatch.setattr(train, "run_experiment", lambda *args, **_: taken.append(args) or 0)
+    assert main(["train", "kit=atari", "env.game=Pong", "options=goals", f"out={tmp_path}"]) == 0
+    (name, experiment, config, *_) = taken[0]
+    assert (name, experiment.name) == ("train kit=atari", "atari")
+    assert (config.game, config.source) == ("Pong", "goals")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["kit=atari", "options=luck"], "source is one of best, goals"),
         (["kit=labmase"], "Unknown kit 'labmase'. Did you mean: labmaze"),
         (["kit=labmaze", "experiment=labmaze"], "say which experiment"),
         (["kit=waterworld", "objective=dayn"], "Did you mean: diayn"),

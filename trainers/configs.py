@@ -251,7 +251,8 @@ def compose_parts(
 
     Args:
         own: entries of the components at their defaults, by part, e.g. ``"planner"``.
-        words: ``PART=NAME`` and ``PART/GROUP=NAME`` choose a class, ``PART.KEY=VALUE`` a keyword.
+        words: ``PART=NAME`` and ``PART/GROUP=NAME`` choose a class, by its short name (``puct``) or
+            its own (``PUCT``), ``PART.KEY=VALUE`` a keyword.
 
     Returns:
         The components by part.
@@ -281,6 +282,8 @@ def compose_parts(
         where: Any = {"": config}.get(parent) or _at(config, parent)
         if group not in COMPONENTS or not isinstance(where, dict) or last not in where:
             raise ValueError(unknown_key(key, _choices(config)))
+        classes = {path.rpartition(".")[2]: short for short, path in COMPONENTS[group].items()}
+        name = classes.get(name, name)
         if name not in COMPONENTS[group]:
             near = difflib.get_close_matches(name, COMPONENTS[group], cutoff=0.4)
             names = ", ".join(near or COMPONENTS[group])

@@ -12,13 +12,26 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.collectors import BaseCollector, Collector
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule
 from torchrl.trainers import UpdateWeights
 
 from torchrl_hmcts.checks import instance, real_number, whole_number
-from torchrl_hmcts.modules import SkillActor, SkillCritic, SkillDiscriminator, SkillPolicy
-from torchrl_hmcts.objectives import DIAYNLoss, DiscreteSkillSACLoss, SkillObjective
+from torchrl_hmcts.modules import (
+    SkillActionCritic,
+    SkillActor,
+    SkillCritic,
+    SkillDiscriminator,
+    SkillPolicy,
+)
+from torchrl_hmcts.objectives import (
+    DIAYNLoss,
+    DiscreteSkillSACLoss,
+    SkillDiscriminatorLoss,
+    SkillObjective,
+    SkillSACLoss,
+)
 from torchrl_hmcts.trainers.collectors import CollectorError
 from torchrl_hmcts.trainers.off_policy import OffPolicyTrainer, Progress, made_by
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
@@ -224,6 +237,7 @@ class DIAYNTrainer(OffPolicyTrainer):
         num_skills: int = 4,
         *,
         objective: SkillObjective | None = None,
+        loss_class: type[LossModule] | None = None,
         in_keys: Sequence[NestedKey] = ("velocity",),
         critic_keys: Sequence[NestedKey] = ("velocity", "displacement"),
         discriminator_keys: Sequence[NestedKey] = ("displacement",),
@@ -231,8 +245,11 @@ class DIAYNTrainer(OffPolicyTrainer):
         discriminator_hidden: Sequence[int] = (),
         seed: int | None = None,
         **loss_kwargs: Any,
-    ) -> DiscreteSkillSACLoss:
+    ) -> LossModule:
         """Builds actor, critics, discriminator and loss with the sizes of an env's specs.
+
+        Critics of discrete actions are :class:`SkillCritic`, those of actions within bounds
+        :class:`SkillActionCritic`.
 
         Args:
             env (EnvBase): env that writes ``in_keys`` and ``discriminator_keys``.
@@ -240,6 +257,8 @@ class DIAYNTrainer(OffPolicyTrainer):
             objective (SkillObjective, optional): what makes skills different, e.g.
                 :class:`METRAEncoderLoss`. Default ``None``: DIAYN's discriminator, built with
                 ``discriminator_keys`` and ``discriminator_hidden``.
+            loss_class (type, optional): one of :func:`worker_losses`. Default ``None``: the first
+                of these that takes the ``objective``.
             in_keys (sequence of NestedKey): what the actor sees besides the skill. Default
                 ``("velocity",)``.
             critic_keys (sequence of NestedKey): what the critics see besides the skill. Default
@@ -256,35 +275,69 @@ class DIAYNTrainer(OffPolicyTrainer):
             **loss_kwargs: passed to the loss.
 
         Returns:
-            DIAYNLoss, or with an ``objective`` DiscreteSkillSACLoss: the loss, with fresh networks.
+            LossModule: the loss, with fresh networks.
 
         Raises:
             KeyError: if the env does not write one of the keys.
+            ValueError: if ``loss_class`` does not train such actions, or such an objective.
         """
         action_spec = env.action_spec_unbatched
+        losses = worker_losses(action_spec, objective)
+        if loss_class is None:
+            loss_class = losses[0]
+        if loss_class not in losses:
+            raise ValueError(
+                f"{loss_class.__name__} is no loss for a worker with "
+                f"{type(action_spec).__name__} actions and "
+                f"{'no other objective' if objective is None else type(objective).__name__}; these "
+                f"are: {', '.join(loss.__name__ for loss in losses)}."
+            )
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
             if seed is not None:
                 torch.manual_seed(int(seed))
             actor = SkillActor(
                 _width(env, in_keys), action_spec, num_skills, in_keys=in_keys, hidden=hidden
             )
-            critic = SkillCritic(
-                _width(env, critic_keys),
-                actor.num_actions,
-                num_skills,
-                in_keys=critic_keys,
-                hidden=hidden,
-            )
-            loss_kwargs["action_space"] = action_spec
+            keys: dict[str, Any] = {"in_keys": critic_keys, "hidden": hidden}
+            width = _width(env, critic_keys)
+            critic: SkillCritic | SkillActionCritic
+            if issubclass(loss_class, SkillSACLoss):
+                critic = SkillActionCritic(width, action_spec.shape[-1], num_skills, **keys)
+            else:
+                critic = SkillCritic(width, actor.num_actions, num_skills, **keys)
+                loss_kwargs["action_space"] = action_spec
             if objective is not None:
-                return DiscreteSkillSACLoss(actor, critic, objective, **loss_kwargs)
+                return loss_class(actor, critic, objective, **loss_kwargs)
             discriminator = SkillDiscriminator(
                 _width(env, discriminator_keys),
                 num_skills,
                 in_keys=discriminator_keys,
                 hidden=discriminator_hidden,
             )
-            return DIAYNLoss(actor, critic, discriminator, **loss_kwargs)
+            if issubclass(loss_class, DIAYNLoss):
+                return loss_class(actor, critic, discriminator, **loss_kwargs)
+            return loss_class(actor, critic, SkillDiscriminatorLoss(discriminator), **loss_kwargs)
+
+
+def worker_losses(
+    action_spec: TensorSpec, objective: SkillObjective | None = None
+) -> tuple[type[LossModule], ...]:
+    """Returns the losses that train a worker with such actions, the default first.
+
+    Args:
+        action_spec (TensorSpec): discrete, or bounded floats.
+        objective (SkillObjective, optional): what makes skills different. Default ``None``: DIAYN's
+            discriminator, which :class:`DIAYNLoss` builds its objective of.
+
+    Examples:
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.trainers.diayn import worker_losses
+        >>> [loss.__name__ for loss in worker_losses(Categorical(4))]
+        ['DIAYNLoss', 'DiscreteSkillSACLoss']
+    """
+    if not hasattr(action_spec.space, "n"):
+        return (SkillSACLoss,)
+    return (DIAYNLoss, DiscreteSkillSACLoss)[objective is not None :]
 
 
 def make_skill_optimizer(

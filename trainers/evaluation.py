@@ -44,6 +44,9 @@ def execute_plans(
 ) -> Execution:
     """Take the options of each plan one after the other, until it or the episode ends.
 
+    It is no :class:`~torchrl_hmcts.planners.HierarchicalPolicy`, which would plan again at a plan's
+    end and act without one: one trial is one plan, and its failure is to be seen.
+
     Args:
         real: the macro environment to act in, which can be set to states; not the planner's.
         starts: states ``[M]``.

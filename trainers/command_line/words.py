@@ -46,6 +46,12 @@ def parse_config(
     config = parse_overrides(experiment.config_class, rest, base=base, others=others)
     if not chosen:
         return config
+    first = [word for word in chosen if word.startswith("objective")]
+    if 0 < len(first) < len(chosen):  # the default of the loss depends on it
+        config = parse_config(experiment, first, config)
+        chosen = [word for word in chosen if word not in first]
+    from torch.random import fork_rng
+
     from torchrl_hmcts.trainers.configs import compose_parts, full
     from torchrl_hmcts.trainers.experiments.kits import make_kit
     from torchrl_hmcts.trainers.parts import build, differences, merged
@@ -56,7 +62,15 @@ def parse_config(
     for part in composed["planner"].values():  # says what is wrong with a part before all work
         if isinstance(part, dict) and "_component_" in part:
             build(**part)
-    return replace(config, **{p: differences(full(own[p]), node) for p, node in composed.items()})
+    config = replace(
+        config, **{part: differences(full(own[part]), node) for part, node in composed.items()}
+    )
+    if config.loss:
+        from torchrl_hmcts.trainers.experiments.skills import make_loss
+
+        with fork_rng(devices=[]):
+            make_loss(make_kit(config))  # the same for the loss
+    return config
 
 
 def expand(words: Sequence[str]) -> list[list[str]]:

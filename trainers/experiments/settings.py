@@ -36,12 +36,14 @@ class SkillsConfig(RunConfig):
     """What sets skills apart: objective=metra, lsd, dads or diayn, the default;
     objective.KEY=VALUE."""
     loss: dict[str, Any] = field(default_factory=dict)
-    """Keywords of the worker's loss: loss.KEY=VALUE, e.g. loss.alpha_init=0.1."""
+    """The worker's loss: loss=diayn, the default, or discrete_skill_sac; for actions within bounds
+    skill_sac. Its keywords: loss.KEY=VALUE, e.g. loss.alpha_init=0.1."""
     trainer: dict[str, Any] = field(default_factory=dict)
     """Keywords of the trainer: trainer.KEY=VALUE, e.g. trainer.buffer_size=50000."""
     planner: dict[str, Any] = field(default_factory=dict)
     """Parts of the planner: planner/PART=NAME, e.g. planner/tree_policy=puct, and their keywords:
-    planner.KEY=VALUE, planner.PART.KEY=VALUE."""
+    planner.KEY=VALUE, planner.PART.KEY=VALUE. They hold for Algorithm 3's training rounds too, but
+    the expansions of those are round_expansions."""
     num_skills: int = 4
     """Skills of the worker, the options of the manager (the dissertation's N_policies)."""
     updates_per_step: float = 3 / 64
@@ -74,7 +76,10 @@ class SkillsConfig(RunConfig):
     Ray cluster (with algorithm=diayn; such a run does not continue exactly)."""
 
     KIT: ClassVar[str] = ""  # name of the kit
-    KEPT = ("seed", "toy", "options", "algorithm", "objective", "loss", "trainer", "num_skills")
+    KEPT = (
+        *("seed", "toy", "options", "algorithm", "objective", "loss", "trainer", "planner"),
+        "num_skills",
+    )
     LEAST = dict.fromkeys(
         (
             *("mazes", "num_skills", "option_steps", "skill_steps", "init_options", "expansions"),

@@ -27,7 +27,7 @@ from torchrl_hmcts.modules import (
     SpectralLinear,
 )
 from torchrl_hmcts.objectives import SkillObjective
-from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
+from torchrl_hmcts.planners import MCTSPlanner
 from torchrl_hmcts.trainers.collectors import make_ray_collector
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
@@ -40,7 +40,8 @@ from torchrl_hmcts.trainers.experiments.kits import (
 )
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, SkillsConfig
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
-from torchrl_hmcts.trainers.parts import build, merged
+from torchrl_hmcts.trainers.parts import build, merged, named
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
@@ -199,10 +200,15 @@ def given_worker(kit: Kit) -> TensorDictModuleBase | None:
 
     Args:
         kit: with ``options="actions"`` an option repeats one action.
+
+    Raises:
+        ExperimentError: if the actions cannot be counted.
     """
     if kit.config.options == "learned":
         return None
     env = kit.make_env("test")
+    if not hasattr(env.action_spec.space, "n"):
+        raise ExperimentError("options=actions needs discrete actions; these are within bounds.")
     kit.config = dataclasses.replace(kit.config, num_skills=int(env.action_spec.space.n))
     return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
 
@@ -219,6 +225,9 @@ def make_loss(kit: Kit) -> Any:
     config, env = kit.config, kit.make_training_env(1)
     node = merged(OBJECTIVE, config.objective)
     keywords = dict(config.loss)
+    if keywords.pop("num_skills", None) not in (None, config.num_skills):
+        raise ValueError("The number of skills is num_skills, not loss.num_skills.")
+    chosen = keywords.pop("_component_", None)
     critic_keys = list(kit.worker_keys)
     if node != OBJECTIVE:
         keywords["objective"] = make_objective(kit, env, node)
@@ -227,6 +236,7 @@ def make_loss(kit: Kit) -> Any:
     return DIAYNTrainer.make_loss(
         env,
         config.num_skills,
+        loss_class=None if chosen is None else named(chosen),
         in_keys=kit.worker_keys,
         critic_keys=critic_keys,
         seed=config.seed,
@@ -292,11 +302,7 @@ def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTr
         "option_steps": config.option_steps,
         "make_options": partial(OptionTransform, gamma=config.gamma),
         "make_recorder": partial(OptionRecorder, position_key=kit.place_key),
-        "make_planner": partial(
-            MCTSPlanner,
-            novelty=RadiusNovelty(kit.place_key, config.novelty_radius),
-            budget=SearchBudget(expansions=config.round_expansions),
-        ),
+        "make_planner": kit.make_round_planner,
         "updates_per_step": config.updates_per_step,
     }
     if config.curve_points:

@@ -59,6 +59,7 @@ class RunConfig:
     TOY: ClassVar[Mapping[str, Any]] = {}  # what toy=true changes
     KEPT: ClassVar[tuple[str, ...]] = ("seed", "toy")  # a run that is resumed keeps these
     PATHS: ClassVar[tuple[str, ...]] = ("out",)
+    ALIASES: ClassVar[Mapping[str, str]] = {}  # other names of keys on the command line
     LEAST: ClassVar[Mapping[str, int]] = {}  # least value of a number
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ()
     CHOICES: ClassVar[Mapping[str, Sequence[str]]] = {}
@@ -201,6 +202,7 @@ def parse_overrides(
     for word in overrides:
         word = word.removeprefix("env.")
         key, separator, value = word.partition("=")
+        key = getattr(config_class, "ALIASES", {}).get(key, key)
         if not separator:
             raise ValueError(f"{word!r} is no key=value, e.g. {next(iter(types))}=1.")
         if key not in types:

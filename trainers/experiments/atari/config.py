@@ -28,14 +28,14 @@ class AtariConfig(RunConfig):
     """"deterministic" (comparable with the dissertation and the planning papers) or "sticky"
     (actions stick with probability 0.25, and the planner is given no random generator)."""
     source: str = "best"
-    """Where options come from. Rules: "best" ("action_sets", "actions" or "goals", with which a
-    planner's trials score best), "goals" (found by a probe and trials), "repeat" (one for each
-    action), "actions" (some of these, chosen by trials), "action_sets" (all of these, those that
-    fire or those that do not, chosen by trials). Networks: "goals_network" (has learned the goals),
-    "goals_fine_tuned" (that network, trained further by SAC on its goals and the game),
-    "goals_retrained" (the same on what searches simulated, Algorithm 3), "diayn" (the
-    dissertation's worker), "diayn_displacement", "diayn_controllable" (with other discriminators),
-    "diayn_retrained" (Algorithm 3)."""
+    """Where options come from; `options=` is the same key. Rules: "best" ("action_sets",
+    "actions" or "goals", with which a planner's trials score best), "goals" (found by a probe
+    and trials), "repeat" (one for each action), "actions" (some of these, chosen by trials),
+    "action_sets" (all of these, those that fire or those that do not, chosen by trials).
+    Networks: "goals_network" (has learned the goals), "goals_fine_tuned" (that network, trained
+    further by SAC on its goals and the game), "goals_retrained" (the same on what searches
+    simulated, Algorithm 3), "diayn" (the dissertation's worker), "diayn_displacement",
+    "diayn_controllable" (with other discriminators), "diayn_retrained" (Algorithm 3)."""
     frames: int = 40_000_000
     """Emulated frames in all, 10 million base steps as in the dissertation; the last episode is
     finished."""
@@ -88,6 +88,7 @@ class AtariConfig(RunConfig):
     EXPERIMENT = "atari"
     FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
     PATHS = ("out", "options_from")
+    ALIASES = {"options": "source"}
     CHOICES = {
         "protocol": ("deterministic", "sticky"),
         "source": (

@@ -23,6 +23,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner
+from torchrl_hmcts.trainers.diayn import worker_losses
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
@@ -211,9 +212,14 @@ class Kit:
     def parts(self) -> dict[str, dict[str, Any]]:
         """Return the components that keys of the command line change, at the kit's defaults."""
         trainer = {"hmcts": "HMCTSTrainer"}.get(self.config.algorithm, "DIAYNTrainer")
+        with torch.random.fork_rng(devices=[]):  # a new env draws its seed
+            losses = worker_losses(self.make_training_env(1).action_spec_unbatched)
+        other = merged(OBJECTIVE, self.config.objective) != OBJECTIVE
         return {
             "objective": dict(OBJECTIVE),
-            "loss": {"_component_": "torchrl_hmcts.objectives.DiscreteSkillSACLoss"},
+            "loss": {
+                "_component_": f"torchrl_hmcts.objectives.{losses[-1 if other else 0].__name__}"
+            },
             "trainer": {"_component_": f"torchrl_hmcts.trainers.{trainer}"},
             "planner": self.planner_part(),
         }
@@ -228,6 +234,23 @@ class Kit:
         part = merged(self.planner_part(), self.config.planner)
         part["budget"] = {**part["budget"], **budget}
         planner: MCTSPlanner = build(**part, env=simulator)
+        return planner
+
+    def make_round_planner(self, simulator: EnvBase, **own: Any) -> MCTSPlanner:
+        """Return the planner of Algorithm 3's training rounds: bare, with the keys of ``planner``.
+
+        Args:
+            simulator: the macro env to plan in.
+            **own: what the trainer sets; another ``tree_policy`` of the configuration goes first.
+        """
+        bare = {
+            "_component_": "torchrl_hmcts.planners.MCTSPlanner",
+            "novelty": self.planner_part()["novelty"] | {"shorter_paths": False},
+            "budget": {"_component_": "torchrl_hmcts.planners.SearchBudget"},
+        }
+        part = merged(bare, self.config.planner)
+        part["budget"] = {**part["budget"], "expansions": self.config.round_expansions}
+        planner: MCTSPlanner = build(**{**own, **part, "seed": own["seed"]}, env=simulator)
         return planner
 
     def second_try(self) -> Kit | None:
