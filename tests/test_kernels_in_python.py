@@ -43,7 +43,10 @@ PLANNERS, ENVS = "torchrl_hmcts.planners", "torchrl_hmcts.envs"
 Arrays = dict[str, np.ndarray]
 
 
-KERNELS = ("variant_kernels", "kernels", "batch_kernels", "subtree_kernels", "novelty_kernels")
+KERNELS = (
+    *("number_kernels", "variant_kernels", "kernels", "root_kernels", "batch_kernels"),
+    *("subtree_kernels", "novelty_kernels"),
+)
 
 
 def in_python(name: str) -> ModuleType:

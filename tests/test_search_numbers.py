@@ -334,7 +334,7 @@ def test_an_evaluator_that_changes_its_states_changes_no_tree(part: str) -> None
 def test_outcomes_that_do_not_fit_a_wave_are_refused(
     field: str, wrong: np.ndarray, message: str
 ) -> None:
-    from torchrl_hmcts.planners.search import Outcomes, RootStates
+    from torchrl_hmcts.planners.outcomes import Outcomes, RootStates
     from torchrl_hmcts.planners.subtree import reroot
 
     search = Search(1, 2)

@@ -13,10 +13,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_hmcts.planners.random_streams import with_seeds
 from torchrl_hmcts.planners.tree import LARGEST
-
-# Entry with a seed for each state, int64 [m], given to evaluators that draw random numbers.
-SEED_KEY = "_seed"
 
 
 class Evaluation(NamedTuple):
@@ -96,10 +94,10 @@ class NodeEvaluator:
         td = td.clone()  # what is stored must not depend on what the parts do with it
         found = Evaluation()
         if self.leaf_evaluator is not None:
-            answer = self.leaf_evaluator(_with_seeds(self.leaf_evaluator, td, seeds))
+            answer = self.leaf_evaluator(with_seeds(self.leaf_evaluator, td, seeds))
             found = answer if isinstance(answer, Evaluation) else Evaluation(values=answer)
         if self.option_prior is not None:
-            answer = self.option_prior(_with_seeds(self.option_prior, td, seeds))
+            answer = self.option_prior(with_seeds(self.option_prior, td, seeds))
             prior = answer.priors if isinstance(answer, Evaluation) else answer
             found = found._replace(priors=prior)
         if found.priors is not None:
@@ -146,28 +144,9 @@ def check_values(values: Any, num_states: int, reader: str) -> Tensor:
     return found
 
 
-def _with_seeds(
-    part: Evaluator, td: TensorDictBase, seeds: Callable[[], np.ndarray]
-) -> TensorDictBase:
-    if not getattr(part, "is_random", False):
-        return td
-    return td.copy().set(SEED_KEY, torch.from_numpy(seeds()))
-
-
 def _check_tensor(value: Any, reader: str) -> None:
     if not isinstance(value, Tensor):
         raise TypeError(
             f"The {reader} must return a tensor; got {type(value).__name__}. Wrap a module in "
             f"ModulePrior or ValueEvaluator."
         )
-
-
-def wave_seeds(
-    seeds: np.ndarray, counted: np.ndarray, nodes: np.ndarray, options: np.ndarray
-) -> np.ndarray:
-    """Return seeds that depend on root, node, option and order of outcomes, int64 ``[m]``."""
-    mixed = seeds.astype(np.uint64) * np.uint64(0xBF58476D1CE4E5B9)
-    for part in (nodes, options, counted):
-        mixed = (mixed ^ part.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
-    return (mixed >> np.uint64(1)).astype(np.int64)

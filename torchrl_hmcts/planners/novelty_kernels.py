@@ -203,25 +203,6 @@ def accept_distant(
 
 
 @njit()
-def accept_new_bytes(counts, limits, tally, roots, features, accepted):
-    """Accept, in order, the states with a byte whose value ``counts [B, F, 256]`` has seldom."""
-    for i in range(roots.shape[0]):
-        b = roots[i]
-        novel = False
-        for f in range(features.shape[1]):
-            if counts[b, f, features[i, f]] < limits[b]:
-                novel = True
-                break
-        accepted[i] = novel
-        if novel:
-            for f in range(features.shape[1]):
-                if counts[b, f, features[i, f]] < 255:
-                    counts[b, f, features[i, f]] += 1
-        else:
-            tally[0] += 1
-
-
-@njit()
 def _slot(values, owners, b, f, value):
     """The slot of feature ``f`` with this value in the hash table of a root, or a free one."""
     last = owners.shape[1] - 1
@@ -233,7 +214,7 @@ def _slot(values, owners, b, f, value):
 
 
 @njit()
-def accept_new_integers(
+def accept_new(
     values, owners, counts, used, limits, tally, roots, features, accepted, slots, first
 ):
     """Accept, in order, the states with a value that was seldom seen; return how far it came.

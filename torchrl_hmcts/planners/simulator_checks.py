@@ -8,8 +8,8 @@ from tensordict.utils import NestedKey
 from torchrl.data import Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_hmcts.checks import nested_key
 from torchrl_hmcts.nesting import env_name, flat_transforms
-from torchrl_hmcts.planners.keys import entry_key
 
 
 def check_env(env: EnvBase) -> None:
@@ -112,7 +112,7 @@ def find_reward_key(env: EnvBase, reward_key: NestedKey | None) -> NestedKey:
     """Return the reward that is asked for, or the only one."""
     keys = [unravel_key(k) for k in env.reward_keys]
     if reward_key is not None:
-        reward_key = entry_key("MCTSPlanner", "reward_key", reward_key)
+        reward_key = nested_key("MCTSPlanner", "reward_key", reward_key)
         if reward_key in keys:
             return reward_key
     if reward_key is not None or len(keys) != 1:
