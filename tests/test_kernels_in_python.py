@@ -13,6 +13,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from search_parts import least_visited
 
 from torchrl_hmcts import planners
 from torchrl_hmcts.envs import LabMazeEnv, SharedMLP
@@ -24,7 +25,6 @@ from torchrl_hmcts.planners import (
     DirichletNoise,
     Gumbel,
     MCTSPlanner,
-    NodeStatistics,
     ProgressiveWidening,
     RadiusNovelty,
     Root,
@@ -124,10 +124,6 @@ def prior(td: Any) -> torch.Tensor:
 
 def half(td: Any) -> torch.Tensor:
     return 0.5 * torch.ones(len(td))
-
-
-def least_visited(statistics: NodeStatistics) -> torch.Tensor:
-    return -statistics.option_visits
 
 
 SEARCHES: dict[str, dict[str, Any]] = {

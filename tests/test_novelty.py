@@ -11,11 +11,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from search_parts import expansions
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Categorical
 
 from torchrl_hmcts.envs import GridworldMazeEnv, generate_mazes, shortest_path
-from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget, WidthNovelty
+from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
 PRUNED = 8
@@ -247,7 +248,7 @@ def test_shorter_paths_improve_the_plan_after_the_first() -> None:
             env,
             gamma=0.5,
             novelty=RadiusNovelty("state", 0.5, shorter_paths=shorter_paths, max_relaxations=0),
-            budget=SearchBudget(expansions=50, until_plan=False),
+            budget=expansions(50),
         )
         search = planner.search(env.reset())
         returns.append(float(search.best_return[0]))
@@ -363,11 +364,7 @@ def test_a_search_expands_each_place_once() -> None:
 
 
 def test_a_pruned_node_has_no_children_and_is_visited_once() -> None:
-    planner = MCTSPlanner(
-        ChainEnv(30),
-        novelty=RadiusNovelty("state", 1.0),
-        budget=SearchBudget(expansions=25, until_plan=False),
-    )
+    planner = MCTSPlanner(ChainEnv(30), novelty=RadiusNovelty("state", 1.0), budget=expansions(25))
     search = planner.search(ChainEnv(30).reset())
     tree = search.tree
     pruned = np.flatnonzero(tree.nodes[0]["flags"] & PRUNED)
@@ -429,7 +426,7 @@ def test_reopened_nodes_are_searched_and_keep_their_values() -> None:
         env,
         gamma=0.5,
         novelty=RadiusNovelty("state", 5.0),
-        budget=SearchBudget(expansions=100, until_plan=False),
+        budget=expansions(100),
     )
     search = planner.search(env.reset())
     assert search.tree.states is not None
@@ -445,11 +442,7 @@ def test_reopened_nodes_are_searched_and_keep_their_values() -> None:
 
 def test_an_exhausted_width_search_relaxes_and_reaches_all_states() -> None:
     env = PairEnv(5)
-    planner = MCTSPlanner(
-        env,
-        novelty=WidthNovelty(["x", "y"]),
-        budget=SearchBudget(expansions=400, until_plan=False),
-    )
+    planner = MCTSPlanner(env, novelty=WidthNovelty(["x", "y"]), budget=expansions(400))
     search = planner.search(env.reset())
     tree = search.tree
     assert tree.states is not None
@@ -462,7 +455,7 @@ def test_a_search_that_is_resumed_after_another_remembers_its_own_states(
     novelty: RadiusNovelty | WidthNovelty,
 ) -> None:
     env = ChainEnv(40)
-    budget = SearchBudget(expansions=10, until_plan=False)
+    budget = expansions(10)
     planner = MCTSPlanner(env, novelty=novelty, budget=budget)
     first = planner.search(TensorDict({"state": torch.tensor([0, 20, 30])}, [3]))
     planner.search(env.reset().set("state", torch.tensor(12)))

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
+from search_parts import simulations
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
@@ -97,7 +98,7 @@ def random_search() -> Search:
         SlipperyEnv(table, terminal=[3]),
         gamma=0.9,
         chance=ProgressiveWidening(k=2.0),
-        budget=SearchBudget(simulations=60, until_plan=False),
+        budget=simulations(60),
         expand="one",
         seed=0,
     )

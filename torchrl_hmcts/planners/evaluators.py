@@ -18,12 +18,8 @@ from torch import Tensor
 
 from torchrl_hmcts.checks import nested_key, real_number, whole_number
 from torchrl_hmcts.direct_calls import has_hooks, is_plain
-from torchrl_hmcts.planners.evaluation import (
-    Evaluation,
-    Evaluator,
-    check_priors,
-    check_values,
-)
+from torchrl_hmcts.planners.answers import check_priors, check_values
+from torchrl_hmcts.planners.evaluation import Evaluation, Evaluator
 from torchrl_hmcts.planners.random_streams import SEED_KEY, mix, uniform_bits, with_seeds
 from torchrl_hmcts.planners.simulator import Simulator
 

@@ -37,6 +37,7 @@ from torchrl_hmcts.planners.search import Search
 from torchrl_hmcts.planners.search_loop import SearchLoop
 from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.simulator import Simulator
+from torchrl_hmcts.planners.simulator_checks import check_masks
 from torchrl_hmcts.planners.subtree import check_successor, keep_subtrees
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree_policies import UCT, TreePolicy
@@ -380,12 +381,7 @@ class MCTSPlanner(TensorDictModuleBase):
         where = np.arange(search.num_roots) if rows is None else rows
         with torch.no_grad(), simulator.searching():
             done, masks = simulator.done(root), simulator.masks(root)
-            if len(masks) and not (masks.any(-1) | done).all():
-                bad = int(where[np.flatnonzero(~(masks.any(-1) | done))[0]])
-                raise ValueError(
-                    f"Root {bad} has no option that may be taken: its action mask is all False. "
-                    f"Plan from a state that is not a dead end, or mark it as done."
-                )
+            check_masks(masks, done, where)
             terminated = simulator.terminated(root)
             priors, values = self.evaluate(root, terminated, lambda: search.seeds[where])
             novelty, transpositions = settings.novelty, settings.transpositions

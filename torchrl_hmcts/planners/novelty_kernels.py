@@ -20,8 +20,7 @@ RADIUS_ROOT = np.dtype(
         ("count", np.int64),  # accepted states
         ("radius", np.float64),
         ("cell", np.float64),  # edge of the grid's cells, 0: there is no grid
-        ("axes", np.int64),  # features that span the grid, at most 3 ...
-        ("axis0", np.int64),  # ... and which
+        ("axis0", np.int64),  # features that span the grid, at most 3; -1 for none
         ("axis1", np.int64),
         ("axis2", np.int64),
     ],
@@ -40,7 +39,11 @@ _MARGIN = 1.0 + 1e-6
 
 
 @njit()
-def _cell(x, edge):
+def _cell(states, i, axis, edge, shift):
+    """The cell of a state along a feature, if there is one, moved by ``shift``."""
+    if axis < 0:
+        return 0
+    x = float(states[i, axis]) + shift
     return int(min(max(np.floor(x / edge), -_FURTHEST), _FURTHEST))
 
 
@@ -65,9 +68,9 @@ def _link(seen, links, heads, root, b, j):
         return
     edge = root["cell"]
     bucket = _bucket(
-        _cell(seen[b, j, root["axis0"]], edge) if root["axes"] > 0 else 0,
-        _cell(seen[b, j, root["axis1"]], edge) if root["axes"] > 1 else 0,
-        _cell(seen[b, j, root["axis2"]], edge) if root["axes"] > 2 else 0,
+        _cell(seen[b], j, root["axis0"], edge, 0.0),
+        _cell(seen[b], j, root["axis1"], edge, 0.0),
+        _cell(seen[b], j, root["axis2"], edge, 0.0),
         heads.shape[1],
     )
     links[b, j] = heads[b, bucket]
@@ -78,8 +81,9 @@ def _link(seen, links, heads, root, b, j):
 def _choose_axes(seen, root, b):
     """Span the grid by the three features that vary most; a distance in them is a lower bound."""
     num_features = seen.shape[2]
-    root["axes"] = min(num_features, 3)
-    root["axis0"], root["axis1"], root["axis2"] = 0, 1, 2
+    root["axis0"] = 0 if num_features > 0 else -1
+    root["axis1"] = 1 if num_features > 1 else -1
+    root["axis2"] = 2 if num_features > 2 else -1
     if num_features <= 3:
         return
     variance = np.zeros(num_features)
@@ -134,17 +138,11 @@ def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_
         return fewest
     if not _is_finite(features, i):
         return fewest
-    reach, edge, axes = root["radius"] * _MARGIN, root["cell"], root["axes"]
-    low0 = low1 = low2 = high0 = high1 = high2 = 0
-    if axes > 0:
-        x = float(features[i, root["axis0"]])
-        low0, high0 = _cell(x - reach, edge), _cell(x + reach, edge)
-    if axes > 1:
-        x = float(features[i, root["axis1"]])
-        low1, high1 = _cell(x - reach, edge), _cell(x + reach, edge)
-    if axes > 2:
-        x = float(features[i, root["axis2"]])
-        low2, high2 = _cell(x - reach, edge), _cell(x + reach, edge)
+    reach, edge = root["radius"] * _MARGIN, root["cell"]
+    axis0, axis1, axis2 = root["axis0"], root["axis1"], root["axis2"]
+    low0, high0 = _cell(features, i, axis0, edge, -reach), _cell(features, i, axis0, edge, reach)
+    low1, high1 = _cell(features, i, axis1, edge, -reach), _cell(features, i, axis1, edge, reach)
+    low2, high2 = _cell(features, i, axis2, edge, -reach), _cell(features, i, axis2, edge, reach)
     for x0 in range(low0, high0 + 1):
         for x1 in range(low1, high1 + 1):
             for x2 in range(low2, high2 + 1):

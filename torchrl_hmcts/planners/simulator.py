@@ -12,8 +12,8 @@ Letters: ``m`` states of one call, ``A`` options.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from torchrl_hmcts.planners.simulator_checks import (
     check_durations_and_masks,
     check_env,
     check_rewards_and_ends,
+    check_state,
     count_options,
     find_done_keys,
     find_reward_key,
@@ -102,21 +103,7 @@ class Simulator:
 
     def root(self, td: TensorDictBase) -> TensorDictBase:
         """Return the root states in one batch dimension, after checking them."""
-        missing = [key for key in self.root_keys if td.get(key, None) is None]
-        if missing:
-            raise ValueError(
-                f"The state to plan from lacks {missing}. Pass a tensordict as env.reset() or "
-                f'env.step(td)["next"] gives it; this one has '
-                f"{sorted(map(str, td.keys(True, True)))}."
-            )
-        for key in self.root_keys:
-            value = td.get(key)
-            if value.is_floating_point() and not torch.isfinite(value).all():
-                bad = value[~torch.isfinite(value)][0].item()
-                raise ValueError(
-                    f'The state to plan from has "{key}" = {bad}. A state that is not finite '
-                    f"cannot be simulated; find the step that wrote it."
-                )
+        check_state(td, self.root_keys)
         flat: TensorDictBase = td.flatten() if len(td.batch_size) != 1 else td
         return flat
 
@@ -186,27 +173,9 @@ class Simulator:
                 after.set(key, states.get(key))
         return after
 
-    @contextmanager
-    def searching(self) -> Iterator[None]:
-        """Let nothing that a search does stay in the transforms of the env.
-
-        Raises:
-            ValueError: at the end, if a transform of another project kept something.
-        """
-        before = self._foreign.read()
-        try:
-            yield
-        finally:
-            changed = self._foreign.changed(before)
-            if changed is not None:
-                self._foreign.put_back(before)
-        if changed is not None:
-            raise ValueError(
-                f"{changed} of {self._name} changed while MCTSPlanner searched: a transform keeps "
-                f"a state in itself, which cannot be set, so that nodes of the tree see each "
-                f"other's. Keep it in the tensordict: read it from the first argument of _step, "
-                f"write it to the second, and declare it in the state and observation specs."
-            )
+    def searching(self) -> AbstractContextManager[None]:
+        """Let nothing that a search does stay in the transforms of the env."""
+        return self._foreign.unchanged(self._name)
 
     def leave(self, td: TensorDictBase) -> None:
         """Set an env with a state of its own back to ``td``, if that is a state of all of it."""
