@@ -66,6 +66,8 @@ def kernels() -> dict[str, ModuleType]:
     """The kernels once more; each imports those before it."""
     found: dict[str, ModuleType] = {}
     for name in KERNELS:
+        importlib.import_module(f"{PLANNERS}.{name}")
+    for name in KERNELS:
         with used(found):
             found[name] = in_python(f"{PLANNERS}.{name}")
     return found
@@ -76,7 +78,6 @@ def used(kernels: dict[str, ModuleType]) -> Iterator[None]:
     """Searches that begin inside use these."""
     with pytest.MonkeyPatch.context() as patch:
         for name, module in kernels.items():
-            importlib.import_module(f"{PLANNERS}.{name}")
             patch.setitem(sys.modules, f"{PLANNERS}.{name}", module)
             patch.setattr(planners, name, module)
         yield

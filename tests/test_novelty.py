@@ -119,8 +119,8 @@ def test_a_key_that_the_simulator_does_not_have_is_named() -> None:
 class Scan:
     """RadiusNovelty as its docstring defines it: each state against all accepted ones."""
 
-    def __init__(self, radius: float, relaxation: float, shorter_by: float, num_roots: int) -> None:
-        self.radius, self.relaxation, self.shorter_by = radius, relaxation, shorter_by
+    def __init__(self, radius: float, shorter_paths: bool, num_roots: int) -> None:
+        self.shorter_paths = shorter_paths
         self.radii = [radius] * num_roots
         self.seen: list[list[tuple[np.ndarray, int]]] = [[] for _ in range(num_roots)]
 
@@ -134,7 +134,7 @@ class Scan:
                 apart = [float(((state - other) ** 2).sum()) for other, _ in seen]
             limit = self.radii[root] ** 2
             near = [j for (_, j), d in zip(seen, apart, strict=True) if d < limit]
-            novel = not near or (self.shorter_by > 0.0 and k < self.shorter_by * min(near))
+            novel = not near or (self.shorter_paths and k < min(near))
             if novel:
                 seen.append((state, k))
             accepted.append(novel)
@@ -162,22 +162,16 @@ def random_states(rng: np.random.Generator, count: int, num_features: int) -> np
     seed=st.integers(0, 2**32 - 1),
     num_features=st.integers(1, 6),
     num_roots=st.integers(1, 3),
-    shorter_by=st.sampled_from([0.0, 0.0, 0.8, 1.0]),
+    shorter_paths=st.booleans(),
 )
 def test_the_grid_accepts_what_a_scan_of_all_states_accepts(
-    seed: int, num_features: int, num_roots: int, shorter_by: float
+    seed: int, num_features: int, num_roots: int, shorter_paths: bool
 ) -> None:
     rng = np.random.default_rng(seed)
     radius = float(rng.choice([0.25, 1.0, 1.005, 1.5]))  # points of the lattice lie 1 apart
-    novelty = RadiusNovelty(
-        "x",
-        radius,
-        relaxation=0.6,
-        shorter_paths=shorter_by > 0.0,
-        shorter_by=shorter_by or 1.0,
-    )
+    novelty = RadiusNovelty("x", radius, relaxation=0.6, shorter_paths=shorter_paths)
     novelty.start(num_roots)
-    scan = Scan(radius, 0.6, shorter_by, num_roots)
+    scan = Scan(radius, shorter_paths, num_roots)
     for _ in range(8):
         count = int(rng.choice([0, 1, 30, 120]))
         roots = rng.integers(num_roots, size=count)
@@ -228,13 +222,6 @@ def test_a_shorter_path_to_a_known_place_is_accepted_and_a_longer_one_is_not() -
         "novelty_refused": 3,
         "novelty_shorter": 2,
     }
-
-
-def test_a_path_must_be_shorter_by_the_given_factor() -> None:
-    novelty = RadiusNovelty("x", 1.0, shorter_paths=True, shorter_by=0.5)
-    novelty.start(1)
-    accepted = novelty.accept(np.zeros(3, np.int64), features(0, 0, 0), np.array([10, 5, 4]))
-    assert accepted.tolist() == [True, False, True]
 
 
 def test_shorter_paths_improve_the_plan_after_the_first() -> None:

@@ -152,30 +152,19 @@ def test_all_roots_of_a_wave_share_one_simulator_call() -> None:
     assert [len(call) for call in env.calls] == [8]
 
 
-def test_a_terminal_root_is_not_searched_and_is_worth_nothing() -> None:
-    env = CountingEnv(BINARY_TREE, terminal=LEAVES)
-    ones = lambda td: torch.ones(len(td))  # noqa: E731
-    planner = MCTSPlanner(env, leaf_evaluator=ones)
-    td = at(env, [7, 0])
-    ends = torch.tensor([[True], [False]])
-    td = planner(td.set("terminated", ends).set("done", ends))
-    assert td["num_expansions"][0].item() == 0
+@pytest.mark.parametrize(("end", "value"), [("terminal", 0.0), ("truncated", 0.5)])
+def test_a_root_that_has_ended_is_not_searched_and_a_truncated_one_worth_its_evaluation(
+    end: str, value: float
+) -> None:
+    env = CountingEnv(BINARY_TREE, **{end: LEAVES})
+    planner = MCTSPlanner(env, leaf_evaluator=lambda td: torch.full((len(td),), 0.5))
+    td, ends = at(env, [7, 0]), torch.tensor([[True], [False]])
+    td = planner(td.set("truncated" if value else "terminated", ends).set("done", ends))
+    assert td["num_expansions"][0].item() == 0 < td["num_expansions"][1].item()
     assert td["root_visits"][0].tolist() == [0, 0]
-    assert td["root_value"][0].item() == 0.0
+    assert td["root_value"][0].item() == value
     assert not td["plan_found"][0].item()
     assert all(state != 7 for state, _ in env.pairs)
-    assert td["num_expansions"][1].item() > 0
-
-
-def test_a_truncated_root_is_not_searched_and_is_worth_its_evaluation() -> None:
-    env = TableEnv(BINARY_TREE, truncated=LEAVES)
-    planner = MCTSPlanner(env, leaf_evaluator=lambda td: torch.full((len(td),), 0.5))
-    td = at(env, [7])
-    td = planner(
-        td.set("truncated", torch.ones(1, 1, dtype=torch.bool)).set("done", td["truncated"])
-    )
-    assert td["num_expansions"].item() == 0
-    assert td["root_value"].item() == 0.5
 
 
 def test_truncation_bootstraps_and_termination_does_not() -> None:

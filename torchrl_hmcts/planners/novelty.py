@@ -110,7 +110,7 @@ class RadiusNovelty(_Counted):
     With ``shorter_paths`` a state is novel as well if its :math:`k` base steps from the root are
     fewer than those of all accepted states around it, so that plans get shorter after the first:
 
-    .. math:: k(s) < \beta \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
+    .. math:: k(s) < \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
 
     The subtree behind the longer path stays. A grid of cells makes the cost of a test independent
     of the size of the tree; with more than three features it spans the three that vary most.
@@ -125,8 +125,6 @@ class RadiusNovelty(_Counted):
         shorter_paths: accept states near others that are reached in fewer base steps. Default
             False: a place is searched from the first path to it. Meant for a budget that continues
             after the first plan (``improve_expansions``).
-        shorter_by: :math:`\beta` in ``(0, 1]``, the share of the base steps that a shorter path may
-            need at most. Default 1: a single step less will do; 0.9 asks for a tenth.
 
     Raises:
         ValueError: if no key is given, the radius is not positive, the scales do not match the
@@ -156,7 +154,6 @@ class RadiusNovelty(_Counted):
         relaxation: float = 0.75,
         max_relaxations: int = 14,
         shorter_paths: bool = False,
-        shorter_by: float = 1.0,
     ) -> None:
         self.in_keys = nested_keys("RadiusNovelty", "key", key)
         self.radius = real_number("RadiusNovelty", "radius", radius, above=0.0)
@@ -178,7 +175,6 @@ class RadiusNovelty(_Counted):
         self.max_relaxations = whole_number("RadiusNovelty", "max_relaxations", max_relaxations)
         instance("RadiusNovelty", "shorter_paths", shorter_paths, bool)
         self.shorter_paths = shorter_paths
-        self.shorter_by = real_number("RadiusNovelty", "shorter_by", shorter_by, above=0, most=1)
         self.start(0)
 
     def start(self, num_roots: int) -> None:
@@ -235,12 +231,11 @@ class RadiusNovelty(_Counted):
             self._make_room(features.shape[1])
         _check_width(self, features, self._seen.shape[2])
         accepted = np.zeros(len(roots), np.bool_)
-        shorter_by = self.shorter_by if self.shorter_paths else 0.0
         begin = 0
         while True:
             begin = self._accept_distant(
                 self._seen, self._seen_steps, self._links, self._heads, self._known, self._tally,
-                roots, features, base_steps, shorter_by, accepted, begin,
+                roots, features, base_steps, self.shorter_paths, accepted, begin,
             )  # fmt: skip
             if begin == len(roots):
                 break

@@ -159,15 +159,15 @@ def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_
 
 @njit()
 def accept_distant(
-    seen, seen_steps, links, heads, known, tally, roots, features, base_steps, shorter_by,
+    seen, seen_steps, links, heads, known, tally, roots, features, base_steps, shorter_paths,
     accepted, first,
 ):  # fmt: skip
     """Accept, in order, the states outside the radius of every accepted one; return how far.
 
-    A ``shorter_by`` above 0 also accepts a state that needs fewer base steps than that share of the
-    fewest within its radius. States of a root lie in a hash grid: ``heads [B, buckets]`` is the
-    last state of a bucket, ``links [B, C]`` the one before it. ``tally`` counts what was refused,
-    and what was accepted for a shorter path.
+    With ``shorter_paths`` also a state that needs fewer base steps than all within its radius.
+    States of a root lie in a hash grid: ``heads [B, buckets]`` is the last state of a bucket,
+    ``links [B, C]`` the one before it. ``tally`` counts what was refused, and what was accepted for
+    a shorter path.
     """
     for i in range(first, roots.shape[0]):
         b = roots[i]
@@ -177,10 +177,10 @@ def accept_distant(
         if root["count"] >= _SMALL and not 0.0 < root["cell"] <= 4.0 * root["radius"]:
             _build_grid(seen, links, heads, root, b)
         fewest = _fewest_nearby(
-            seen, seen_steps, links, heads, root, b, features, i, shorter_by == 0.0
+            seen, seen_steps, links, heads, root, b, features, i, not shorter_paths
         )
         novel = fewest < 0
-        if not novel and base_steps[i] < shorter_by * fewest:
+        if not novel and shorter_paths and base_steps[i] < fewest:
             novel = True
             tally[1] += 1
         accepted[i] = novel
