@@ -39,7 +39,7 @@ class RootStates(NamedTuple):
 
 def check_rows(known: Outcomes | RootStates, m: int, num_options: int) -> None:
     """Refuse arrays without a row for each of ``m`` states: the kernels trust them."""
-    for name, array in zip(known._fields, known, strict=True):
+    for name, array in zip(type(known).__annotations__, known, strict=True):
         wide = name in ("priors", "masks")
         if array is None or (wide and array.shape == (0, num_options)):
             continue

@@ -315,17 +315,9 @@ class Search:
         A root whose budget is spent is neither.
         """
         kept, stuck = np.empty_like(active), np.empty_like(active)
+        nodes, roots = self.tree.nodes, self.tree.roots
         num_kept, num_stuck = self._root_kernels.still_active(
-            self.tree.nodes,
-            self.tree.roots,
-            active,
-            NO_LIMIT if budget.expansions is None else budget.expansions,
-            NO_LIMIT if budget.base_steps is None else budget.base_steps,
-            NO_LIMIT if budget.nodes is None else budget.nodes,
-            budget.until_plan,
-            budget.improve_expansions,
-            kept,
-            stuck,
+            nodes, roots, active, *budget.limits, kept, stuck
         )
         return kept[:num_kept], stuck[:num_stuck]
 
