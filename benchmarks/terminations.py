@@ -19,6 +19,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from learned_termination import (
+    MazeView,
+    TerminationConfig,
+    collect_option_steps,
+    learn_termination,
+)
 from mazes import demo_loss, greedy, make_option_env, make_starts, planner
 from table import markdown, read_arguments, write
 from tensordict import TensorDictBase
@@ -35,12 +41,6 @@ from torchrl_hmcts.modules import (
 )
 from torchrl_hmcts.planners import SearchBudget
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute, spread
-from torchrl_hmcts.trainers.skills.termination import (
-    MazeView,
-    TerminationConfig,
-    collect_option_steps,
-    learn_termination,
-)
 from torchrl_hmcts.transforms import OptionTransform, StallTransform
 
 STALL_TOLERANCE = 0.005  # tiles per base step, a twentieth of the top speed

@@ -22,14 +22,16 @@ from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import spread
-from torchrl_hmcts.trainers.experiments.demo import train_worker
-from torchrl_hmcts.trainers.runs.config import FRAMES_PER_BATCH, DemoConfig
+from torchrl_hmcts.trainers.experiments.kits import make_kit
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.skills import learn
 
 
 def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     """Train a worker and take all figures."""
-    config = DemoConfig(seed=seed, train_base_steps=base_steps // FRAMES_PER_BATCH * 64)
-    trainer, loss = train_worker(config)
+    config = DemoConfig(seed=seed, train_base_steps=base_steps // 64 * 64)  # whole batches
+    trained = learn(make_kit(config))
+    loss = trained.loss
     mazes, worker = maze_pool("test"), greedy(loss)
     env = make_option_env(worker, mazes)
     starts = make_starts(env.base_env, num_mazes, seed)
@@ -43,7 +45,7 @@ def measure(seed: int, base_steps: int, num_mazes: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "train_base_steps": config.train_base_steps,
-        "last_training_accuracy": round(trainer.history["discriminator_accuracy"][-1], 4),
+        "last_training_accuracy": round(trained.history["discriminator_accuracy"][-1], 4),
         "greedy": skill_figures(worker, loss.discriminator, mazes, seed=seed),
         "sampled": skill_figures(sampling, loss.discriminator, mazes, seed=seed),
         "coverage_200_expansions": spread(torch.cat(coverage).numpy()),

@@ -243,7 +243,6 @@ GOOD: dict[str, Good] = {
         AtariSearch={},
         RuleSource={},
         DemoConfig={},
-        TerminationConfig={},
         StateCoverage={},
         ScriptedExpert={},
         SharedRMSprop={"params": lambda: [nn.Parameter(torch.zeros(2))]},
@@ -291,8 +290,9 @@ EXCLUDED = {  # why public names are not fuzzed here
     "Evaluation GoalEpisodes GoalTrack Options Controllability",
     "a protocol": "NoveltyTest PlansGoals OptionWorker",
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
-    "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv",
+    "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
+    "SkillWorker "
     "AttributeSnapshot ReplaySnapshot SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",
     "hands its arguments to SkillReward": "SkillRewardHook",

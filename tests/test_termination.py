@@ -6,6 +6,7 @@ from functools import partial
 
 import pytest
 import torch
+from learned_termination import HindsightTransitions, MazeView
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -24,7 +25,6 @@ from torchrl_hmcts.modules import (
 from torchrl_hmcts.objectives import IntraOptionQLoss, OptionTerminationLoss
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget, Transpositions
 from torchrl_hmcts.testing import ChainEnv, TableEnv
-from torchrl_hmcts.trainers.skills.termination import HindsightTransitions, MazeView
 from torchrl_hmcts.transforms import OptionTransform, StallTransform
 
 LEFT, RIGHT = 0, 1

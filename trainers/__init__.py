@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.skills.coverage import StateCoverage
     from torchrl_hmcts.trainers.skills.growing import GrowSkills, SearchCoverage
     from torchrl_hmcts.trainers.skills.reward_hook import SkillRewardHook
-    from torchrl_hmcts.trainers.skills.termination import TerminationConfig, learn_termination
 
 
 def _places() -> dict[str, str]:

@@ -246,6 +246,3 @@ def plan_and_execute(
             )
         )
     return Results.concatenate(parts)
-
-
-plan_and_carry_out = plan_and_execute  # its name until every room calls it by the new one

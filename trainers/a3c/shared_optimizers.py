@@ -95,6 +95,7 @@ class SharedRMSprop(Optimizer):
         weight_decay (float): added to the gradient times the parameter. Default 0.
 
     Raises:
+        TypeError: if ``params`` is no list of parameters, or a setting is no number.
         ValueError: if a setting is out of range.
 
     Reference:

@@ -57,6 +57,7 @@ class SkillRewardHook(TrainerHookBase):
         buffer.append_transform(SkillReward(objective, **self._keywords))
 
     def state_dict(self) -> dict[str, Any]:
+        """Return nothing: the transform has no state of its own."""
         return {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ Letters: C copies, T base steps of each, *B batch of the tensordict, b batch of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +18,6 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules import MLP
 from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import TerminationNetwork
 from torchrl_hmcts.objectives import IntraOptionQLoss, OptionTerminationLoss
@@ -175,70 +174,30 @@ class HindsightTransitions:
 
 @dataclass
 class TerminationConfig:
-    """How a termination is learned.
+    """How a termination is learned."""
 
-    Raises:
-        ValueError: if a number is below 1, or ``every`` is above ``option_steps``.
-
-    Example:
-        >>> TerminationConfig(seed=1).base_steps
-        20000
-    """
-
-    base_steps: int = 20_000
-    """Base steps of options executed in training mazes: all the experience there is."""
-    copies: int = 32
-    """Mazes played at once."""
-    option_steps: int = 50
-    """Base steps of an option in that experience."""
-    every: int = 5
-    """Base steps between two chances to end; those that a transition spans."""
-    horizon: int = 100
-    """Base steps within which a place that was reached serves as a target in hindsight."""
-    gamma: float = 0.98
-    """Discount per base step of the values; shorter-sighted than the manager, and less noisy."""
-    initial_probability: float = 0.05
-    """Chance to end, each time it is asked, of the options whose values are learned first."""
-    rounds: int = 1
-    """How often values are learned under the termination, and the termination from the values."""
-    value_updates: int = 5_000
-    """Updates of the values in a round."""
-    termination_updates: int = 500
-    """Updates of the termination in a round."""
-    batch_size: int = 256
-    """Transitions of an update."""
-    deliberation_cost: float = 0.04
-    """What ending an option costs, in units of return (a target at once is worth 1)."""
+    base_steps: int = 20_000  # of options executed in training mazes: all the experience there is
+    copies: int = 32  # mazes played at once
+    option_steps: int = 50  # base steps of an option in that experience
+    every: int = 5  # base steps between two chances to end; those that a transition spans
+    horizon: int = 100  # base steps within which a place that was reached serves as a target
+    gamma: float = 0.98  # discount per base step; shorter-sighted than the manager, less noisy
+    initial_probability: float = 0.05  # to end, each time, of options whose values come first
+    rounds: int = 1  # values under the termination, then the termination from the values
+    value_updates: int = 5_000  # in a round
+    termination_updates: int = 500  # in a round
+    batch_size: int = 256  # transitions of an update
+    deliberation_cost: float = 0.04  # of ending an option; a target at once is worth 1
     value_lr: float = 1e-3
-    """Learning rate of the values."""
     termination_lr: float = 1e-3
-    """Learning rate of the termination."""
-    tau: float = 0.01
-    """Share by which the target values follow in an update."""
-    seed: int = 0
-    """Of mazes, networks and batches."""
-
-    def __post_init__(self) -> None:
-        for column in fields(self):
-            name, value = column.name, getattr(self, column.name)
-            if isinstance(column.default, int):
-                whole_number("TerminationConfig", name, value, least=0 if name == "seed" else 1)
-            else:
-                real_number("TerminationConfig", name, value, least=0.0)
-        if self.every > self.option_steps:
-            raise ValueError(
-                f"Options of option_steps={self.option_steps} hold no piece of "
-                f"every={self.every} base steps; ask more often."
-            )
+    tau: float = 0.01  # share by which the target values follow in an update
+    seed: int = 0  # of mazes, networks and batches
 
 
 def collect_option_steps(
-    worker: Callable[[TensorDictBase], TensorDictBase],
-    num_options: int,
-    config: TerminationConfig,
-    mazes: Tensor | None = None,
+    worker: Callable[[TensorDictBase], TensorDictBase], num_options: int, config: TerminationConfig
 ) -> TensorDictBase:
-    """Let the worker execute random options in random mazes, of the training split by default.
+    """Let the worker execute random options in random training mazes.
 
     Returns:
         Base transitions ``[C, T]`` with the option under ``"skill"`` and the base steps it has
@@ -246,7 +205,6 @@ def collect_option_steps(
     """
     env = TransformedEnv(
         WaterworldMazeEnv(
-            mazes,
             observation=False,
             batch_size=[config.copies],
             max_steps=_EPISODE_STEPS,
@@ -260,12 +218,10 @@ def collect_option_steps(
 
 def learn_termination(
     worker: Callable[[TensorDictBase], TensorDictBase],
-    num_options: int = 4,
-    config: TerminationConfig | None = None,
+    num_options: int,
+    config: TerminationConfig,
     *,
-    mazes: Tensor | None = None,
     data: TensorDictBase | None = None,
-    progress: Callable[[int], Any] | None = None,
 ) -> tuple[TerminationNetwork, dict[str, list[float]]]:
     """Learn when options should end, from random options and targets in hindsight.
 
@@ -279,11 +235,8 @@ def learn_termination(
     Args:
         worker: reads ``"velocity"`` and ``"skill"``, writes ``"action"``.
         num_options: number of options.
-        config: see :class:`TerminationConfig`.
-        mazes: bool ``[M, H, W]`` to learn in. Default: the training split.
-        data: base transitions as :func:`collect_option_steps` gives them, in the same mazes.
-            Default: collected here.
-        progress: called with 1 after every update, e.g. ``tqdm(...).update``.
+        config: numbers of base steps, updates, ...
+        data: of :func:`collect_option_steps`. Default: collected here.
 
     Returns:
         The network, which reads ``"view"`` of a :class:`MazeView` and ``"skill"``; and losses and
@@ -293,21 +246,10 @@ def learn_termination(
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140; Harb et
         al., "When waiting is not an option", 2018, arXiv 1709.04571; Andrychowicz et al.,
         "Hindsight experience replay", 2017, arXiv 1707.01495.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule
-        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> config = TerminationConfig(
-        ...     base_steps=640, value_updates=2, termination_updates=2, copies=16)
-        >>> network, history = learn_termination(worker, 4, config)
-        >>> network.in_keys
-        ['view', 'skill']
     """
-    config = TerminationConfig() if config is None else config
-    mazes = maze_pool("train") if mazes is None else mazes
     if data is None:
-        data = collect_option_steps(worker, num_options, config, mazes)
-    view = MazeView(mazes)
+        data = collect_option_steps(worker, num_options, config)
+    view = MazeView(maze_pool("train"))
     transitions = HindsightTransitions(
         data,
         view,
@@ -350,8 +292,6 @@ def learn_termination(
         adam.zero_grad()
         out[name].backward()
         adam.step()
-        if progress is not None:
-            progress(1)
         if update % 100 == 99:
             for key, value in out.detach().items():
                 history.setdefault(key, []).append(float(value))
