@@ -24,7 +24,8 @@ class Evaluation(NamedTuple):
         values (Tensor): ``[m]`` or ``[m, 1]`` values. Default: 0.
 
     Example:
-        >>>         >>> from torchrl_hmcts.planners import Evaluation, MCTSPlanner
+        >>> import torch
+        >>> from torchrl_hmcts.planners import Evaluation, MCTSPlanner
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> def to_the_right(td):  # priors and values of states, together
         ...     priors = torch.tensor([0.1, 0.9]).expand(len(td), 2)
