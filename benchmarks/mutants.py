@@ -38,7 +38,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 SKIPPED = {"__init__.py", "drawing.py", "export.py"}  # pictures, not search
 FAST = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-KERNELS = {f"{name}kernels.py" for name in ("", "variant_", "batch_", "subtree_")}
+_BESIDE = ("variant_", "batch_", "subtree_", "root_", "number_")
+KERNELS = {f"{name}kernels.py" for name in ("", *_BESIDE)}
 COMPILED = {*KERNELS, "novelty_kernels.py", "tree.py"}  # numba keeps what it made of them
 # First, as `make coverage` does, what is fast without compiling.
 PLAIN = dict.fromkeys([*KERNELS, "tree.py"], "planner_golden")
@@ -50,6 +51,7 @@ TESTS = {  # of a file; others have the general ones of their folder
         f"{_SEARCH} tree_policies stochastic_search planner_reference kernels_in_python",
     ),
     "search.py": f"{_SEARCH} novelty",
+    "outcomes.py": "search_numbers planner",
     "search_loop.py": f"{_SEARCH} waves_in_flight tree_rollout",
     "subtree.py": f"{_SEARCH} novelty tree_rollout",
     "settings.py": "search_numbers planner tree_policies",
@@ -64,11 +66,14 @@ TESTS = {  # of a file; others have the general ones of their folder
     "reference.py": "planner_reference",
     "tree_policies.py": "tree_policies",
     "evaluation.py": "evaluators expert_iteration",
+    "answers.py": "evaluators planner",
+    "random_streams.py": "evaluators planner",
     "evaluators.py": "evaluators expert_iteration",
     "plan.py": "planner_golden planner hierarchical_policy",
     "control.py": "hierarchical_policy model_control goal_planning subgoal_transform",
     "simulator.py": "planner foreign_envs hierarchical_policy",
     "simulator_checks.py": "planning_envs planner",
+    "turns.py": "planning_envs foreign_envs",
     "array_search.py": "array_search",
     "search_data.py": "search_data",
     "scored_descent.py": "tree_policies planner_reference",

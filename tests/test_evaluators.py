@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from search_parts import CountingEnv, DeadEnd, expansions, trees
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
@@ -18,35 +19,10 @@ from torchrl_hmcts.planners import (
     MixedEvaluator,
     ModulePrior,
     RolloutEvaluator,
-    Search,
     SearchBudget,
     ValueEvaluator,
 )
 from torchrl_hmcts.testing import ChainEnv, TableEnv
-
-Pairs = list[tuple[int, int]]
-
-
-class CountingTable(TableEnv):
-    """A table that records what it is asked to simulate."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.calls: list[Pairs] = []
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        pairs = zip(tensordict["state"].tolist(), tensordict["action"].tolist(), strict=True)
-        self.calls.append(list(pairs))
-        return super()._step(tensordict)
-
-
-class DeadEndTable(TableEnv):
-    """A table in whose state 1 no action may be taken."""
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        after = super()._step(tensordict)
-        after["action_mask"][after["state"] == 1] = False
-        return after
 
 
 def at(env: Any, states: list[int], seeds: list[int] | None = None) -> TensorDictBase:
@@ -96,7 +72,7 @@ def test_a_rollout_that_is_cut_off_ends_with_what_the_bootstrap_says() -> None:
 
 
 def test_rollouts_that_have_ended_are_not_simulated() -> None:
-    env = CountingTable({(s, 0): (s + 1, 1.0, 1) for s in range(4)}, terminal=[4])
+    env = CountingEnv({(s, 0): (s + 1, 1.0, 1) for s in range(4)}, terminal=[4])
     rollout = bound(env, RolloutEvaluator(), gamma=1.0)
     assert rollout(at(env, [0, 3, 2])).tolist() == [4.0, 1.0, 2.0]
     assert [len(call) for call in env.calls] == [3, 2, 1, 1]
@@ -104,7 +80,7 @@ def test_rollouts_that_have_ended_are_not_simulated() -> None:
 
 
 def test_a_terminal_state_is_worth_nothing_and_a_truncated_one_its_bootstrap() -> None:
-    env = CountingTable({(0, 0): (1, 5.0, 1)}, terminal=[1])
+    env = CountingEnv({(0, 0): (1, 5.0, 1)}, terminal=[1])
     rollout = bound(env, RolloutEvaluator(bootstrap=constant(8.0)), gamma=0.5)
     terminal = env.step(at(env, [0]).set("action", torch.tensor([0])))["next"]
     env.calls.clear()
@@ -127,7 +103,7 @@ def test_within_a_rollout_truncation_bootstraps_and_termination_does_not(
 
 
 def test_a_rollout_ends_where_no_option_may_be_taken() -> None:
-    env = DeadEndTable({(0, 0): (1, 1.0, 1), (1, 0): (2, 9.0, 1)}, terminal=[2])
+    env = DeadEnd({(0, 0): (1, 1.0, 1), (1, 0): (2, 9.0, 1)}, terminal=[2])
     rollout = bound(env, RolloutEvaluator(bootstrap=constant(8.0)), gamma=0.5)
     assert rollout(at(env, [0])).tolist() == [1.0 + 0.5 * 8.0]
     assert rollout.num_base_steps == 1
@@ -158,7 +134,7 @@ def test_the_value_of_a_state_does_not_depend_on_what_is_evaluated_beside_it(
 def test_near_seeds_draw_unlike_options() -> None:
     # 64 neighbouring seeds, 8 draws of two options each: about half of all draws are 1, each seed
     # has its own sequence, and the order of draws has no pattern.
-    env = CountingTable({(s, a): (s, 0.0, 1) for s in range(64) for a in range(2)})
+    env = CountingEnv({(s, a): (s, 0.0, 1) for s in range(64) for a in range(2)})
     bound(env, RolloutEvaluator(max_options=8))(at(env, list(range(64))))
     draws = np.array([[option for _, option in call] for call in env.calls])  # [8, 64]
     assert draws.shape == (8, 64)
@@ -183,16 +159,16 @@ def test_options_are_drawn_with_the_probabilities_of_the_policy(
 
 @pytest.mark.parametrize("policy", [None, lambda td: torch.full((len(td), 4), 0.25)])
 def test_rollouts_take_every_option_that_the_mask_allows_and_no_other(policy: Any) -> None:
-    env = CountingTable(MAZE)
+    env = CountingEnv(MAZE)
     bound(env, RolloutEvaluator(policy, max_options=40))(at(env, list(range(7))))
-    assert {pair for call in env.calls for pair in call} == set(MAZE)
+    assert set(env.pairs) == set(MAZE)
 
 
 def test_an_option_of_probability_zero_is_never_taken() -> None:
-    env = CountingTable({(0, a): (0, 0.0, 1) for a in range(4)})
+    env = CountingEnv({(0, a): (0, 0.0, 1) for a in range(4)})
     policy = lambda td: torch.tensor([0.0, 0.5, 0.0, 0.5]).expand(len(td), 4)  # noqa: E731
     bound(env, RolloutEvaluator(policy, max_options=20))(at(env, [0] * 50))
-    assert {option for call in env.calls for _, option in call} == {1, 3}
+    assert {option for _, option in env.pairs} == {1, 3}
 
 
 @pytest.mark.parametrize(
@@ -469,16 +445,10 @@ def evaluators() -> dict[str, Any]:
     }
 
 
-def trees(search: Search) -> list[tuple[bytes, bytes]]:
-    tree = search.tree
-    used = enumerate(tree.num_nodes)
-    return [(tree.nodes[b, :n].tobytes(), tree.edges[b, :n].tobytes()) for b, n in used]
-
-
 @pytest.mark.parametrize("name", ["rollouts", "guided", "mixed"])
 def test_a_root_has_the_rollouts_it_has_alone(name: str) -> None:
     env = ChainEnv(9)
-    budget = SearchBudget(expansions=20, until_plan=False)
+    budget = expansions(20)
     planner = MCTSPlanner(env, leaf_evaluator=evaluators()[name], budget=budget)
     together = trees(planner.search(at(env, [4, 2, 4]), seed=7))
     assert together == trees(planner.search(at(env, [4, 2, 4]), seed=7))
@@ -501,7 +471,7 @@ def test_rollouts_show_the_value_of_a_plan_before_it_is_in_the_tree() -> None:
 
 
 def test_the_steps_of_rollouts_are_counted_beside_the_budget() -> None:
-    env = CountingTable({(s, 0): (s + 1, 0.0, 1) for s in range(8)}, terminal=[8])
+    env = CountingEnv({(s, 0): (s + 1, 0.0, 1) for s in range(8)}, terminal=[8])
     rollout = RolloutEvaluator(max_options=2)
     planner = MCTSPlanner(env, leaf_evaluator=rollout, budget=SearchBudget(expansions=3))
     td = planner(env.reset())

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from search_parts import BINARY_TREE, FOREVER, LEAVES, ROAD, SLIPPERY_ROAD, CountingEnv, at
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import StepCounter, TransformedEnv
@@ -18,40 +19,6 @@ from torchrl_hmcts.planners import (
     SearchBudget,
 )
 from torchrl_hmcts.testing import ChainEnv, TableEnv
-
-FOREVER = SearchBudget(expansions=10_000, until_plan=False)
-
-# A binary tree of depth 3: the children of s are 2 s + 1 and 2 s + 2, the leaves 7 to 14 are
-# terminal and pay s.
-BINARY_TREE = {
-    (s, a): (2 * s + 1 + a, 2 * s + 1 + a if s >= 3 else 0.0, 1) for s in range(7) for a in range(2)
-}
-LEAVES = list(range(7, 15))
-
-# Forward from 0 to 5, which pays 1; beside the way lies 6, which option 0 leaves for 3.
-ROAD = {(s, 1): (s + 1, float(s == 4), 1) for s in range(5)}
-ROAD.update({(s, 0): (s, 0.0, 1) for s in range(5)})
-ROAD.update({(6, 0): (3, 0.0, 1), (6, 1): (6, 0.0, 1)})
-# The same, but from 2 the road leads off to 6.
-SLIPPERY_ROAD = {**ROAD, (2, 1): (6, 0.0, 1)}
-
-
-class CountingEnv(TableEnv):
-    """A table that records the states it is asked to simulate from."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.calls: list[list[int]] = []
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.calls.append(tensordict["state"].flatten().tolist())
-        return super()._step(tensordict)
-
-
-def at(env: TableEnv | ChainEnv, states: Any) -> TensorDictBase:
-    """The state of an env at the given table states, any shape."""
-    state = torch.as_tensor(states)
-    return env.reset(TensorDict({"state": state}, state.shape), set_state=True)
 
 
 class CountingPlanner(MCTSPlanner):

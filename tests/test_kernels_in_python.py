@@ -13,6 +13,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from search_parts import least_visited
 
 from torchrl_hmcts import planners
 from torchrl_hmcts.envs import LabMazeEnv, SharedMLP
@@ -24,7 +25,6 @@ from torchrl_hmcts.planners import (
     DirichletNoise,
     Gumbel,
     MCTSPlanner,
-    NodeStatistics,
     ProgressiveWidening,
     RadiusNovelty,
     Root,
@@ -43,7 +43,10 @@ PLANNERS, ENVS = "torchrl_hmcts.planners", "torchrl_hmcts.envs"
 Arrays = dict[str, np.ndarray]
 
 
-KERNELS = ("variant_kernels", "kernels", "batch_kernels", "subtree_kernels", "novelty_kernels")
+KERNELS = (
+    *("number_kernels", "variant_kernels", "kernels", "root_kernels", "batch_kernels"),
+    *("subtree_kernels", "novelty_kernels"),
+)
 
 
 def in_python(name: str) -> ModuleType:
@@ -63,6 +66,8 @@ def kernels() -> dict[str, ModuleType]:
     """The kernels once more; each imports those before it."""
     found: dict[str, ModuleType] = {}
     for name in KERNELS:
+        importlib.import_module(f"{PLANNERS}.{name}")
+    for name in KERNELS:
         with used(found):
             found[name] = in_python(f"{PLANNERS}.{name}")
     return found
@@ -73,7 +78,6 @@ def used(kernels: dict[str, ModuleType]) -> Iterator[None]:
     """Searches that begin inside use these."""
     with pytest.MonkeyPatch.context() as patch:
         for name, module in kernels.items():
-            importlib.import_module(f"{PLANNERS}.{name}")
             patch.setitem(sys.modules, f"{PLANNERS}.{name}", module)
             patch.setattr(planners, name, module)
         yield
@@ -121,10 +125,6 @@ def prior(td: Any) -> torch.Tensor:
 
 def half(td: Any) -> torch.Tensor:
     return 0.5 * torch.ones(len(td))
-
-
-def least_visited(statistics: NodeStatistics) -> torch.Tensor:
-    return -statistics.option_visits
 
 
 SEARCHES: dict[str, dict[str, Any]] = {

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from search_parts import ROAD, SLIPPERY_ROAD
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -18,12 +19,6 @@ from torchrl_hmcts.envs import DeepMindLabEnv, LabMazeEnv
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 from torchrl_hmcts.transforms import OptionTransform
-
-# The model's road leads straight from 0 to 5; in the real one 2 leads to 6, and 6 to 3.
-ROAD = {(s, 1): (s + 1, float(s == 4), 1) for s in range(5)}
-ROAD.update({(s, 0): (s, 0.0, 1) for s in range(5)})
-ROAD.update({(6, 0): (3, 0.0, 1), (6, 1): (6, 0.0, 1)})
-SLIPPERY_ROAD = {**ROAD, (2, 1): (6, 0.0, 1)}
 
 
 def renamed() -> TransformedEnv:

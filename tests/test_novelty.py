@@ -11,11 +11,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from search_parts import expansions
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Categorical
 
 from torchrl_hmcts.envs import GridworldMazeEnv, generate_mazes, shortest_path
-from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget, WidthNovelty
+from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
 PRUNED = 8
@@ -118,8 +119,8 @@ def test_a_key_that_the_simulator_does_not_have_is_named() -> None:
 class Scan:
     """RadiusNovelty as its docstring defines it: each state against all accepted ones."""
 
-    def __init__(self, radius: float, relaxation: float, shorter_by: float, num_roots: int) -> None:
-        self.radius, self.relaxation, self.shorter_by = radius, relaxation, shorter_by
+    def __init__(self, radius: float, shorter_paths: bool, num_roots: int) -> None:
+        self.shorter_paths = shorter_paths
         self.radii = [radius] * num_roots
         self.seen: list[list[tuple[np.ndarray, int]]] = [[] for _ in range(num_roots)]
 
@@ -133,7 +134,7 @@ class Scan:
                 apart = [float(((state - other) ** 2).sum()) for other, _ in seen]
             limit = self.radii[root] ** 2
             near = [j for (_, j), d in zip(seen, apart, strict=True) if d < limit]
-            novel = not near or (self.shorter_by > 0.0 and k < self.shorter_by * min(near))
+            novel = not near or (self.shorter_paths and k < min(near))
             if novel:
                 seen.append((state, k))
             accepted.append(novel)
@@ -161,22 +162,16 @@ def random_states(rng: np.random.Generator, count: int, num_features: int) -> np
     seed=st.integers(0, 2**32 - 1),
     num_features=st.integers(1, 6),
     num_roots=st.integers(1, 3),
-    shorter_by=st.sampled_from([0.0, 0.0, 0.8, 1.0]),
+    shorter_paths=st.booleans(),
 )
 def test_the_grid_accepts_what_a_scan_of_all_states_accepts(
-    seed: int, num_features: int, num_roots: int, shorter_by: float
+    seed: int, num_features: int, num_roots: int, shorter_paths: bool
 ) -> None:
     rng = np.random.default_rng(seed)
     radius = float(rng.choice([0.25, 1.0, 1.005, 1.5]))  # points of the lattice lie 1 apart
-    novelty = RadiusNovelty(
-        "x",
-        radius,
-        relaxation=0.6,
-        shorter_paths=shorter_by > 0.0,
-        shorter_by=shorter_by or 1.0,
-    )
+    novelty = RadiusNovelty("x", radius, relaxation=0.6, shorter_paths=shorter_paths)
     novelty.start(num_roots)
-    scan = Scan(radius, 0.6, shorter_by, num_roots)
+    scan = Scan(radius, shorter_paths, num_roots)
     for _ in range(8):
         count = int(rng.choice([0, 1, 30, 120]))
         roots = rng.integers(num_roots, size=count)
@@ -229,13 +224,6 @@ def test_a_shorter_path_to_a_known_place_is_accepted_and_a_longer_one_is_not() -
     }
 
 
-def test_a_path_must_be_shorter_by_the_given_factor() -> None:
-    novelty = RadiusNovelty("x", 1.0, shorter_paths=True, shorter_by=0.5)
-    novelty.start(1)
-    accepted = novelty.accept(np.zeros(3, np.int64), features(0, 0, 0), np.array([10, 5, 4]))
-    assert accepted.tolist() == [True, False, True]
-
-
 def test_shorter_paths_improve_the_plan_after_the_first() -> None:
     # 0 -> 1 by an option of 9 base steps, or over 2 by two of 1; 1 -> 3 earns 1 and ends.
     # Breadth first the search knows 1 by the long way; the short one is refused, or replaces it.
@@ -247,7 +235,7 @@ def test_shorter_paths_improve_the_plan_after_the_first() -> None:
             env,
             gamma=0.5,
             novelty=RadiusNovelty("state", 0.5, shorter_paths=shorter_paths, max_relaxations=0),
-            budget=SearchBudget(expansions=50, until_plan=False),
+            budget=expansions(50),
         )
         search = planner.search(env.reset())
         returns.append(float(search.best_return[0]))
@@ -363,11 +351,7 @@ def test_a_search_expands_each_place_once() -> None:
 
 
 def test_a_pruned_node_has_no_children_and_is_visited_once() -> None:
-    planner = MCTSPlanner(
-        ChainEnv(30),
-        novelty=RadiusNovelty("state", 1.0),
-        budget=SearchBudget(expansions=25, until_plan=False),
-    )
+    planner = MCTSPlanner(ChainEnv(30), novelty=RadiusNovelty("state", 1.0), budget=expansions(25))
     search = planner.search(ChainEnv(30).reset())
     tree = search.tree
     pruned = np.flatnonzero(tree.nodes[0]["flags"] & PRUNED)
@@ -429,7 +413,7 @@ def test_reopened_nodes_are_searched_and_keep_their_values() -> None:
         env,
         gamma=0.5,
         novelty=RadiusNovelty("state", 5.0),
-        budget=SearchBudget(expansions=100, until_plan=False),
+        budget=expansions(100),
     )
     search = planner.search(env.reset())
     assert search.tree.states is not None
@@ -445,11 +429,7 @@ def test_reopened_nodes_are_searched_and_keep_their_values() -> None:
 
 def test_an_exhausted_width_search_relaxes_and_reaches_all_states() -> None:
     env = PairEnv(5)
-    planner = MCTSPlanner(
-        env,
-        novelty=WidthNovelty(["x", "y"]),
-        budget=SearchBudget(expansions=400, until_plan=False),
-    )
+    planner = MCTSPlanner(env, novelty=WidthNovelty(["x", "y"]), budget=expansions(400))
     search = planner.search(env.reset())
     tree = search.tree
     assert tree.states is not None
@@ -462,7 +442,7 @@ def test_a_search_that_is_resumed_after_another_remembers_its_own_states(
     novelty: RadiusNovelty | WidthNovelty,
 ) -> None:
     env = ChainEnv(40)
-    budget = SearchBudget(expansions=10, until_plan=False)
+    budget = expansions(10)
     planner = MCTSPlanner(env, novelty=novelty, budget=budget)
     first = planner.search(TensorDict({"state": torch.tensor([0, 20, 30])}, [3]))
     planner.search(env.reset().set("state", torch.tensor(12)))

@@ -17,6 +17,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from search_parts import uct_in_python
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_hmcts.planners import (
@@ -24,7 +25,6 @@ from torchrl_hmcts.planners import (
     UCT,
     Gumbel,
     MCTSPlanner,
-    NodeStatistics,
     Search,
     SearchBudget,
 )
@@ -327,13 +327,6 @@ def test_gumbel_without_noise_equals_the_equations_of_its_paper(
             assert chosen[b] == reference.final_choice()
 
 
-def uct_in_python(statistics: NodeStatistics) -> torch.Tensor:
-    """UCT with c = 0.7 in double precision, as the compiled one."""
-    n, n_j = statistics.node_visits.double().unsqueeze(-1), statistics.option_visits.double()
-    scores = statistics.option_values.double() + 0.7 * (n.log() / n_j.clamp_min(1.0)).sqrt()
-    return torch.where(n_j > 0, scores, torch.inf)
-
-
 @settings(max_examples=30)
 @given(
     seed=seeds,
@@ -355,7 +348,7 @@ def test_uct_as_a_python_callable_grows_the_tree_of_the_compiled_uct(
     assert isinstance(env, TableEnv)
     td = roots_at(env, [rng.randrange(smdp.num_states) for _ in range(num_roots)])
     compiled = planner.search(td)
-    planner.tree_policy = uct_in_python
+    planner.tree_policy = uct_in_python(0.7)
     python = planner.search(td)
     for counter in ("simulations", "revisits", "expansions", "base_steps", "best_node"):
         assert compiled.roots[counter].tolist() == python.roots[counter].tolist()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from search_parts import expansions
 from tensordict import TensorDict
 
 from torchrl_hmcts.planners import (
@@ -31,7 +32,7 @@ TABLE = {
 
 def table_search(**kwargs: object) -> object:
     env = TableEnv(TABLE, terminal=[3])
-    budget = SearchBudget(expansions=6, until_plan=False)
+    budget = expansions(6)
     return MCTSPlanner(env, gamma=0.5, budget=budget, **kwargs).search(env.reset())
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from search_parts import expansions, uct_in_python
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -16,7 +17,6 @@ from torchrl_hmcts.planners import (
     UCT,
     MCTSPlanner,
     MostVisited,
-    NodeStatistics,
     ProgressiveWidening,
     Search,
     SearchBudget,
@@ -26,6 +26,9 @@ from torchrl_hmcts.testing import TableEnv
 
 Outcome = tuple[float, int, float]  # probability, next state, reward
 Table = dict[tuple[int, int], list[Outcome]]
+
+
+UCT_IN_PYTHON = uct_in_python(1.0)
 
 
 class DiceEnv(EnvBase):
@@ -110,14 +113,6 @@ def planner_in(env: EnvBase, simulations: int, **kwargs: Any) -> MCTSPlanner:
     return MCTSPlanner(env, budget=budget, **kwargs)
 
 
-def outcomes(search: Search, b: int, n: int, a: int) -> list[int]:
-    nodes, child = [], int(search.tree.edges[b, n, a]["child"])
-    while child >= 0:
-        nodes.append(child)
-        child = int(search.tree.nodes[b, child]["sibling"])
-    return nodes
-
-
 def check_tree(search: Search, widening: ProgressiveWidening | None, b: int = 0) -> None:
     """What holds of every tree with chance."""
     tree = search.tree
@@ -126,7 +121,7 @@ def check_tree(search: Search, widening: ProgressiveWidening | None, b: int = 0)
     seen = [0]
     for n in range(used):
         for a in range(search.num_options):
-            edge, children = tree.edges[b, n, a], outcomes(search, b, n, a)
+            edge, children = tree.edges[b, n, a], search.tree.outcomes(b, a, n)
             seen += children
             if not children:
                 assert (edge["visits"], edge["samples"], edge["value"]) == (0, 0, 0.0)
@@ -155,13 +150,6 @@ def check_tree(search: Search, widening: ProgressiveWidening | None, b: int = 0)
     assert not (tree.nodes["flags"] & PENDING).any()
 
 
-def uct_in_python(statistics: NodeStatistics) -> torch.Tensor:
-    """UCT with c = 1 in double precision, as the compiled one."""
-    n, n_j = statistics.node_visits.double().unsqueeze(-1), statistics.option_visits.double()
-    scores = statistics.option_values.double() + (n.log() / n_j.clamp_min(1.0)).sqrt()
-    return torch.where(n_j > 0, scores, torch.inf)
-
-
 @pytest.mark.parametrize(("k", "alpha"), [(1.0, 0.5), (2.0, 0.3), (0.4, 0.8), (3.0, 0.0), (1.0, 1)])
 @pytest.mark.parametrize("expand", ["one", "all"])
 @pytest.mark.parametrize("leaves_per_wave", [1, 6])
@@ -179,7 +167,7 @@ def test_samples_are_bounded_merged_and_averaged_at_every_edge(
     assert 200 <= search.num_simulations[0] <= 200 + (expand == "all")
     root = search.tree.edges[0, 0]
     if alpha > 0:  # both outcomes of the option that is taken most have been seen
-        assert len(outcomes(search, 0, 0, int(root["visits"].argmax()))) == 2
+        assert len(search.tree.outcomes(0, int(root["visits"].argmax()), 0)) == 2
 
 
 def test_widening_draws_as_often_as_it_may() -> None:
@@ -200,7 +188,7 @@ def test_descents_go_to_outcomes_in_proportion_to_their_samples() -> None:
     edge = search.tree.edges[0, 0]
     a = int(edge["visits"].argmax())
     assert edge["samples"][a] == 20
-    below = search.tree.nodes[0, outcomes(search, 0, 0, a)]
+    below = search.tree.nodes[0, search.tree.outcomes(0, a, 0)]
     assert len(below) == 2
     share = below["visits"] / below["visits"].sum()
     np.testing.assert_allclose(share, below["samples"] / 20, atol=0.02)
@@ -222,11 +210,11 @@ def test_terminal_outcomes_are_drawn_again_and_revisited() -> None:
 
 def bandit_with(**kwargs: Any) -> Search:
     env = TableEnv({(0, 0): (1, 0.0, 1), (0, 1): (1, -1.0, 1)}, terminal=[1])
-    budget = SearchBudget(expansions=50, until_plan=False)
+    budget = expansions(50)
     return MCTSPlanner(env, budget=budget, **kwargs).search(env.reset())
 
 
-@pytest.mark.parametrize("policy", [UCT(), uct_in_python])
+@pytest.mark.parametrize("policy", [UCT(), UCT_IN_PYTHON])
 def test_a_root_that_wants_no_more_outcomes_ends_without_a_limit_of_simulations(
     policy: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -238,7 +226,7 @@ def test_a_root_that_wants_no_more_outcomes_ends_without_a_limit_of_simulations(
 
 
 @pytest.mark.parametrize("expand", ["one", "all"])
-@pytest.mark.parametrize("policy", [UCT(), uct_in_python])
+@pytest.mark.parametrize("policy", [UCT(), UCT_IN_PYTHON])
 def test_a_deterministic_env_under_chance_has_one_outcome_per_option(
     expand: Any, policy: Any
 ) -> None:
@@ -262,7 +250,7 @@ def test_a_deterministic_env_under_chance_has_one_outcome_per_option(
 
 def test_uct_in_python_grows_the_tree_of_the_compiled_uct_under_chance() -> None:
     found = []
-    for policy in (UCT(), uct_in_python):
+    for policy in (UCT(), UCT_IN_PYTHON):
         env = DiceEnv(RING, [], seed=4)  # the same draws for the same simulations
         search = planner_in(env, 400, tree_policy=policy).search(env.reset())
         used = int(search.tree.num_nodes[0])
@@ -288,7 +276,7 @@ def test_a_truncated_and_a_terminated_end_in_one_state_are_two_outcomes() -> Non
     # The first draw ends; the second, at visit 2, is the same state and goes on.
     assert search.tree.states is not None
     assert search.tree.states["state"][0, :3].tolist() == [0, 0, 0]
-    assert outcomes(search, 0, 0, 0) == [1, 2]
+    assert search.tree.outcomes(0, 0, 0) == [1, 2]
     assert (search.tree.nodes["flags"][0, 1:3] & TERMINAL != 0).tolist() == [True, False]
     assert search.tree.nodes["discount"][0, 1:3].tolist() == pytest.approx([0.0, 0.8])
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict, TensorDictBase
+from search_parts import FOREVER, LEAVES, CountingEnv, at, binary_tree, expansions, simulations
+from tensordict import TensorDictBase
 
 from torchrl_hmcts.planners import (
     PUCT,
@@ -28,33 +29,7 @@ from torchrl_hmcts.planners import (
 from torchrl_hmcts.planners.tree import CLOSED, FORBIDDEN, PRUNED, TERMINAL
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
-# A binary tree of depth 3: the children of s are 2 s + 1 and 2 s + 2 after 1 and 2 base steps, the
-# leaves 7 to 14 are terminal and pay s - 10.
-BINARY_TREE = {
-    (s, a): (2 * s + 1 + a, 2 * s + 1 + a - 10.0 if s >= 3 else 0.0, 1 + a)
-    for s in range(7)
-    for a in range(2)
-}
-LEAVES = list(range(7, 15))
-FOREVER = SearchBudget(expansions=10_000, until_plan=False)
-
-
-class CountingEnv(TableEnv):
-    """A table that records the states it is asked to simulate from."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.asked: list[int] = []
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.asked += tensordict["state"].flatten().tolist()
-        return super()._step(tensordict)
-
-
-def at(env: TableEnv | ChainEnv, states: Any) -> TensorDictBase:
-    """The state of an env at the given table states, any shape."""
-    state = torch.as_tensor(states)
-    return env.reset(TensorDict({"state": state}, state.shape), set_state=True)
+BINARY_TREE = binary_tree(slower=1)
 
 
 @dataclass
@@ -116,29 +91,6 @@ def rebased(node: Node, depth: int, base_steps: int, root: bool = True) -> Node:
     return node
 
 
-def path_returns(node: Node, so_far: float = 0.0, discount: float = 1.0) -> list[float]:
-    """The discounted return to every node, parents before children, in the order of options."""
-    so_far += discount * node.reward
-    discount *= node.discount
-    below = [
-        value
-        for outcomes in node.children
-        for child in outcomes
-        for value in path_returns(child, so_far, discount)
-    ]
-    return [so_far, *below]
-
-
-def returns_in_tree(search: Search, b: int, n: int = 0) -> list[float]:
-    children = [
-        value
-        for option in range(search.num_options)
-        for child in search.tree.outcomes(b, option, n)
-        for value in returns_in_tree(search, b, child)
-    ]
-    return [float(search.tree.nodes["path_return"][b, n]), *children]
-
-
 # ---------------------------------------------------------------------- what is kept
 
 
@@ -163,18 +115,20 @@ def test_the_best_plan_is_that_of_the_kept_subtree() -> None:
 
 def test_a_search_goes_on_below_the_kept_root_and_comes_to_the_values_of_a_new_one() -> None:
     env = CountingEnv(BINARY_TREE, terminal=LEAVES)
-    budget = SearchBudget(expansions=2, until_plan=False)
+    budget = expansions(2)
     planner = MCTSPlanner(env, gamma=0.9, backup="max", budget=budget, seed=0)
     search = planner.search(at(env, [0]))  # expands 0 and one of its children
     expanded = int(search.tree.nodes["parent"][0, 3])
     option = int(search.tree.nodes["option"][0, expanded])
     child_state = 1 + option
-    env.asked.clear()
+    env.calls.clear()
     planner.advance(search, torch.tensor([option]), at(env, [child_state]))
-    assert env.asked == []  # nothing is simulated before resume
+    assert env.calls == []  # nothing is simulated before resume
     assert search.tree.num_nodes.tolist() == [3]
     planner.resume(search)
-    assert sorted(env.asked) == sorted([2 * child_state + 1, 2 * child_state + 2] * 2)
+    assert sorted(state for state, _ in env.pairs) == sorted(
+        [2 * child_state + 1, 2 * child_state + 2] * 2
+    )
     assert search.num_expansions.tolist() == [2]  # counted afresh
     new = planner.search(at(env, [child_state]))
     planner.resume(new)
@@ -224,17 +178,17 @@ def test_each_root_of_a_batch_keeps_its_tree_or_gets_a_new_one() -> None:
 
 def test_roots_that_are_left_out_stay_as_they_are() -> None:
     env = CountingEnv(BINARY_TREE, terminal=LEAVES)
-    budget = SearchBudget(expansions=1, until_plan=False)
+    budget = expansions(1)
     planner = MCTSPlanner(env, budget=budget)
     search = planner.search(at(env, [0, 0]))
     before = walk(search, 0)
     where = torch.tensor([False, True])
-    env.asked.clear()
+    env.calls.clear()
     kept = planner.advance(search, torch.tensor([0, 0]), at(env, [9, 1]), where=where)
     assert kept.tolist() == [False, True]
     planner.resume(search, where=where)
     assert walk(search, 0) == before
-    assert env.asked == [1, 1]
+    assert env.pairs == [(1, 0), (1, 1)]
 
 
 def test_several_options_are_followed_at_once() -> None:
@@ -295,7 +249,7 @@ def test_the_memory_of_the_novelty_test_is_that_of_the_kept_subtree() -> None:
     env = ChainEnv(12)
     # Every state is new once; a second node of it is refused.
     novelty = RadiusNovelty("state", radius=0.5, max_relaxations=0)
-    budget = SearchBudget(expansions=3, until_plan=False)
+    budget = expansions(3)
     planner = MCTSPlanner(env, novelty=novelty, budget=budget, tree_policy=PUCT(), seed=0)
     search = planner.search(at(env, [3]))  # expands 3, 2 and 4
     states = search.tree.states
@@ -329,14 +283,19 @@ def test_a_root_is_never_refused() -> None:
     assert search.num_expansions.tolist() == [1]
 
 
-def test_a_state_whose_twin_is_searched_elsewhere_keeps_the_twins_subtree() -> None:
-    # 0 leads to 1 by option 0 and to 2 by option 1, both lead to 3, and 3 to the end.
+def with_twins() -> tuple[TableEnv, MCTSPlanner]:
+    """0 leads to 1 by option 0 and to 2 by option 1, both lead to 3, and 3 to the end."""
     table = {(0, 0): (1, 0.0, 1), (0, 1): (2, 0.0, 1), (1, 0): (3, 0.0, 1), (2, 0): (3, 0.0, 1)}
     table |= {(3, 0): (4, 0.0, 1), (4, 0): (5, 1.0, 1)}
     env = TableEnv(table, terminal=[5])
     planner = MCTSPlanner(
         env, gamma=0.5, transpositions=Transpositions("state"), backup="max", budget=FOREVER
     )
+    return env, planner
+
+
+def test_a_state_whose_twin_is_searched_elsewhere_keeps_the_twins_subtree() -> None:
+    env, planner = with_twins()
     for first in (0, 1):
         search = planner.search(at(env, [0]))
         kept = planner.advance(search, torch.tensor([[first, 0]]), at(env, [3]))
@@ -347,12 +306,7 @@ def test_a_state_whose_twin_is_searched_elsewhere_keeps_the_twins_subtree() -> N
 
 
 def test_a_subtree_that_leant_on_a_twin_outside_is_opened_again() -> None:
-    table = {(0, 0): (1, 0.0, 1), (0, 1): (2, 0.0, 1), (1, 0): (3, 0.0, 1), (2, 0): (3, 0.0, 1)}
-    table |= {(3, 0): (4, 0.0, 1), (4, 0): (5, 1.0, 1)}
-    env = TableEnv(table, terminal=[5])
-    planner = MCTSPlanner(
-        env, gamma=0.5, transpositions=Transpositions("state"), backup="max", budget=FOREVER
-    )
+    env, planner = with_twins()
     search = planner.search(at(env, [0]))
     leaning = int(np.flatnonzero(search.tree.nodes["twin"][0, : search.tree.num_nodes[0]] >= 0)[0])
     parent = int(search.tree.nodes["parent"][0, leaning])
@@ -380,7 +334,7 @@ def test_the_outcome_that_came_about_is_kept_out_of_several() -> None:
         env,
         chance=ProgressiveWidening(k=4.0),
         expand="one",
-        budget=SearchBudget(simulations=60, until_plan=False),
+        budget=simulations(60),
     )
     for state in (1, 3):
         search = planner.search(at(env, [2]))
@@ -399,13 +353,7 @@ def test_the_outcome_that_came_about_is_kept_out_of_several() -> None:
 
 def test_halving_starts_anew_since_it_counts_from_zero_visits() -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    planner = MCTSPlanner(
-        env,
-        tree_policy=Gumbel(),
-        expand="one",
-        budget=SearchBudget(simulations=8, until_plan=False),
-        seed=0,
-    )
+    planner = MCTSPlanner(env, tree_policy=Gumbel(), expand="one", budget=simulations(8), seed=0)
     search = planner.search(at(env, [0]))
     assert planner.advance(search, torch.tensor([1]), at(env, [2])).tolist() == [False]
     planner.resume(search)
@@ -415,7 +363,7 @@ def test_halving_starts_anew_since_it_counts_from_zero_visits() -> None:
 @pytest.mark.parametrize("send", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_a_search_that_was_copied_or_sent_goes_on_like_the_original(send: Any) -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    planner = MCTSPlanner(env, budget=SearchBudget(expansions=2, until_plan=False), seed=0)
+    planner = MCTSPlanner(env, budget=expansions(2), seed=0)
     planner.search(at(env, [0]))
     again = send(planner)  # as a collector does with its policy
     searches = [planner.last_search, again.last_search]
@@ -543,6 +491,3 @@ def test_a_tree_stays_consistent_however_often_its_root_moves(seed: int) -> None
             check_invariants(search, b, exhausted == "revisit")
         if td["done"].any():
             break
-
-
-# ---------------------------------------------------------------------- what is behind the nodes

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
+from search_parts import simulations
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
@@ -97,7 +98,7 @@ def random_search() -> Search:
         SlipperyEnv(table, terminal=[3]),
         gamma=0.9,
         chance=ProgressiveWidening(k=2.0),
-        budget=SearchBudget(simulations=60, until_plan=False),
+        budget=simulations(60),
         expand="one",
         seed=0,
     )
@@ -412,11 +413,11 @@ def test_every_node_is_drawn_once_at_its_depth(search: Search) -> None:
 
 def test_values_shape_and_plan_are_drawn() -> None:
     tree = small_search().tree
-    ax = tree.plot(option_names=["slow", "quick"], cmap="viridis")
+    ax = tree.plot(option_names=["slow", "quick"])
     circles, squares = (c for c in ax.collections if isinstance(c, PathCollection))
     assert len(circles.get_offsets()) == len(squares.get_offsets()) == 3
     values = tree.nodes["value"][0, :3]
-    expected = pyplot.get_cmap("viridis")((values - values.min()) / np.ptp(values))
+    expected = pyplot.get_cmap("Blues")((values - values.min()) / np.ptp(values))
     np.testing.assert_allclose(circles.get_facecolors(), expected, atol=1e-6)
     areas = circles.get_sizes()
     assert areas[0] > areas[2] > areas[1]  # as 6, 3 and 2 visits
@@ -462,7 +463,7 @@ def test_a_large_tree_is_drawn_in_part_and_says_so() -> None:
 def test_a_picture_goes_into_the_axes_it_is_given() -> None:
     figure, (left, right) = pyplot.subplots(1, 2)
     tree = small_search().tree
-    assert tree.plot(ax=left, legend=False, colorbar=False) is left
+    assert tree.plot(ax=left, legend=False) is left
     assert left.get_legend() is None
     assert figure.axes == [left, right]
     tree.plot(ax=right)

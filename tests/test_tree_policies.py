@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from search_parts import at, expansions, simulations, trees
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -63,17 +64,6 @@ class Problem:
         return planner.search(at(self.env, [0, 1, 5]), seed=0)
 
 
-def at(env: TableEnv, states: list[int]) -> TensorDictBase:
-    td = TensorDict({"state": torch.tensor(states)}, [len(states)])
-    return env.reset(td, set_state=True)
-
-
-def trees(search: Search) -> list[tuple[bytes, bytes]]:
-    tree = search.tree
-    used = enumerate(tree.num_nodes)
-    return [(tree.nodes[b, :n].tobytes(), tree.edges[b, :n].tobytes()) for b, n in used]
-
-
 def visits(search: Search) -> list[list[list[int]]]:
     tree = search.tree
     return [tree.edges["visits"][b, :n].tolist() for b, n in enumerate(tree.num_nodes)]
@@ -109,8 +99,7 @@ def statistics(
 
 # ---------------------------------------------------------------------- the scores of TorchRL
 
-EXPANSIONS = SearchBudget(expansions=25, until_plan=False)
-SIMULATIONS = SearchBudget(simulations=40, until_plan=False)
+EXPANSIONS = expansions(25)
 
 
 @pytest.mark.parametrize("expand", ["one", "all"])
@@ -186,7 +175,7 @@ def test_every_score_of_torchrl_finds_the_reward(
         tree_policy=TorchRLScore(member),
         expand=expand,
         leaves_per_wave=leaves_per_wave,
-        budget=SearchBudget(expansions=70, until_plan=False),
+        budget=expansions(70),
     )
     search = planner.search(env.reset(TensorDict({}, [2])))
     assert planner.choose(search).tolist() == [1, 1]
@@ -259,13 +248,7 @@ def test_a_policy_is_told_visits_values_and_squared_returns() -> None:
         return torch.tensor([1.0, 9.0, 0.0]).expand(len(node), 3)
 
     env = TableEnv(table, terminal=[3])
-    planner = MCTSPlanner(
-        env,
-        gamma=0.5,
-        tree_policy=policy,
-        expand="one",
-        budget=SearchBudget(simulations=3, until_plan=False),
-    )
+    planner = MCTSPlanner(env, gamma=0.5, tree_policy=policy, expand="one", budget=simulations(3))
     planner(env.reset())
     at_root = [node for node in seen if node.depths.item() == 0]
     assert [node.depths.item() for node in seen] == [0, 0, 1, 0, 1, 2]
@@ -311,7 +294,7 @@ def test_a_search_goes_on_after_its_policy_raised(expand: Any, last_call: int) -
         return -node.option_visits
 
     env = ChainEnv(9)
-    budget = SearchBudget(expansions=12, until_plan=False)
+    budget = expansions(12)
     planner = MCTSPlanner(env, tree_policy=policy, expand=expand, leaves_per_wave=3, budget=budget)
     with pytest.raises(RuntimeError, match="no idea"):
         planner.search(env.reset())
@@ -332,9 +315,6 @@ def test_not_a_number_for_a_forbidden_option_does_not_matter() -> None:
 def test_something_that_is_no_policy_is_refused() -> None:
     with pytest.raises(TypeError, match=r"needs a tree policy.*TorchRLScore.*got 'uct'"):
         MCTSPlanner(ChainEnv(3), tree_policy="uct")  # type: ignore[arg-type]
-
-
-# ---------------------------------------------------------------------- normalised values
 
 
 # ---------------------------------------------------------------------- Gumbel

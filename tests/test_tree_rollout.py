@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from search_parts import assert_nothing_in_flight
+from search_parts import simulations as budget_of
 from tensordict import TensorDict
 
 from torchrl_hmcts.planners import (
@@ -15,7 +17,6 @@ from torchrl_hmcts.planners import (
     Gumbel,
     HighestValue,
     MCTSPlanner,
-    Search,
     SearchBudget,
     TreeRollout,
     WidthNovelty,
@@ -29,7 +30,7 @@ def planner(length: int = 30, simulations: int = 12, **kwargs) -> MCTSPlanner:
     return MCTSPlanner(
         ChainEnv(length=length),
         expand="one",
-        budget=SearchBudget(simulations=simulations, until_plan=False),
+        budget=budget_of(simulations),
         seed=0,
         **kwargs,
     )
@@ -37,10 +38,6 @@ def planner(length: int = 30, simulations: int = 12, **kwargs) -> MCTSPlanner:
 
 def roots(length: int, count: int) -> TensorDict:
     return ChainEnv(length=length).reset().expand(count).clone()
-
-
-def nothing_in_flight(search: Search) -> bool:
-    return not search.tree.edges["in_flight"].any()
 
 
 def test_a_rollout_adds_its_nodes_below_the_leaf_one_by_one() -> None:
@@ -76,7 +73,7 @@ def test_what_a_rollout_finds_is_a_plan() -> None:
 @pytest.mark.parametrize("leaves", [1, 4])
 def test_many_roots_have_the_trees_they_have_alone(leaves: int) -> None:
     together = planner(simulations=40, leaves_per_wave=leaves).search(roots(9, 3), seed=5)
-    assert nothing_in_flight(together)
+    assert_nothing_in_flight(together)
     for b in range(3):
         alone = planner(simulations=40, leaves_per_wave=leaves).search(roots(9, 1), seed=5 + b)
         count = int(alone.tree.num_nodes[0])
@@ -91,7 +88,7 @@ def test_many_roots_have_the_trees_they_have_alone(leaves: int) -> None:
 def test_the_budget_of_simulations_is_kept_to_the_last_one(leaves: int) -> None:
     search = planner(simulations=10, leaves_per_wave=leaves).search(roots(30, 2))
     assert search.num_simulations.tolist() == [10, 10]
-    assert nothing_in_flight(search)
+    assert_nothing_in_flight(search)
 
 
 def test_a_rollout_ends_where_the_novelty_test_refuses_a_state() -> None:
@@ -106,32 +103,6 @@ def test_a_rollout_ends_where_the_novelty_test_refuses_a_state() -> None:
     assert (nodes["flags"] & PRUNED == 0).sum() <= 6  # a chain has no more states
 
 
-def test_an_error_in_the_simulator_leaves_nothing_in_flight() -> None:
-    env = ChainEnv(length=30)
-    search_planner = MCTSPlanner(
-        env,
-        expand="one",
-        rollout=TreeRollout(),
-        leaves_per_wave=2,
-        budget=SearchBudget(simulations=50, until_plan=False),
-        seed=0,
-    )
-    steps, real = iter(range(4)), search_planner.simulator.step
-
-    def step(states, options):
-        if next(steps, None) is None:
-            raise OSError("unplugged")
-        return real(states, options)
-
-    search_planner.simulator.step = step
-    with pytest.raises(OSError, match="unplugged"):
-        search_planner.search(env.reset())
-    assert search_planner.last_search is not None
-    assert nothing_in_flight(search_planner.last_search)
-    search_planner.simulator.step = real
-    assert search_planner.resume(search_planner.last_search).num_simulations.tolist() == [50]
-
-
 @pytest.mark.parametrize(
     "kwargs", [{"expand": "all"}, {"tree_policy": Gumbel(), "expand": "one"}], ids=str
 )
@@ -140,7 +111,7 @@ def test_what_does_not_go_with_a_rollout_is_refused(kwargs) -> None:
         MCTSPlanner(
             ChainEnv(length=3),
             rollout=TreeRollout(),
-            budget=SearchBudget(simulations=8, until_plan=False),
+            budget=budget_of(8),
             **kwargs,
         )
 

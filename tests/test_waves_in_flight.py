@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from search_parts import assert_nothing_in_flight, least_visited, trees
 from tensordict import TensorDictBase
 from torchrl.envs import RewardScaling, TransformedEnv
 
@@ -25,7 +26,6 @@ from torchrl_hmcts.planners import (
     TreeRollout,
     WidthNovelty,
 )
-from torchrl_hmcts.planners.tree import PENDING
 from torchrl_hmcts.testing import TableEnv
 
 # Three options in each of 40 states, to a random state; two of ten rewards are not zero.
@@ -70,21 +70,6 @@ def planner_of(env: Any, simulations: int = 60, **kwargs: Any) -> MCTSPlanner:
     return MCTSPlanner(env, **{"gamma": 0.9, "budget": budget, "seed": 0, **kwargs})
 
 
-def tree_of(search: Search, b: int = 0) -> tuple[bytes, bytes]:
-    used = search.tree.num_nodes[b]
-    return search.tree.nodes[b, :used].tobytes(), search.tree.edges[b, :used].tobytes()
-
-
-def assert_nothing_in_flight(search: Search) -> None:
-    assert not search.tree.edges["in_flight"].any()
-    assert not (search.tree.nodes["flags"] & PENDING).any()
-    assert not search.roots["scheduled"].any()
-
-
-def fewest_visits(statistics: NodeStatistics) -> torch.Tensor:
-    return -statistics.option_visits
-
-
 SEARCHES: dict[str, dict[str, Any]] = {
     "one": {"expand": "one"},
     "all": {"expand": "all"},
@@ -94,7 +79,7 @@ SEARCHES: dict[str, dict[str, Any]] = {
     "novelty": {"novelty": WidthNovelty("state"), "expand": "one"},
     "transpositions": {"transpositions": Transpositions("state"), "backup": "max"},
     "chance": {"chance": ProgressiveWidening(), "expand": "one"},
-    "python": {"tree_policy": fewest_visits, "expand": "one", "leaves_per_wave": 2},
+    "python": {"tree_policy": least_visited, "expand": "one", "leaves_per_wave": 2},
 }
 
 
@@ -123,14 +108,14 @@ def test_a_rollout_goes_on_while_another_wave_is_simulated() -> None:
 @pytest.mark.parametrize("name", SEARCHES)
 @pytest.mark.parametrize("waves", [1, 2, 5])
 def test_the_tree_is_the_same_on_a_simulator_that_works_beside(name: str, waves: int) -> None:
-    trees = []
+    found = []
     for kind in (TableEnv, Beside):
         env = kind(MAZE)
         planner = planner_of(env, waves_in_flight=waves, **SEARCHES[name])
         search = planner.search(env.reset().expand(2).clone())
         assert_nothing_in_flight(search)
-        trees.append((tree_of(search, 0), tree_of(search, 1)))
-    assert trees[0] == trees[1]
+        found.append(trees(search))
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("name", SEARCHES)
@@ -149,7 +134,7 @@ def test_a_number_of_simulations_is_kept_to_exactly(name: str, waves: int) -> No
         assert revisits < 10
 
 
-@pytest.mark.parametrize("waves", [2, 3])
+@pytest.mark.parametrize("waves", [1, 3])
 @pytest.mark.parametrize("event", ["sent", "waited"])
 @pytest.mark.parametrize("number", range(6))
 @pytest.mark.parametrize("name", ["waves of three", "all", "rollouts", "chance", "python"])
@@ -162,7 +147,6 @@ def test_an_error_leaves_nothing_in_flight_and_the_search_goes_on(
     with pytest.raises(OSError, match=f"{event} {number}"):
         planner.search(env.reset())
     search = planner.last_search
-    assert search is not None
     assert_nothing_in_flight(search)
     assert not env.under_way, "a step was neither waited for nor given up"
     env.fails_at = None
@@ -186,7 +170,6 @@ def test_an_error_of_the_progress_display_or_the_tree_policy_gives_up_what_is_un
         planner = planner_of(env, waves_in_flight=3, expand="one", **keywords)
         with pytest.raises(KeyboardInterrupt):
             planner.search(env.reset())
-        assert planner.last_search is not None
         assert_nothing_in_flight(planner.last_search)
         assert not env.under_way
         assert env.events

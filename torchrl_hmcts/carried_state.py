@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -231,6 +232,28 @@ class ForeignStates:
         for transform, old in zip(self._transforms, before, strict=True):
             for name, value in old.items():
                 setattr(transform, name, value)
+
+    @contextmanager
+    def unchanged(self, env: str) -> Iterator[None]:
+        """Let nothing that a search does stay in the transforms of ``env``.
+
+        Raises:
+            ValueError: at the end, if a transform of another project kept something.
+        """
+        before, changed = self.read(), None
+        try:
+            yield
+        finally:
+            changed = self.changed(before)
+            if changed is not None:
+                self.put_back(before)
+        if changed is not None:
+            raise ValueError(
+                f"{changed} of {env} changed while MCTSPlanner searched: a transform keeps "
+                f"a state in itself, which cannot be set, so that nodes of the tree see each "
+                f"other's. Keep it in the tensordict: read it from the first argument of _step, "
+                f"write it to the second, and declare it in the state and observation specs."
+            )
 
 
 def _held(transform: Transform) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,15 @@ def nested_key(owner: str, name: str, value: Any) -> NestedKey:
             f"{type(value).__name__}."
         )
     return unravel_key(value)
+
+
+def nested_keys(owner: str, name: str, value: Any) -> list[NestedKey]:
+    """Return one key or several in their flat form; raise a ValueError if there is none."""
+    several = isinstance(value, Sequence) and not isinstance(value, (str, tuple))
+    keys = [nested_key(owner, name, key) for key in (value if several else [value])]
+    if not keys:
+        raise ValueError(f"{owner} needs at least one entry to compare in {name}; got none.")
+    return keys
 
 
 def _is_key(value: Any) -> bool:

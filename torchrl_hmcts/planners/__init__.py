@@ -14,6 +14,7 @@ from torchrl_hmcts.planners.evaluators import (
 from torchrl_hmcts.planners.mcts import MCTSPlanner
 from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.planners.plan import Plan, extract_plans
+from torchrl_hmcts.planners.progress import SearchProgress
 from torchrl_hmcts.planners.reference import ReferenceSearch
 from torchrl_hmcts.planners.root_options import (
     BestPlan,
@@ -24,7 +25,6 @@ from torchrl_hmcts.planners.root_options import (
 )
 from torchrl_hmcts.planners.search import Search
 from torchrl_hmcts.planners.search_data import search_examples
-from torchrl_hmcts.planners.search_loop import SearchProgress
 from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree_policies import PUCT, UCT, Gumbel, NodeStatistics, TorchRLScore

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.planners.outcomes import Outcomes, RootStates
 from torchrl_hmcts.planners.root_options import halve
-from torchrl_hmcts.planners.search import Outcomes, RootStates, Search
+from torchrl_hmcts.planners.search import Search
 from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.tree import LARGEST, MOST_NODES
 from torchrl_hmcts.planners.tree_policies import PUCT, CompiledPolicy, TreePolicy

@@ -6,16 +6,15 @@ import numpy as np
 
 from torchrl_hmcts.compiling import njit
 from torchrl_hmcts.planners.kernels import (
-    GOOD,
     append,
     arrived,
     back_up,
     best_option,
     close,
     count_plan,
-    first_bad,
     select,
 )
+from torchrl_hmcts.planners.number_kernels import GOOD, first_bad
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     EDGE,
@@ -113,8 +112,8 @@ def _walk_together(nodes, edges, roots, s, gumbel, first, last):
 
 @njit(error_model="numpy", _nrt=False)
 def walk(nodes, edges, roots, record, gumbel):
-    """Walk down in step where there are many trees; return whether :func:`select` continues."""
-    if roots.shape[0] < MANY_ROOTS or record[0]["mark"]:
+    """Walk many trees down in step; return whether :func:`select` continues from there."""
+    if record[0]["mark"]:
         return False
     for first in range(0, roots.shape[0], BLOCK):
         last = min(first + BLOCK, roots.shape[0])
@@ -170,7 +169,7 @@ def advance(
             count_plan(tree, root, new)
         if done or tree[new]["open_options"] == 0:
             close(tree, links, new)
-    walked = walk(nodes, edges, roots, record, gumbel)
+    walked = roots.shape[0] >= MANY_ROOTS and walk(nodes, edges, roots, record, gumbel)
     count = select(nodes, edges, roots, record, gumbel, wave, walked)
     for i in range(count):
         b, n = wave[i]["root"], wave[i]["node"]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
-from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts.checks import NO_LIMIT, instance, real_number, whole_number
 
 _DEFAULT_EXPANSIONS = 1000
 
@@ -68,6 +69,13 @@ class SearchBudget:
         instance("SearchBudget", "until_plan", self.until_plan, bool)
         more = whole_number("SearchBudget", "improve_expansions", self.improve_expansions)
         object.__setattr__(self, "improve_expansions", more)
+
+    @cached_property
+    def limits(self) -> tuple[int, ...]:
+        """What ``root_kernels.still_active`` compares roots with."""
+        counts = (self.expansions, self.base_steps, self.nodes)
+        limits = (NO_LIMIT if count is None else count for count in counts)
+        return *limits, self.until_plan, self.improve_expansions
 
 
 @dataclass(frozen=True)

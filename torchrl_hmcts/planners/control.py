@@ -17,9 +17,8 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts.checks import instance, nested_key, nested_keys, real_number, whole_number
 from torchrl_hmcts.nesting import env_name
-from torchrl_hmcts.planners.keys import entry_key, entry_keys
 from torchrl_hmcts.planners.mcts import MCTSPlanner
 from torchrl_hmcts.planners.plan import Plan, extract_plans
 from torchrl_hmcts.planners.search import Search
@@ -125,7 +124,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         self.divergence_keys: list[NestedKey] = []
         if divergence is not None and divergence_key is not None:
             real_number(owner, "divergence", divergence, least=0.0)
-            self.divergence_keys = entry_keys(owner, "divergence_key", divergence_key)
+            self.divergence_keys = nested_keys(owner, "divergence_key", divergence_key)
         self.planner, self.replan_every = planner, replan_every
         instance(owner, "reuse", reuse, bool)
         self.divergence, self.reuse = divergence, reuse
@@ -344,10 +343,10 @@ class GoalPlanner:
         if not callable(to_macro):
             raise TypeError(f"to_macro must be callable on a tensordict; got {to_macro!r}.")
         self.planner, self.to_macro = planner, to_macro
-        self.goal_key = entry_key("GoalPlanner", "goal_key", goal_key)
+        self.goal_key = nested_key("GoalPlanner", "goal_key", goal_key)
         planner.simulator.keep([self.goal_key])
         if in_keys is not None:
-            self.in_keys = entry_keys("GoalPlanner", "in_keys", in_keys)
+            self.in_keys = nested_keys("GoalPlanner", "in_keys", in_keys)
 
     def plan_goals(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Plan from states.

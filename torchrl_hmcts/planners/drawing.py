@@ -103,9 +103,7 @@ def plot_tree(
     ax: Axes | None = None,
     max_nodes: int | None = 300,
     option_names: Sequence[str] | None = None,
-    cmap: str = "Blues",
     legend: bool = True,
-    colorbar: bool = True,
 ) -> Axes:
     """Draw the tree of one root in layers: a node stands as deep as options lead to it.
 
@@ -121,9 +119,8 @@ def plot_tree(
         max_nodes: how many nodes at most: those with most visits, and the best plan. None for
             all. Default 300.
         option_names: one for each of the ``A`` options. Default: their numbers.
-        cmap: matplotlib's name of the colours of values. Default ``"Blues"``.
-        legend: whether to say what colours and shapes mean. Default True.
-        colorbar: whether to show the scale of values. Default True.
+        legend: whether to say what colours and shapes mean, and to show the scale of values.
+            Default True.
 
     Returns:
         The matplotlib axes; ``plot_tree(...).figure.savefig("tree.png")`` writes a picture.
@@ -160,7 +157,7 @@ def plot_tree(
     ax.set_title("\n".join(_title(tree, root, shown)), fontsize=10, loc="left")
 
     box, dpi = ax.get_window_extent(), ax.figure.dpi
-    spacing = 72.0 * box.width / dpi * (0.85 if colorbar else 0.95) / (width + 2.0)  # in points
+    spacing = 72.0 * box.width / dpi * (0.85 if legend else 0.95) / (width + 2.0)  # in points
     row = 72.0 * box.height / dpi / (depth + 1.0)
     largest = float(np.clip(min(1.1 * spacing, 0.45 * row), 7.0, 15.0))
     smallest = float(np.clip(0.62 * spacing, 1.4, 7.0))
@@ -176,8 +173,8 @@ def plot_tree(
     diameters = diameter(visits)
     diameters[shown.plan] = np.maximum(diameters[shown.plan], 6.0)
     _draw_curves(ax, shown, points, share(visits), float(np.clip(spacing / 12.0, 0.3, 0.8)))
-    colors = _draw_nodes(ax, shown, points, diameters, cmap)
-    if colorbar and colors.norm.vmin < colors.norm.vmax:
+    colors = _draw_nodes(ax, shown, points, diameters)
+    if legend and colors.norm.vmin < colors.norm.vmax:
         bar = ax.figure.colorbar(colors, ax=ax, fraction=0.03, pad=0.01, aspect=30)
         bar.set_label("value V of the node")
         bar.outline.set_visible(False)
@@ -344,16 +341,14 @@ def _draw_curves(
     shown.lines(ax, curves, rows, linewidths=widths[rows], alpha=0.9, zorder=2)
 
 
-def _draw_nodes(
-    ax: Axes, shown: _Shown, points: np.ndarray, diameters: np.ndarray, cmap: str
-) -> Any:
+def _draw_nodes(ax: Axes, shown: _Shown, points: np.ndarray, diameters: np.ndarray) -> Any:
     """Draw the nodes, each once; return what a colour bar is made of."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
     values, inner = shown.nodes["value"].astype(float), ~shown.pruned & ~shown.terminal
     scale = values[inner] if inner.any() else values
-    colors = ScalarMappable(Normalize(float(scale.min()), float(scale.max())), cmap)
+    colors = ScalarMappable(Normalize(float(scale.min()), float(scale.max())), "Blues")
     thin = np.clip(diameters / 12.0, 0.3, 0.9)
     rims = np.where(shown.rewarded, np.maximum(1.6, thin), thin)
     for chosen, marker, area in ((inner, "o", 1.0), (shown.terminal, "s", 0.8)):

@@ -9,14 +9,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_hmcts.planners.tree import LARGEST
-
-# Entry with a seed for each state, int64 [m], given to evaluators that draw random numbers.
-SEED_KEY = "_seed"
+from torchrl_hmcts.planners.answers import check_priors, check_values
+from torchrl_hmcts.planners.random_streams import with_seeds
 
 
 class Evaluation(NamedTuple):
@@ -96,10 +93,10 @@ class NodeEvaluator:
         td = td.clone()  # what is stored must not depend on what the parts do with it
         found = Evaluation()
         if self.leaf_evaluator is not None:
-            answer = self.leaf_evaluator(_with_seeds(self.leaf_evaluator, td, seeds))
+            answer = self.leaf_evaluator(with_seeds(self.leaf_evaluator, td, seeds))
             found = answer if isinstance(answer, Evaluation) else Evaluation(values=answer)
         if self.option_prior is not None:
-            answer = self.option_prior(_with_seeds(self.option_prior, td, seeds))
+            answer = self.option_prior(with_seeds(self.option_prior, td, seeds))
             prior = answer.priors if isinstance(answer, Evaluation) else answer
             found = found._replace(priors=prior)
         if found.priors is not None:
@@ -109,65 +106,3 @@ class NodeEvaluator:
             checked = check_values(found.values, m, "leaf evaluator")
             values = np.where(terminated, np.float32(0.0), checked.numpy())
         return priors, values
-
-
-def check_priors(priors: Any, shape: tuple[int, int], reader: str) -> Tensor:
-    """Return probabilities, contiguous on the CPU; refuse what is none."""
-    _check_tensor(priors, reader)
-    if tuple(priors.shape) != shape:
-        raise ValueError(
-            f"The {reader} returned shape {list(priors.shape)}; it must give one probability per "
-            f"state and option, {list(shape)}."
-        )
-    good = (priors >= 0) & (priors < LARGEST)
-    if not good.all():
-        raise ValueError(
-            f"The {reader} returned {priors[~good][0].item()}. Probabilities must be finite and "
-            f"not negative; apply a softmax to logits."
-        )
-    return priors.detach().cpu().contiguous()
-
-
-def check_values(values: Any, num_states: int, reader: str) -> Tensor:
-    """Return values, float32 ``[m]`` on the CPU; refuse what no search can use."""
-    _check_tensor(values, reader)
-    if tuple(values.shape) not in ((num_states,), (num_states, 1)):
-        raise ValueError(
-            f"The {reader} returned shape {list(values.shape)}; it must give one value per state, "
-            f"[{num_states}] or [{num_states}, 1]."
-        )
-    found: Tensor = values.detach().reshape(-1).to("cpu", torch.float32)
-    good = found.abs() < LARGEST
-    if not good.all():
-        raise ValueError(
-            f"The {reader} returned {found[~good][0].item()}. Values must be finite and smaller "
-            f"than {LARGEST:g}; check the network's input and weights."
-        )
-    return found
-
-
-def _with_seeds(
-    part: Evaluator, td: TensorDictBase, seeds: Callable[[], np.ndarray]
-) -> TensorDictBase:
-    if not getattr(part, "is_random", False):
-        return td
-    return td.copy().set(SEED_KEY, torch.from_numpy(seeds()))
-
-
-def _check_tensor(value: Any, reader: str) -> None:
-    if not isinstance(value, Tensor):
-        raise TypeError(
-            f"The {reader} must return a tensor; got {type(value).__name__}. Wrap a module in "
-            f"ModulePrior or ValueEvaluator."
-        )
-
-
-def wave_seeds(
-    seeds: np.ndarray, counted: np.ndarray, nodes: np.ndarray, options: np.ndarray
-) -> np.ndarray:
-    """Return seeds that depend on root, node, option and order of outcomes, int64 ``[m]``."""
-    mixed = seeds.astype(np.uint64) * np.uint64(0xBF58476D1CE4E5B9)
-    for part in (nodes, options, counted):
-        mixed = (mixed ^ part.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
-    return (mixed >> np.uint64(1)).astype(np.int64)

@@ -16,16 +16,11 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_hmcts.checks import real_number, whole_number
+from torchrl_hmcts.checks import nested_key, real_number, whole_number
 from torchrl_hmcts.direct_calls import has_hooks, is_plain
-from torchrl_hmcts.planners.evaluation import (
-    SEED_KEY,
-    Evaluation,
-    Evaluator,
-    check_priors,
-    check_values,
-)
-from torchrl_hmcts.planners.keys import entry_key
+from torchrl_hmcts.planners.answers import check_priors, check_values
+from torchrl_hmcts.planners.evaluation import Evaluation, Evaluator
+from torchrl_hmcts.planners.random_streams import SEED_KEY, mix, uniform_bits, with_seeds
 from torchrl_hmcts.planners.simulator import Simulator
 
 
@@ -307,7 +302,7 @@ class RolloutEvaluator:
                 cut = np.flatnonzero(stops & ~terminated)
                 if len(cut):
                     rows = walkers[cut]
-                    seeds = _uniform_bits(streams[rows], step)
+                    seeds = uniform_bits(streams[rows], step)
                     values[rows] += discounts[rows] * self._bootstrap(_rows(td, cut), seeds)
             runs = np.flatnonzero(~stops)
             if not len(runs):
@@ -315,7 +310,7 @@ class RolloutEvaluator:
             if len(runs) < len(walkers):
                 td, walkers = _rows(td, runs), walkers[runs]
                 masks = None if masks is None else masks[runs]
-            options = self._draw(td, masks, _uniform_bits(streams[walkers], step))
+            options = self._draw(td, masks, uniform_bits(streams[walkers], step))
             td = simulator.step(simulator.state(td), options)
             durations = simulator.durations(td)
             rewards = simulator.rewards(td)
@@ -339,9 +334,9 @@ class RolloutEvaluator:
                 f"which a planner writes; this tensordict has none. Outside of a planner set it: "
                 f'td.set("{SEED_KEY}", torch.arange(len(td))).'
             )
-        states = _mix(seeds.cpu().reshape(-1).numpy().astype(np.uint64))
+        states = mix(seeds.cpu().reshape(-1).numpy().astype(np.uint64))
         rollouts = np.arange(self.num_rollouts, dtype=np.uint64)
-        return _mix(states[:, None] + rollouts).reshape(-1)
+        return mix(states[:, None] + rollouts).reshape(-1)
 
     def _draw(self, td: TensorDictBase, masks: np.ndarray | None, bits: np.ndarray) -> np.ndarray:
         """Draw an option for each state, int64 ``[w]``, from random bits, uint64 ``[w]``."""
@@ -365,9 +360,7 @@ class RolloutEvaluator:
 
     def _bootstrap(self, td: TensorDictBase, bits: np.ndarray) -> np.ndarray:
         assert self.bootstrap is not None
-        if getattr(self.bootstrap, "is_random", False):
-            seeds = (bits >> np.uint64(1)).astype(np.int64)
-            td = td.copy().set(SEED_KEY, torch.from_numpy(seeds))
+        td = with_seeds(self.bootstrap, td, lambda: (bits >> np.uint64(1)).astype(np.int64))
         return check_values(self.bootstrap(td), len(td), "bootstrap").double().numpy()
 
     def __repr__(self) -> str:
@@ -437,7 +430,7 @@ class _Network:
                 f'TensorDictModule(net, in_keys=["observation"], out_keys={list(keys)!r}).'
             )
         writes = [unravel_key(k) for k in module.out_keys]
-        self.keys = [entry_key(owner, "its outputs", k) for k in keys]
+        self.keys = [nested_key(owner, "its outputs", k) for k in keys]
         for key in self.keys:
             if key not in writes:
                 raise ValueError(f"{owner} reads {key!r}; its module writes {writes}.")
@@ -482,19 +475,3 @@ def _bind(part: Evaluator | None, simulator: Simulator, gamma: float) -> None:
 
 def _rows(td: TensorDictBase, rows: np.ndarray) -> TensorDictBase:
     return td if len(rows) == td.batch_size[0] else td[torch.from_numpy(rows)]
-
-
-def _mix(bits: np.ndarray) -> np.ndarray:
-    """Hash 64 bits (the output function of SplitMix64), so that near seeds have nothing in common.
-
-    Reference: Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014.
-    """
-    bits = bits + np.uint64(0x9E3779B97F4A7C15)
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return bits ^ (bits >> np.uint64(31))
-
-
-def _uniform_bits(streams: np.ndarray, step: int) -> np.ndarray:
-    """Random bits number ``step`` of each stream, uint64 ``[w]``."""
-    return _mix(streams + np.uint64(step))

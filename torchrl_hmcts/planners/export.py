@@ -5,9 +5,8 @@ Letters: ``N`` nodes, ``A`` options.
 
 from __future__ import annotations
 
-import heapq
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +33,11 @@ FLAGS = {
     "closed": CLOSED,
     "rewarded": REWARDED,
 }
+_OF_NODES = ("visits", "value", "depth", "base_steps", "path_return", "twin")
+_OF_OUTCOMES, _OF_OPTIONS = (
+    ("option", "reward", "discount", "samples"),
+    ("visits", "value", "prior"),
+)
 _MAX_OPTIONS = 24  # rows of the summary's table of options
 _MAX_STEPS = 40  # rows of its plan
 _LINE_WIDTH = 88
@@ -51,15 +55,6 @@ def check_root(tree: TreeArrays, root: int) -> int:
     return int(tree.num_nodes[root])
 
 
-def children(tree: TreeArrays, root: int, node: int) -> Iterator[int]:
-    """Yield the nodes that the options of a node led to, by option, in the order of their draw."""
-    for first in tree.edges["child"][root, node].tolist():
-        child = first
-        while child >= 0:
-            yield child
-            child = int(tree.nodes["sibling"][root, child])
-
-
 def best_plan(tree: TreeArrays, root: int) -> list[int]:
     """Return the nodes of the best plan from the root on, or none."""
     best = int(tree.roots["best_node"][root])
@@ -68,21 +63,15 @@ def best_plan(tree: TreeArrays, root: int) -> list[int]:
 
 def most_visited_path(tree: TreeArrays, root: int) -> list[int]:
     """Return the nodes from the root on along the options with most visits, then highest Q."""
-    path, node = [0], 0
+    path = [0]
     while True:
-        edges = tree.edges[root, node]
+        edges = tree.edges[root, path[-1]]
         visits = np.where(edges["child"] >= 0, edges["visits"], 0)
         if not visits.any():
             return path
         most = np.flatnonzero(visits == visits.max())
-        option = most[edges["value"][most].argmax()]
-        outcomes = [
-            n
-            for n in children(tree, root, node)
-            if int(tree.nodes["option"][root, n]) == int(option)
-        ]
-        node = max(outcomes, key=lambda n: (int(tree.nodes["visits"][root, n]), -n))
-        path.append(node)
+        outcomes = tree.outcomes(root, int(most[edges["value"][most].argmax()]), path[-1])
+        path.append(max(outcomes, key=lambda n: (int(tree.nodes["visits"][root, n]), -n)))
 
 
 def shown_nodes(tree: TreeArrays, root: int, max_nodes: int | None) -> np.ndarray:
@@ -93,24 +82,10 @@ def shown_nodes(tree: TreeArrays, root: int, max_nodes: int | None) -> np.ndarra
     count = check_root(tree, root)
     if max_nodes is not None and max_nodes < 1:
         raise ValueError(f"max_nodes must be at least 1, the root; got {max_nodes}.")
-    if max_nodes is None or max_nodes >= count:
-        return np.arange(count)
-    chosen = set(best_plan(tree, root)[:max_nodes]) | {0}
-    visits = tree.nodes["visits"][root]
-    border: list[tuple[int, int]] = []
-
-    def add_children(node: int) -> None:
-        for child in children(tree, root, node):
-            if child not in chosen:
-                heapq.heappush(border, (-int(visits[child]), child))
-
-    for node in sorted(chosen):
-        add_children(node)
-    while border and len(chosen) < max_nodes:
-        node = heapq.heappop(border)[1]
-        chosen.add(node)
-        add_children(node)
-    return np.array(sorted(chosen))
+    # Each node has more visits than one below it, so that the first ones are a tree.
+    visits = tree.nodes["visits"][root, :count].astype(np.int64)
+    visits[best_plan(tree, root)[:max_nodes]] = np.iinfo(np.int64).max
+    return np.sort(np.argsort(-visits, kind="stable")[:max_nodes])
 
 
 def to_networkx(
@@ -160,16 +135,9 @@ def to_networkx(
     nodes = tree.nodes[root, shown]
     graph = networkx.DiGraph(num_nodes=count, best_node=int(tree.roots["best_node"][root]))
     for index, node in zip(shown.tolist(), nodes, strict=True):
-        graph.add_node(
-            index,
-            visits=int(node["visits"]),
-            value=float(node["value"]),
-            depth=int(node["depth"]),
-            base_steps=int(node["base_steps"]),
-            path_return=float(node["path_return"]),
-            twin=int(node["twin"]),
-            **{name: bool(node["flags"] & bit) for name, bit in FLAGS.items()},
-        )
+        named = {name: node[name].item() for name in _OF_NODES}
+        named |= {name: bool(node["flags"] & bit) for name, bit in FLAGS.items()}
+        graph.add_node(index, **named)
         if states:
             assert tree.states is not None
             graph.nodes[index]["state"] = {
@@ -178,17 +146,9 @@ def to_networkx(
         if index == 0:
             continue
         edge = tree.edges[root, node["parent"], node["option"]]
-        graph.add_edge(
-            int(node["parent"]),
-            index,
-            option=int(node["option"]),
-            visits=int(edge["visits"]),
-            value=float(edge["value"]),
-            prior=float(edge["prior"]),
-            reward=float(node["reward"]),
-            discount=float(node["discount"]),
-            samples=int(node["samples"]),
-        )
+        named = {name: node[name].item() for name in _OF_OUTCOMES}
+        named |= {name: edge[name].item() for name in _OF_OPTIONS}
+        graph.add_edge(int(node["parent"]), index, **named)
     return graph
 
 
@@ -251,7 +211,9 @@ def to_torchrl(tree: TreeArrays, root: int = 0) -> Tree:
 
     visits = torch.from_numpy(nodes["visits"].copy())
     wins = visits * torch.from_numpy(nodes["value"].copy())
-    below: list[list[int]] = [list(children(tree, root, n)) for n in range(count)]
+    below: list[list[int]] = [[] for _ in range(count)]  # by option, in the order of their draw
+    for n in np.argsort(nodes["option"], kind="stable")[1:].tolist():
+        below[nodes["parent"][n]].append(n)
     vertices: list[Any] = [
         Tree(
             count=visits[n],

@@ -16,15 +16,14 @@ import numba
 import numpy as np
 
 from torchrl_hmcts.compiling import njit
+from torchrl_hmcts.planners.number_kernels import GOOD, MISFIT, first_bad, fits
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     EXPANDED,
     FACTORS,
     FORBIDDEN,
     GUMBEL_SCORE,
-    LARGEST,
     MEAN_BACKUP,
-    MOST_VISITS,
     PENDING,
     PRUNED,
     PUCT_SCORE,
@@ -47,7 +46,6 @@ from torchrl_hmcts.planners.variant_kernels import (
 # Visits of a node up to which its mean value is updated in float32, with an error of about 1e-5.
 # Beyond it the rest of the mean is kept too: changes of one part in 10 million would be lost.
 FEW_VISITS = 2**16
-GOOD, MISFIT = -1, -2  # what becomes of a wave's outcomes, if not the row of one that is bad
 ROUNDING = 1e-5  # by which the sum of float32 probabilities may differ from 1
 
 # What a descent comes to.
@@ -283,7 +281,7 @@ def cancel(nodes, edges, record, wave):
 
 
 @numba.njit(forceinline=True, error_model="numpy", _nrt=False)
-def _write_node(nodes, edges, n, parent, option, value, priors, masks, i):
+def write_node(nodes, edges, n, parent, option, value, priors, masks, i):
     num_options = edges.shape[-1]
     node = nodes[n]
     node["visits"] = 1
@@ -328,7 +326,7 @@ def append(nodes, edges, root, n, a, reward, discount, duration, done, value, pr
     """Write a new node behind option ``a`` of node ``n``; return it."""
     new = root["num_nodes"]
     root["num_nodes"] += 1
-    _write_node(nodes, edges, new, n, a, value, priors, masks, i)
+    write_node(nodes, edges, new, n, a, value, priors, masks, i)
     parent, node, edge = nodes[n], nodes[new], edges[n, a]
     node["reward"] = reward
     node["discount"] = discount
@@ -432,28 +430,6 @@ def arrived(nodes, edges, roots, s, wave, count):
 
 
 @njit(error_model="numpy", _nrt=False)
-def first_bad(rewards, discounts, values, priors):
-    """The first outcome with a number that no search can use, or GOOD.
-
-    Those are rewards and values from LARGEST on, discounts outside [0, 1], priors below 0, and what
-    is not finite. ``values`` and ``priors`` may be empty.
-    """
-    for i in range(rewards.shape[0]):
-        good = (abs(rewards[i]) < LARGEST) & (0.0 <= discounts[i]) & (discounts[i] <= 1.0)
-        if values.shape[0]:
-            good &= abs(values[i]) < LARGEST
-        if priors.shape[0]:
-            least, total = priors[i, 0], priors[i, 0]
-            for a in range(1, priors.shape[1]):
-                least = min(least, priors[i, a])
-                total += priors[i, a]
-            good &= (0.0 <= least) & (total < LARGEST)
-        if not good:
-            return i
-    return GOOD
-
-
-@njit(error_model="numpy", _nrt=False)
 def insert(
     nodes,
     edges,
@@ -485,8 +461,8 @@ def insert(
         or durations.shape[0] != count
         or done.shape[0] != count
         or values.shape[0] != count
-        or not _fits(priors, count, edges.shape[-1])
-        or not _fits(masks, count, edges.shape[-1])
+        or not fits(priors, count, edges.shape[-1])
+        or not fits(masks, count, edges.shape[-1])
     ):
         return MISFIT
     bad = first_bad(rewards, discounts, values, priors)
@@ -529,85 +505,3 @@ def insert(
         if s["widening"] <= 0.0 and closed:
             close(tree, links, new)
     return GOOD
-
-
-@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
-def _fits(rows, count, num_options):
-    """Whether there is a row for each outcome, or none for all."""
-    return (rows.shape[0] == count or rows.shape[0] == 0) and rows.shape[1] == num_options
-
-
-# ------------------------------------------------------------------------------------------- roots
-
-
-@njit(error_model="numpy", _nrt=False)
-def add_roots(nodes, edges, roots, rows, values, closed, priors, masks):
-    """Write node 0 of the roots ``rows`` and forget all that was known of them."""
-    for i in range(rows.shape[0]):
-        b = rows[i]
-        _write_node(nodes[b], edges[b], 0, -1, -1, values[i], priors, masks, i)
-        node = nodes[b, 0]
-        node["reward"] = 0.0
-        node["discount"] = 1.0
-        node["depth"] = 0
-        node["base_steps"] = 0
-        node["path_return"] = 0.0
-        node["path_discount"] = 1.0
-        if closed[i]:
-            node["flags"] |= TERMINAL
-        if closed[i] or node["open_options"] == 0:
-            node["flags"] |= CLOSED
-        root = roots[b]
-        root["num_nodes"] = 1
-        root["active"] = 1
-        root["best_node"] = -1
-        root["best_return"] = -np.inf
-        root["expansions_to_plan"] = -1
-        root["base_steps_to_plan"] = -1
-        root["lowest"] = np.inf
-        root["highest"] = -np.inf
-
-
-@njit(error_model="numpy", _nrt=False)
-def limit(roots, simulations):
-    """Count what is spent from 0, up to a number of simulations."""
-    for b in range(roots.shape[0]):
-        root = roots[b]
-        root["active"] = 1
-        root["limit"] = simulations
-        root["simulations"] = 0
-        root["revisits"] = 0
-        root["expansions"] = 0
-        root["base_steps"] = 0
-        found = root["best_node"] >= 0
-        root["expansions_to_plan"] = 0 if found else -1
-        root["base_steps_to_plan"] = 0 if found else -1
-
-
-@njit(error_model="numpy", _nrt=False)
-def still_active(
-    nodes, roots, active, expansions, base_steps, num_nodes, until_plan, improve, kept, stuck
-):
-    """Split the roots ``active`` into those that continue and those that are exhausted.
-
-    Writes them to ``kept`` and ``stuck``; returns how many there are. A root whose budget is spent
-    is neither.
-    """
-    num_kept, num_stuck = 0, 0
-    for i in range(active.shape[0]):
-        root = roots[active[i]]
-        over = root["simulations"] >= root["limit"]
-        over = over or root["expansions"] >= expansions or root["base_steps"] >= base_steps
-        over = over or root["num_nodes"] >= num_nodes
-        over = over or nodes[active[i], 0]["visits"] >= MOST_VISITS
-        if until_plan and root["expansions_to_plan"] >= 0:
-            over = over or root["expansions"] - root["expansions_to_plan"] >= improve
-        if over:
-            continue
-        if nodes[active[i], 0]["flags"] & CLOSED:
-            stuck[num_stuck] = active[i]
-            num_stuck += 1
-        else:
-            kept[num_kept] = active[i]
-            num_kept += 1
-    return num_kept, num_stuck

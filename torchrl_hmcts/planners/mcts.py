@@ -23,7 +23,9 @@ from torchrl_hmcts.nesting import option_gamma
 from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
 from torchrl_hmcts.planners.evaluation import Evaluator, NodeEvaluator
 from torchrl_hmcts.planners.novelty import NoveltyTest
+from torchrl_hmcts.planners.outcomes import RootStates
 from torchrl_hmcts.planners.plan import Plan, extract_plans
+from torchrl_hmcts.planners.progress import SearchProgress
 from torchrl_hmcts.planners.root_options import (
     BestPlan,
     DirichletNoise,
@@ -31,11 +33,12 @@ from torchrl_hmcts.planners.root_options import (
     MostVisited,
     gumbel_choice,
 )
-from torchrl_hmcts.planners.search import RootStates, Search
-from torchrl_hmcts.planners.search_loop import SearchLoop, SearchProgress
+from torchrl_hmcts.planners.search import Search
+from torchrl_hmcts.planners.search_loop import SearchLoop
 from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.simulator import Simulator
-from torchrl_hmcts.planners.subtree import find_end, reroot
+from torchrl_hmcts.planners.simulator_checks import check_masks
+from torchrl_hmcts.planners.subtree import check_successor, keep_subtrees
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree_policies import UCT, TreePolicy
 
@@ -289,7 +292,9 @@ class MCTSPlanner(TensorDictModuleBase):
         Raises:
             ValueError: if the search was planted with another backup, novelty test or the like.
         """
-        search.follow(self.settings)
+        if search.settings is not self.settings:
+            check_successor(search.settings, self.settings)
+            search.follow(self.settings)
         return self._grow(search, time.perf_counter(), _rows(search, where))
 
     def _grow(self, search: Search, begin: float, rows: np.ndarray) -> Search:
@@ -354,17 +359,8 @@ class MCTSPlanner(TensorDictModuleBase):
         root = self.simulator.root(td.flatten()[index])
         taken = options.reshape(search.num_roots, -1)[index].tolist()
         state, done = self.simulator.state(root), self.simulator.done(root)
-        kept = np.zeros(search.num_roots, np.bool_)
         search.seed(self._draw_seed() if seed is None else seed)
-        for i, b in enumerate(rows.tolist()):
-            path = [option for option in taken[i] if option >= 0]
-            if not path or self.settings.is_gumbel:  # halving starts from zero visits
-                continue
-            keys = self.simulator.state_keys
-            node = find_end(search.tree, b, path, state[i], bool(done[i]), keys)
-            if node >= 0:
-                reroot(search, b, node)
-                kept[b] = True
+        kept = keep_subtrees(search, rows, taken, state, done, self.simulator.state_keys)
         fresh = np.flatnonzero(~kept[rows])
         if len(fresh):
             self._plant(search, root[torch.from_numpy(fresh)], rows[fresh])
@@ -385,12 +381,7 @@ class MCTSPlanner(TensorDictModuleBase):
         where = np.arange(search.num_roots) if rows is None else rows
         with torch.no_grad(), simulator.searching():
             done, masks = simulator.done(root), simulator.masks(root)
-            if len(masks) and not (masks.any(-1) | done).all():
-                bad = int(where[np.flatnonzero(~(masks.any(-1) | done))[0]])
-                raise ValueError(
-                    f"Root {bad} has no option that may be taken: its action mask is all False. "
-                    f"Plan from a state that is not a dead end, or mark it as done."
-                )
+            check_masks(masks, done, where)
             terminated = simulator.terminated(root)
             priors, values = self.evaluate(root, terminated, lambda: search.seeds[where])
             novelty, transpositions = settings.novelty, settings.transpositions

@@ -13,8 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_hmcts.checks import instance, real_number, whole_number
-from torchrl_hmcts.planners.keys import entry_keys
+from torchrl_hmcts.checks import instance, nested_keys, real_number, whole_number
 
 
 class NoveltyTest(Protocol):
@@ -65,6 +64,19 @@ class NoveltyTest(Protocol):
         """Be less strict for one root whose search is exhausted; False if that is impossible."""
 
 
+def ask(
+    test: NoveltyTest, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray
+) -> np.ndarray:
+    """Return the answer of a novelty test, bool ``[m]``, checked."""
+    novel = np.asarray(test.accept(roots, features, base_steps))
+    if novel.shape != (len(features),) or novel.dtype != np.bool_:
+        raise ValueError(
+            f"The novelty test accepted {novel.dtype} {list(novel.shape)}; it must say of each "
+            f"of the {len(features)} states whether it is new, in bool."
+        )
+    return novel
+
+
 class _Counted:
     """What both tests count."""
 
@@ -98,7 +110,7 @@ class RadiusNovelty(_Counted):
     With ``shorter_paths`` a state is novel as well if its :math:`k` base steps from the root are
     fewer than those of all accepted states around it, so that plans get shorter after the first:
 
-    .. math:: k(s) < \beta \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
+    .. math:: k(s) < \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
 
     The subtree behind the longer path stays. A grid of cells makes the cost of a test independent
     of the size of the tree; with more than three features it spans the three that vary most.
@@ -113,8 +125,6 @@ class RadiusNovelty(_Counted):
         shorter_paths: accept states near others that are reached in fewer base steps. Default
             False: a place is searched from the first path to it. Meant for a budget that continues
             after the first plan (``improve_expansions``).
-        shorter_by: :math:`\beta` in ``(0, 1]``, the share of the base steps that a shorter path may
-            need at most. Default 1: a single step less will do; 0.9 asks for a tenth.
 
     Raises:
         ValueError: if no key is given, the radius is not positive, the scales do not match the
@@ -144,9 +154,8 @@ class RadiusNovelty(_Counted):
         relaxation: float = 0.75,
         max_relaxations: int = 14,
         shorter_paths: bool = False,
-        shorter_by: float = 1.0,
     ) -> None:
-        self.in_keys = entry_keys("RadiusNovelty", "key", key)
+        self.in_keys = nested_keys("RadiusNovelty", "key", key)
         self.radius = real_number("RadiusNovelty", "radius", radius, above=0.0)
         if scale is not None:
             instance("RadiusNovelty", "scale", scale, Sequence, np.ndarray)
@@ -166,7 +175,6 @@ class RadiusNovelty(_Counted):
         self.max_relaxations = whole_number("RadiusNovelty", "max_relaxations", max_relaxations)
         instance("RadiusNovelty", "shorter_paths", shorter_paths, bool)
         self.shorter_paths = shorter_paths
-        self.shorter_by = real_number("RadiusNovelty", "shorter_by", shorter_by, above=0, most=1)
         self.start(0)
 
     def start(self, num_roots: int) -> None:
@@ -223,12 +231,11 @@ class RadiusNovelty(_Counted):
             self._make_room(features.shape[1])
         _check_width(self, features, self._seen.shape[2])
         accepted = np.zeros(len(roots), np.bool_)
-        shorter_by = self.shorter_by if self.shorter_paths else 0.0
         begin = 0
         while True:
             begin = self._accept_distant(
                 self._seen, self._seen_steps, self._links, self._heads, self._known, self._tally,
-                roots, features, base_steps, shorter_by, accepted, begin,
+                roots, features, base_steps, self.shorter_paths, accepted, begin,
             )  # fmt: skip
             if begin == len(roots):
                 break
@@ -290,7 +297,7 @@ class WidthNovelty(_Counted):
     """
 
     def __init__(self, key: NestedKey | Sequence[NestedKey], *, max_relaxations: int = 14) -> None:
-        self.in_keys = entry_keys("WidthNovelty", "key", key)
+        self.in_keys = nested_keys("WidthNovelty", "key", key)
         self.max_relaxations = whole_number("WidthNovelty", "max_relaxations", max_relaxations)
         if self.max_relaxations > 254:
             raise ValueError(
@@ -328,20 +335,16 @@ class WidthNovelty(_Counted):
             self._owners[root] = -1
 
     def _make_room(self, features: np.ndarray) -> None:
-        """Allocate the table of bytes, or of other integers, or double that of the latter."""
+        """Allocate the hash tables of values, or double them."""
         from torchrl_hmcts.planners import novelty_kernels
 
         self._kernels = novelty_kernels
         num_roots, num_features = len(self._limits), features.shape[1]
         first = self._used is None
         if first:
-            self._used = np.zeros(num_roots, np.int64)  # values in the hash table
+            self._used = np.zeros(num_roots, np.int64)  # values in the table
             self._slots = np.zeros(num_features, np.int64)
-            self._values = np.zeros((num_roots, 0), np.int64)
             self._owners = np.zeros((num_roots, 0), np.int32)
-        if features.dtype == np.uint8:
-            self._counts: np.ndarray = np.zeros((num_roots, num_features, 256), np.uint8)
-            return
         size = 64
         while size < 4 * num_features or size <= self._owners.shape[1]:
             size *= 2
@@ -356,27 +359,20 @@ class WidthNovelty(_Counted):
 
     def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
         """Return which new states are novel, bool ``[m]``, and remembers those."""
-        if features.dtype != np.uint8:
-            features = features.astype(np.int64, copy=False)
-        features = np.ascontiguousarray(features)
+        features = np.ascontiguousarray(features, np.int64)
         if self._used is None:
             self._make_room(features)
         _check_width(self, features, len(self._slots))
         accepted = np.zeros(len(roots), np.bool_)
-        if features.dtype == np.uint8:
-            self._kernels.accept_new_bytes(
-                self._counts, self._limits, self._tally, roots, features, accepted
-            )
-        else:
-            begin = 0
-            while True:
-                begin = self._kernels.accept_new_integers(
-                    self._values, self._owners, self._counts, self._used, self._limits,
-                    self._tally, roots, features, accepted, self._slots, begin,
-                )  # fmt: skip
-                if begin == len(roots):
-                    break
-                self._make_room(features)
+        begin = 0
+        while True:
+            begin = self._kernels.accept_new(
+                self._values, self._owners, self._counts, self._used, self._limits,
+                self._tally, roots, features, accepted, self._slots, begin,
+            )  # fmt: skip
+            if begin == len(roots):
+                break
+            self._make_room(features)
         self.num_tested += len(roots)
         return accepted
 

@@ -20,8 +20,7 @@ RADIUS_ROOT = np.dtype(
         ("count", np.int64),  # accepted states
         ("radius", np.float64),
         ("cell", np.float64),  # edge of the grid's cells, 0: there is no grid
-        ("axes", np.int64),  # features that span the grid, at most 3 ...
-        ("axis0", np.int64),  # ... and which
+        ("axis0", np.int64),  # features that span the grid, at most 3; -1 for none
         ("axis1", np.int64),
         ("axis2", np.int64),
     ],
@@ -40,7 +39,11 @@ _MARGIN = 1.0 + 1e-6
 
 
 @njit()
-def _cell(x, edge):
+def _cell(states, i, axis, edge, shift):
+    """The cell of a state along a feature, if there is one, moved by ``shift``."""
+    if axis < 0:
+        return 0
+    x = float(states[i, axis]) + shift
     return int(min(max(np.floor(x / edge), -_FURTHEST), _FURTHEST))
 
 
@@ -65,9 +68,9 @@ def _link(seen, links, heads, root, b, j):
         return
     edge = root["cell"]
     bucket = _bucket(
-        _cell(seen[b, j, root["axis0"]], edge) if root["axes"] > 0 else 0,
-        _cell(seen[b, j, root["axis1"]], edge) if root["axes"] > 1 else 0,
-        _cell(seen[b, j, root["axis2"]], edge) if root["axes"] > 2 else 0,
+        _cell(seen[b], j, root["axis0"], edge, 0.0),
+        _cell(seen[b], j, root["axis1"], edge, 0.0),
+        _cell(seen[b], j, root["axis2"], edge, 0.0),
         heads.shape[1],
     )
     links[b, j] = heads[b, bucket]
@@ -78,8 +81,9 @@ def _link(seen, links, heads, root, b, j):
 def _choose_axes(seen, root, b):
     """Span the grid by the three features that vary most; a distance in them is a lower bound."""
     num_features = seen.shape[2]
-    root["axes"] = min(num_features, 3)
-    root["axis0"], root["axis1"], root["axis2"] = 0, 1, 2
+    root["axis0"] = 0 if num_features > 0 else -1
+    root["axis1"] = 1 if num_features > 1 else -1
+    root["axis2"] = 2 if num_features > 2 else -1
     if num_features <= 3:
         return
     variance = np.zeros(num_features)
@@ -134,17 +138,11 @@ def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_
         return fewest
     if not _is_finite(features, i):
         return fewest
-    reach, edge, axes = root["radius"] * _MARGIN, root["cell"], root["axes"]
-    low0 = low1 = low2 = high0 = high1 = high2 = 0
-    if axes > 0:
-        x = float(features[i, root["axis0"]])
-        low0, high0 = _cell(x - reach, edge), _cell(x + reach, edge)
-    if axes > 1:
-        x = float(features[i, root["axis1"]])
-        low1, high1 = _cell(x - reach, edge), _cell(x + reach, edge)
-    if axes > 2:
-        x = float(features[i, root["axis2"]])
-        low2, high2 = _cell(x - reach, edge), _cell(x + reach, edge)
+    reach, edge = root["radius"] * _MARGIN, root["cell"]
+    axis0, axis1, axis2 = root["axis0"], root["axis1"], root["axis2"]
+    low0, high0 = _cell(features, i, axis0, edge, -reach), _cell(features, i, axis0, edge, reach)
+    low1, high1 = _cell(features, i, axis1, edge, -reach), _cell(features, i, axis1, edge, reach)
+    low2, high2 = _cell(features, i, axis2, edge, -reach), _cell(features, i, axis2, edge, reach)
     for x0 in range(low0, high0 + 1):
         for x1 in range(low1, high1 + 1):
             for x2 in range(low2, high2 + 1):
@@ -161,15 +159,15 @@ def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_
 
 @njit()
 def accept_distant(
-    seen, seen_steps, links, heads, known, tally, roots, features, base_steps, shorter_by,
+    seen, seen_steps, links, heads, known, tally, roots, features, base_steps, shorter_paths,
     accepted, first,
 ):  # fmt: skip
     """Accept, in order, the states outside the radius of every accepted one; return how far.
 
-    A ``shorter_by`` above 0 also accepts a state that needs fewer base steps than that share of the
-    fewest within its radius. States of a root lie in a hash grid: ``heads [B, buckets]`` is the
-    last state of a bucket, ``links [B, C]`` the one before it. ``tally`` counts what was refused,
-    and what was accepted for a shorter path.
+    With ``shorter_paths`` also a state that needs fewer base steps than all within its radius.
+    States of a root lie in a hash grid: ``heads [B, buckets]`` is the last state of a bucket,
+    ``links [B, C]`` the one before it. ``tally`` counts what was refused, and what was accepted for
+    a shorter path.
     """
     for i in range(first, roots.shape[0]):
         b = roots[i]
@@ -179,10 +177,10 @@ def accept_distant(
         if root["count"] >= _SMALL and not 0.0 < root["cell"] <= 4.0 * root["radius"]:
             _build_grid(seen, links, heads, root, b)
         fewest = _fewest_nearby(
-            seen, seen_steps, links, heads, root, b, features, i, shorter_by == 0.0
+            seen, seen_steps, links, heads, root, b, features, i, not shorter_paths
         )
         novel = fewest < 0
-        if not novel and base_steps[i] < shorter_by * fewest:
+        if not novel and shorter_paths and base_steps[i] < fewest:
             novel = True
             tally[1] += 1
         accepted[i] = novel
@@ -203,25 +201,6 @@ def accept_distant(
 
 
 @njit()
-def accept_new_bytes(counts, limits, tally, roots, features, accepted):
-    """Accept, in order, the states with a byte whose value ``counts [B, F, 256]`` has seldom."""
-    for i in range(roots.shape[0]):
-        b = roots[i]
-        novel = False
-        for f in range(features.shape[1]):
-            if counts[b, f, features[i, f]] < limits[b]:
-                novel = True
-                break
-        accepted[i] = novel
-        if novel:
-            for f in range(features.shape[1]):
-                if counts[b, f, features[i, f]] < 255:
-                    counts[b, f, features[i, f]] += 1
-        else:
-            tally[0] += 1
-
-
-@njit()
 def _slot(values, owners, b, f, value):
     """The slot of feature ``f`` with this value in the hash table of a root, or a free one."""
     last = owners.shape[1] - 1
@@ -233,7 +212,7 @@ def _slot(values, owners, b, f, value):
 
 
 @njit()
-def accept_new_integers(
+def accept_new(
     values, owners, counts, used, limits, tally, roots, features, accepted, slots, first
 ):
     """Accept, in order, the states with a value that was seldom seen; return how far it came.

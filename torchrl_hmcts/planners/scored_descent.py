@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_hmcts.planners.settings import SearchSettings
-from torchrl_hmcts.planners.tree import EXPANDED, FORBIDDEN, PRUNED, TERMINAL, TreeArrays
+from torchrl_hmcts.planners.tree import FORBIDDEN, TreeArrays
 from torchrl_hmcts.planners.tree_policies import NodeStatistics, ScoreFunction
 
 
@@ -47,36 +47,20 @@ def select_by_scores(
 
 def _walk(tree: TreeArrays, settings: SearchSettings, record: np.ndarray) -> None:
     """Take all active roots down; write their node, and the option to simulate, if any."""
-    from torchrl_hmcts.planners import subtree_kernels as kernels
+    from torchrl_hmcts.planners.subtree_kernels import walk_on
 
-    nodes, edges, roots = tree.nodes, tree.edges, tree.roots
-    scores = settings.tree_policy
+    roots, scores = tree.roots, settings.tree_policy
+    arrays = tree.nodes, tree.edges, roots, record
     assert callable(scores)
-    roots["at"], roots["choice"] = 0, -1
-    b = np.flatnonzero(kernels.may_descend(nodes, roots, record))
-    n = np.zeros_like(b)
-    while len(b):
-        flags = nodes["flags"][b, n]
-        ends = (flags & (TERMINAL | PRUNED)) != 0
-        if settings.expand == "all":
-            ends |= ((flags & EXPANDED) == 0) & (nodes["open_options"][b, n] > 0)
-        b, n = b[~ends], n[~ends]
-        if settings.transpositions is not None:
-            kernels.refresh_all(nodes, edges, b, n)
-        edge = edges[b, n]  # [d, A], a copy
+    rows = np.empty(len(roots), np.int64)
+    count = walk_on(*arrays, True, rows)
+    while count:
+        b = rows[:count]
+        n = roots["at"][b]
+        edge = tree.edges[b, n]  # [d, A], a copy
         allowed = edge["closed"] != FORBIDDEN if settings.revisit else edge["closed"] == 0
-        further = allowed.any(-1)
-        b, n, edge, allowed = b[further], n[further], edge[further], allowed[further]
-        if not len(b):
-            return
-        a = _best(scores, nodes[b, n], edge, allowed)
-        child = edge["child"][np.arange(len(b)), a].astype(np.int64)
-        wants = (child < 0) | kernels.wants_samples(edges, record, b, n, a)
-        roots["choice"][b[wants]] = a[wants]
-        b, n, a, child = b[~wants], n[~wants], a[~wants], child[~wants]
-        edges["in_flight"][b, n, a] += 1
-        n = kernels.outcomes(nodes, b, child)
-        roots["at"][b] = n
+        roots["choice"][b] = _best(scores, tree.nodes[b, n], edge, allowed)
+        count = walk_on(*arrays, False, rows)
 
 
 def _best(

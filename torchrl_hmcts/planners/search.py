@@ -7,18 +7,19 @@ search, and :meth:`Search.insert`. Nothing here knows tensordicts or environment
 from __future__ import annotations
 
 import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from torchrl_hmcts.checks import NO_LIMIT, instance, whole_number
 from torchrl_hmcts.planners.budget import SearchBudget
+from torchrl_hmcts.planners.novelty import ask
+from torchrl_hmcts.planners.outcomes import Outcomes, RootStates, check_rows, refuse
 from torchrl_hmcts.planners.scored_descent import select_by_scores
 from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     FORBIDDEN,
-    LARGEST,
     MANY_ROOTS,
     PENDING,
     PRUNED,
@@ -43,42 +44,9 @@ class Wave:
         return len(self.records)
 
 
-class Outcomes(NamedTuple):
-    """What came of a wave's triples."""
-
-    rewards: np.ndarray  # [m] float32, R
-    discounts: np.ndarray  # [m] float32, D: gamma ** duration, 0 after a terminal state
-    durations: np.ndarray  # [m] int64, base steps
-    done: np.ndarray  # [m] bool: terminated or truncated
-    values: np.ndarray  # [m] float32, the leaf evaluator's
-    priors: np.ndarray  # [m, A] float32, or [0, A] for uniform
-    masks: np.ndarray  # [m, A] bool: options that may be taken, or [0, A] for all
-    features: np.ndarray | None = None  # [m, F], the novelty test's
-    codes: np.ndarray | None = None  # [m, K] uint8, states as bytes: for equal states
-
-
-class RootStates(NamedTuple):
-    """What is known of roots before they are searched."""
-
-    values: np.ndarray  # [m] float32
-    done: np.ndarray  # [m] bool
-    priors: np.ndarray  # [m, A] float32, or [0, A] for uniform
-    masks: np.ndarray  # [m, A] bool, or [0, A] for all
-    features: np.ndarray | None = None  # [m, F]
-    codes: np.ndarray | None = None  # [m, K] uint8
-
-
-def _check_rows(known: Outcomes | RootStates, m: int, num_options: int) -> None:
-    """Refuse arrays without a row for each of ``m`` states: the kernels trust them."""
-    for name, array in zip(known._fields, known, strict=True):
-        wide = name in ("priors", "masks")
-        if array is None or (wide and array.shape == (0, num_options)):
-            continue
-        if array.shape[0] != m or (wide and array.shape[1] != num_options):
-            expected = [m, num_options] if wide else [m]
-            raise ValueError(
-                f"A search got {name} {list(array.shape)} for {m} states; it needs {expected}."
-            )
+def _counter(name: str, meaning: str) -> Any:
+    """A property of a search: one number of each root."""
+    return property(lambda search: search.tree.roots[name], doc=f"{meaning}, ``[B]``.")
 
 
 class Search:
@@ -107,9 +75,9 @@ class Search:
         *,
         capacity: int = 64,
     ) -> None:
-        from torchrl_hmcts.planners import kernels
+        from torchrl_hmcts.planners import kernels, root_kernels
 
-        self._kernels = kernels
+        self._kernels, self._root_kernels = kernels, root_kernels
         settings = SearchSettings() if settings is None else settings
         instance("Search", "settings", settings, SearchSettings)
         self.tree = SearchTree(num_roots, num_options, capacity=capacity)
@@ -119,22 +87,23 @@ class Search:
         self.transpositions = copy.copy(settings.transpositions)
         self.inserting = False  # also after an interruption: nodes may be there without a state
         self.growing = False  # also after an interruption: some of it may have been in flight
-        self._set(settings)
+        self.follow(settings)
         self.gumbel = np.zeros((0, 0), np.float32)  # [B, A + N], see root_options.halve
         self.seeds = np.arange(self.num_roots)  # [B]
         self.rollouts: dict[int, np.random.Generator] = {}
         self._room = 1  # nodes of the largest tree, at most
-        self._kernels.limit(self.tree.roots, NO_LIMIT)
+        self._root_kernels.limit(self.tree.roots, NO_LIMIT)
 
     def __getstate__(self) -> dict[str, Any]:  # a module can be neither copied nor sent
-        return {**self.__dict__, "_kernels": None}
+        return {**self.__dict__, "_kernels": None, "_root_kernels": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        from torchrl_hmcts.planners import kernels
+        from torchrl_hmcts.planners import kernels, root_kernels
 
-        self.__dict__.update(state, _kernels=kernels)
+        self.__dict__.update(state, _kernels=kernels, _root_kernels=root_kernels)
 
-    def _set(self, settings: SearchSettings) -> None:
+    def follow(self, settings: SearchSettings) -> None:
+        """Take over settings, of which those that shape the tree are as before."""
         self.settings, self.record = settings, settings.record()
         policy = settings.tree_policy
         self._scores = None if isinstance(policy, CompiledPolicy) else policy
@@ -144,57 +113,16 @@ class Search:
         self._per_root *= self.num_options if settings.expand == "all" else 1
         self._wave = np.zeros(self.num_roots * self._per_root, WAVE)
 
-    def follow(self, settings: SearchSettings) -> None:
-        """Take over what the planner is set to now: constants of the tree policy, and waves.
-
-        Raises:
-            ValueError: if anything else differs, since what the tree holds would not fit it.
-        """
-        if settings is not self.settings:
-            self.settings.check_successor(settings)
-            self._set(settings)
-
     # ------------------------------------------------------------------ what is known of the roots
 
-    @property
-    def roots(self) -> np.ndarray:
-        """Counters of the roots, ``[B]`` of ``tree.ROOT``."""
-        return self.tree.roots
-
-    @property
-    def num_simulations(self) -> np.ndarray:
-        """Options simulated or revisited since :meth:`limit`, int64 ``[B]``."""
-        return self.roots["simulations"]
-
-    @property
-    def num_expansions(self) -> np.ndarray:
-        """Expansions since :meth:`limit`, int64 ``[B]``."""
-        return self.roots["expansions"]
-
-    @property
-    def num_base_steps(self) -> np.ndarray:
-        """Base steps simulated since :meth:`limit`, int64 ``[B]``."""
-        return self.roots["base_steps"]
-
-    @property
-    def best_node(self) -> np.ndarray:
-        """End of the best plan so far, int64 ``[B]``, -1 without one."""
-        return self.roots["best_node"]
-
-    @property
-    def best_return(self) -> np.ndarray:
-        """Discounted return of the best plan so far, float64 ``[B]``, -inf without one."""
-        return self.roots["best_return"]
-
-    @property
-    def expansions_to_plan(self) -> np.ndarray:
-        """Expansions when the first plan was found, int64 ``[B]``, -1 without one."""
-        return self.roots["expansions_to_plan"]
-
-    @property
-    def base_steps_to_plan(self) -> np.ndarray:
-        """Base steps simulated when the first plan was found, int64 ``[B]``, -1 without one."""
-        return self.roots["base_steps_to_plan"]
+    roots = property(lambda search: search.tree.roots, doc="Counters, ``[B]`` of ``tree.ROOT``.")
+    num_simulations = _counter("simulations", "Options simulated or revisited since :meth:`limit`")
+    num_expansions = _counter("expansions", "Expansions since :meth:`limit`")
+    num_base_steps = _counter("base_steps", "Base steps simulated since :meth:`limit`")
+    best_node = _counter("best_node", "End of the best plan so far, -1 without one")
+    best_return = _counter("best_return", "Discounted return of the best plan, -inf without one")
+    expansions_to_plan = _counter("expansions_to_plan", "Expansions when the first plan was found")
+    base_steps_to_plan = _counter("base_steps_to_plan", "Base steps when the first plan was found")
 
     # ------------------------------------------------------------------ growing
 
@@ -203,7 +131,7 @@ class Search:
         first = rows is None
         if rows is None:
             rows = np.arange(self.num_roots)
-        _check_rows(known, len(rows), self.num_options)
+        check_rows(known, len(rows), self.num_options)
         if len(rows) and not (0 <= rows.min() and rows.max() < self.num_roots):
             raise ValueError(f"A search of {self.num_roots} roots has no roots {rows}.")
         tree = self.tree
@@ -220,7 +148,7 @@ class Search:
                 tree.features = np.zeros((*shape, width), dtype)
             if known.codes is not None:
                 tree.codes = np.zeros((*shape, known.codes.shape[1]), np.uint8)
-        self._kernels.add_roots(
+        self._root_kernels.add_roots(
             tree.nodes, tree.edges, tree.roots, rows, known.values, known.done, known.priors,
             known.masks,
         )  # fmt: skip
@@ -249,7 +177,9 @@ class Search:
             self._forget_in_flight()
             self.roots["scheduled"] = 0
             self.growing = False
-        self._kernels.limit(self.roots, NO_LIMIT if num_simulations is None else num_simulations)
+        self._root_kernels.limit(
+            self.roots, NO_LIMIT if num_simulations is None else num_simulations
+        )
 
     def _forget_in_flight(self) -> None:
         self.tree.edges["in_flight"] = 0
@@ -314,8 +244,8 @@ class Search:
             raise ValueError(f"merges must name {m} nodes of the tree, or -1; got {merges}.")
         novel, twins = np.ones(m, np.bool_), np.empty(0, np.int64)
         if self.transpositions is not None or self.novelty is not None:
-            _check_rows(outcomes, m, self.num_options)
-            self._refuse(outcomes, self._kernels.first_bad(*_numbers(outcomes)))
+            check_rows(outcomes, m, self.num_options)
+            refuse(outcomes, self._kernels.first_bad(*outcomes[:2], *outcomes[4:6]))
             novel, twins = self._look_up(wave, outcomes)
         self._attach(wave)
         self._reserve_wave()
@@ -328,22 +258,11 @@ class Search:
         )  # fmt: skip
         if status != self._kernels.GOOD:
             self.inserting = False
-            _check_rows(outcomes, m, self.num_options)
-            self._refuse(outcomes, status)
+            check_rows(outcomes, m, self.num_options)
+            refuse(outcomes, status)
         new_nodes = wave.records["new_node"].copy()
         tree.remember(wave.roots, new_nodes, outcomes.features, outcomes.codes)
         return new_nodes
-
-    def _refuse(self, outcomes: Outcomes, bad: int) -> None:
-        """Raise if an outcome is bad."""
-        if bad >= 0:
-            raise ValueError(
-                f"An outcome has the reward {outcomes.rewards[bad]}, the discount "
-                f"{outcomes.discounts[bad]}, the value {outcomes.values[bad]} and the priors "
-                f"{outcomes.priors[bad : bad + 1].tolist()}. All must be finite, rewards and "
-                f"values smaller than {LARGEST:g}, discounts in [0, 1] and priors not negative; "
-                f"scale the rewards, or find the step from which the env wrote them."
-            )
 
     def _look_up(self, wave: Wave, outcomes: Outcomes) -> tuple[np.ndarray, np.ndarray]:
         """Which states are novel, bool ``[m]``, and their twins, int64 ``[m]`` or ``[0]``."""
@@ -363,19 +282,8 @@ class Search:
             assert outcomes.features is not None
             steps = tree.nodes["base_steps"][wave.roots, wave.nodes] + outcomes.durations
             features = outcomes.features[further]
-            novel[further] = self.accept(wave.roots[further], features, steps[further])
+            novel[further] = ask(self.novelty, wave.roots[further], features, steps[further])
         return novel, twins
-
-    def accept(self, roots: np.ndarray, features: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Return the answer of the novelty test, bool ``[m]``, checked."""
-        assert self.novelty is not None
-        novel = np.asarray(self.novelty.accept(roots, features, steps))
-        if novel.shape != (len(features),) or novel.dtype != np.bool_:
-            raise ValueError(
-                f"The novelty test accepted {novel.dtype} {list(novel.shape)}; it must say of each "
-                f"of the {len(features)} states whether it is new, in bool."
-            )
-        return novel
 
     def _reserve_wave(self) -> None:
         """Make room for the nodes of one wave."""
@@ -407,17 +315,9 @@ class Search:
         A root whose budget is spent is neither.
         """
         kept, stuck = np.empty_like(active), np.empty_like(active)
-        num_kept, num_stuck = self._kernels.still_active(
-            self.tree.nodes,
-            self.tree.roots,
-            active,
-            NO_LIMIT if budget.expansions is None else budget.expansions,
-            NO_LIMIT if budget.base_steps is None else budget.base_steps,
-            NO_LIMIT if budget.nodes is None else budget.nodes,
-            budget.until_plan,
-            budget.improve_expansions,
-            kept,
-            stuck,
+        nodes, roots = self.tree.nodes, self.tree.roots
+        num_kept, num_stuck = self._root_kernels.still_active(
+            nodes, roots, active, *budget.limits, kept, stuck
         )
         return kept[:num_kept], stuck[:num_stuck]
 
@@ -450,7 +350,3 @@ class Search:
             if test is not None and hasattr(test, "statistics"):
                 counts.update(test.statistics())
         return counts
-
-
-def _numbers(outcomes: Outcomes) -> tuple[np.ndarray, ...]:
-    return outcomes.rewards, outcomes.discounts, outcomes.values, outcomes.priors

@@ -20,47 +20,17 @@ from tensordict import TensorDictBase
 
 from torchrl_hmcts.checks import NO_LIMIT
 from torchrl_hmcts.planners.budget import SearchBudget
-from torchrl_hmcts.planners.evaluation import NodeEvaluator, wave_seeds
+from torchrl_hmcts.planners.evaluation import NodeEvaluator
+from torchrl_hmcts.planners.outcomes import Outcomes, check_durations
+from torchrl_hmcts.planners.progress import SearchProgress
+from torchrl_hmcts.planners.random_streams import wave_seeds
 from torchrl_hmcts.planners.root_options import halve
-from torchrl_hmcts.planners.search import Outcomes, Search, Wave
+from torchrl_hmcts.planners.search import Search, Wave
 from torchrl_hmcts.planners.simulator import Simulator
 from torchrl_hmcts.planners.subtree import extend, find_merges, relax, solve
-from torchrl_hmcts.planners.tree import MOST_BASE_STEPS
 
 # Revisits in a row, without a limit of simulations, after which a root has nothing left to find.
 _MAX_FRUITLESS_REVISITS = 10_000
-
-
-@dataclass(frozen=True)
-class SearchProgress:
-    """What a progress display is told after every wave.
-
-    Attributes:
-        num_roots (int): roots of the search.
-        num_active (int): roots whose search continues.
-        num_found (int): roots with a plan.
-        expansions (int): nodes expanded so far, of all roots.
-        base_steps (int): base steps simulated so far, of all roots.
-        seconds (float): since the search began.
-        search (Search): the search as it stands, of B roots; ``extract_plans(search)`` gives the
-            best plans so far.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> env, told = ChainEnv(length=4), []
-        >>> _ = MCTSPlanner(env, progress=told.append).plan(env.reset())
-        >>> told[-1].num_found, told[-1].num_roots
-        (1, 1)
-    """
-
-    num_roots: int
-    num_active: int
-    num_found: int
-    expansions: int
-    base_steps: int
-    seconds: float
-    search: Search
 
 
 @dataclass(slots=True)
@@ -157,7 +127,7 @@ class SearchLoop:
                     since[first.roots] = search.roots["revisits"][first.roots]
             seconds = time.perf_counter() - begin
             if self.progress is not None:
-                self.progress(self._told(len(active), seconds))
+                self.progress(SearchProgress.of(search, len(active), seconds))
             if budget.seconds is not None and seconds >= budget.seconds:
                 active = active[:0]
                 continue
@@ -165,18 +135,6 @@ class SearchLoop:
                 revisits = search.roots["revisits"]
                 active = active[revisits[active] - since[active] < _MAX_FRUITLESS_REVISITS]
             active = self._still_active(active)
-
-    def _told(self, num_active: int, seconds: float) -> SearchProgress:
-        search = self.search
-        return SearchProgress(
-            num_roots=search.num_roots,
-            num_active=num_active,
-            num_found=int((search.best_node >= 0).sum()),
-            expansions=int(search.num_expansions.sum()),
-            base_steps=int(search.num_base_steps.sum()),
-            seconds=seconds,
-            search=search,
-        )
 
     def _still_active(self, active: np.ndarray) -> np.ndarray:
         """The roots among ``active`` that have budget left and something to simulate."""
@@ -211,7 +169,8 @@ class SearchLoop:
         if simulator.duration_key is None:
             discounts = np.where(terminated, np.float32(0.0), np.float32(self.gamma))
         else:
-            _check_durations(search, wave, durations)
+            above = search.tree.nodes["base_steps"][wave.roots, wave.nodes]
+            check_durations(durations, above)
             discounts = np.where(terminated, 0.0, self.gamma**durations).astype(np.float32)
 
         def seeds() -> np.ndarray:
@@ -238,15 +197,3 @@ class SearchLoop:
         nodes = search.insert(wave, outcomes, merges)
         search.tree.set_states(wave.roots, nodes, after)
         search.inserting = False
-
-
-def _check_durations(search: Search, wave: Wave, durations: np.ndarray) -> None:
-    """Refuse times that no option can have taken, and paths whose length would wrap."""
-    above = search.tree.nodes["base_steps"][wave.roots, wave.nodes]
-    good = (durations >= 1) & (durations <= MOST_BASE_STEPS - above.astype(np.int64))
-    if not good.all():
-        raise ValueError(
-            f"The simulator returned a duration of {durations[~good][0]}. An option takes one base "
-            f"step or more, and a path {MOST_BASE_STEPS:,} at most; find the step from which the "
-            f"env wrote it."
-        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -13,8 +13,6 @@ from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.transpositions import Transpositions
 from torchrl_hmcts.planners.tree import MAX_BACKUP, MEAN_BACKUP, PYTHON_SCORE, RECORD
 from torchrl_hmcts.planners.tree_policies import UCT, CompiledPolicy, Gumbel, TreePolicy
-
-_MOST_HALVED = 2**24  # simulations of Gumbel, whose schedule holds counts in float32
 
 
 @dataclass(frozen=True)
@@ -134,52 +132,10 @@ class SearchSettings:
         return self.exhausted == "revisit" or self.chance is not None or self.is_gumbel
 
     def check_simulations(self, num_simulations: int | None) -> None:
-        """Refuse a number of simulations that ``Gumbel`` cannot plan.
-
-        Raises:
-            ValueError: if it is not known or very large, or comes with several options at a time.
-        """
-        if not self.is_gumbel:
-            return
-        at_once = self.leaves_per_wave * self.waves_in_flight
-        if num_simulations is None or self.expand != "one" or at_once != 1:
-            raise ValueError(
-                f"Gumbel halves a known number of simulations of one option each; got "
-                f"budget.simulations={num_simulations}, expand={self.expand!r}, "
-                f"leaves_per_wave={self.leaves_per_wave}, waves_in_flight={self.waves_in_flight}. "
-                f"Pass budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
-                f"leaves_per_wave=1."
-            )
-        if num_simulations > _MOST_HALVED:
-            raise ValueError(
-                f"Gumbel plans every simulation ahead, {_MOST_HALVED:,} at most; got "
-                f"{num_simulations:,}."
-            )
-
-    def check_successor(self, new: SearchSettings) -> None:
-        """Refuse settings under which a search that was planted with these cannot continue.
-
-        Constants of the tree policy, the waves and the rollouts may differ.
-
-        Raises:
-            ValueError: if another part differs, since what the tree holds would not fit it.
-        """
-        for part in fields(self):
-            one, other = getattr(self, part.name), getattr(new, part.name)
-            if part.name in ("leaves_per_wave", "waves_in_flight", "rollout"):
-                continue
-            if part.name == "tree_policy" and isinstance(one, CompiledPolicy):
-                same = one.continues(other)
-            elif part.name == "tree_policy":
-                same = not isinstance(other, CompiledPolicy)
-            else:
-                same = _is_same(one, other)
-            if not same:
-                raise ValueError(
-                    f"This search was planted with {part.name}={one!r}; the planner now has "
-                    f"{part.name}={other!r}. What the tree holds does not fit it: plant a new one, "
-                    f"or resume it with a planner like the first."
-                )
+        """Refuse a number of simulations that ``Gumbel`` cannot plan."""
+        if isinstance(self.tree_policy, Gumbel):
+            at_once = self.leaves_per_wave, self.waves_in_flight
+            self.tree_policy.check_simulations(num_simulations, self.expand, *at_once)
 
     def record(self) -> np.ndarray:
         """Return what the kernels read, ``[1]`` of ``tree.RECORD``."""
@@ -202,14 +158,3 @@ class SearchSettings:
         for name, number in numbers.items():
             record[name] = number
         return record
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """Return one of the numbers that the kernels read, ``[1]``, e.g. ``settings["c"]``."""
-        return self.record()[name]
-
-
-def _is_same(one: Any, other: Any) -> bool:
-    """Whether two parts do the same; a copy of a search holds copies of them."""
-    if one is other or type(one) is not type(other):
-        return one is other
-    return type(one).__repr__ is object.__repr__ or one == other or repr(one) == repr(other)

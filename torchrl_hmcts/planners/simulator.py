@@ -12,8 +12,8 @@ Letters: ``m`` states of one call, ``A`` options.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -22,26 +22,22 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import OneHot
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
+from torchrl_hmcts.checks import nested_key
 from torchrl_hmcts.direct_calls import put
-from torchrl_hmcts.nesting import (
-    complete_done,
-    env_name,
-    flat_transforms,
-    set_states,
-    step_states,
-)
-from torchrl_hmcts.planners.keys import entry_key
+from torchrl_hmcts.nesting import complete_done, env_name, step_states
 from torchrl_hmcts.planners.simulator_checks import (
     check_durations_and_masks,
     check_env,
     check_rewards_and_ends,
+    check_state,
     count_options,
     find_done_keys,
     find_reward_key,
 )
+from torchrl_hmcts.planners.turns import Turns
 
 _BESIDE = ("step_async", "step_wait", "step_abandon")
 
@@ -101,28 +97,13 @@ class Simulator:
         self._done_key, self._terminated_key = find_done_keys(env)
         check_rewards_and_ends(env, self._reward_key, (self._done_key, self._terminated_key))
         check_durations_and_masks(env, self.duration_key, self.mask_key, self.num_options)
-        last = flat_transforms(env)[-1:] if type(env) is TransformedEnv else []
-        self._run_from = getattr(last[0], "run_from", None) if last else None
+        self._turns = Turns(env, self.state_keys, self.option_key, self.encode)
         self._ones = np.ones(0, np.int64)
         self._no_masks = np.zeros((0, self.num_options), np.bool_)
 
     def root(self, td: TensorDictBase) -> TensorDictBase:
         """Return the root states in one batch dimension, after checking them."""
-        missing = [key for key in self.root_keys if td.get(key, None) is None]
-        if missing:
-            raise ValueError(
-                f"The state to plan from lacks {missing}. Pass a tensordict as env.reset() or "
-                f'env.step(td)["next"] gives it; this one has '
-                f"{sorted(map(str, td.keys(True, True)))}."
-            )
-        for key in self.root_keys:
-            value = td.get(key)
-            if value.is_floating_point() and not torch.isfinite(value).all():
-                bad = value[~torch.isfinite(value)][0].item()
-                raise ValueError(
-                    f'The state to plan from has "{key}" = {bad}. A state that is not finite '
-                    f"cannot be simulated; find the step that wrote it."
-                )
+        check_state(td, self.root_keys)
         flat: TensorDictBase = td.flatten() if len(td.batch_size) != 1 else td
         return flat
 
@@ -138,9 +119,8 @@ class Simulator:
 
     def _optional(self, name: str, key: NestedKey | None) -> NestedKey | None:
         """A key of the env, or None if the env has no such entry."""
-        if key is None or entry_key("MCTSPlanner", name, key) not in self._available:
-            return None
-        return entry_key("MCTSPlanner", name, key)
+        found = None if key is None else nested_key("MCTSPlanner", name, key)
+        return found if found in self._available else None
 
     def _check_available(self, keys: Sequence[NestedKey], reader: str) -> None:
         for key in keys:
@@ -156,7 +136,7 @@ class Simulator:
         if self.stateless:
             after = step_states(self.env, states)
         else:
-            after = self._step_in_turn(states, options)
+            after = self._turns.step(states, torch.from_numpy(options))
         return self._completed(states, after)
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
@@ -193,69 +173,15 @@ class Simulator:
                 after.set(key, states.get(key))
         return after
 
-    def _step_in_turn(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
-        """Set an env with a state of its own to as many states as it holds at a time, and step."""
-        env, m = self.env, len(states)
-        if not env.batch_dims:
-            return self._step_one_by_one(states, options)
-        size = env.batch_size.numel()
-        parts = []
-        for begin in range(0, m, size):
-            rows = torch.arange(begin, begin + size).clamp_max(m - 1)  # the last one fills up
-            part = states[rows].reshape(env.batch_size)
-            before = env.reset(part.select(*self.state_keys), set_state=True)
-            # A reset sets what transforms keep in the tensordict, e.g. a step count, back to 0.
-            after = env.step(before.update(part)).get("next")
-            parts.append(after.reshape(-1)[: min(size, m - begin)])
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    def _step_one_by_one(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
-        """Set an env of one state to each of the states, and step."""
-        parts = []
-        alone = states.select(*self.state_keys).unbind(0)
-        for state, option in zip(alone, torch.from_numpy(options), strict=True):
-            after = None if self._run_from is None else self._run_from(state, option)
-            if after is None:
-                root = set_states(self.env, state).update(state)
-                put(root, self.option_key, self.encode(option))
-                after = step_states(self.env, root)
-            parts.append(after)
-        stacked: TensorDictBase = torch.stack(parts)
-        return stacked
-
-    @contextmanager
-    def searching(self) -> Iterator[None]:
-        """Let nothing that a search does stay in the transforms of the env.
-
-        Raises:
-            ValueError: at the end, if a transform of another project kept something.
-        """
-        before = self._foreign.read()
-        try:
-            yield
-        finally:
-            changed = self._foreign.changed(before)
-            if changed is not None:
-                self._foreign.put_back(before)
-        if changed is not None:
-            raise ValueError(
-                f"{changed} of {self._name} changed while MCTSPlanner searched: a transform keeps "
-                f"a state in itself, which cannot be set, so that nodes of the tree see each "
-                f"other's. Keep it in the tensordict: read it from the first argument of _step, "
-                f"write it to the second, and declare it in the state and observation specs."
-            )
+    def searching(self) -> AbstractContextManager[None]:
+        """Let nothing that a search does stay in the transforms of the env."""
+        return self._foreign.unchanged(self._name)
 
     def leave(self, td: TensorDictBase) -> None:
         """Set an env with a state of its own back to ``td``, if that is a state of all of it."""
-        if self.stateless or td.batch_size != self.env.batch_size:
-            return
-        goes_on = ~torch.from_numpy(self.done(td.reshape(-1))).reshape(*td.batch_size, 1)
-        if goes_on.any():  # a state at its end is reset by whoever acts
-            state = td.select(*self.state_keys)
-            if not goes_on.all():
-                for key in self.env.reset_keys:
-                    state.set(key, goes_on.to(self.env.device))
-            self.env.reset(state, set_state=True)
+        if not self.stateless and td.batch_size == self.env.batch_size:
+            done = torch.from_numpy(self.done(td.reshape(-1))).reshape(*td.batch_size, 1)
+            self._turns.leave(td, ~done)
 
     def encode(self, options: Tensor) -> Tensor:
         """Return option indices ``[*B]`` in the form of the env's action spec."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
-from tensordict import unravel_key
+from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torchrl.data import Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_hmcts.checks import nested_key
 from torchrl_hmcts.nesting import env_name, flat_transforms
-from torchrl_hmcts.planners.keys import entry_key
 
 
 def check_env(env: EnvBase) -> None:
@@ -108,11 +111,40 @@ def check_durations_and_masks(
             )
 
 
+def check_state(td: TensorDictBase, keys: Sequence[NestedKey]) -> None:
+    """Refuse a state to plan from that lacks an entry, or has one that is not finite."""
+    missing = [key for key in keys if td.get(key, None) is None]
+    if missing:
+        raise ValueError(
+            f"The state to plan from lacks {missing}. Pass a tensordict as env.reset() or "
+            f'env.step(td)["next"] gives it; this one has '
+            f"{sorted(map(str, td.keys(True, True)))}."
+        )
+    for key in keys:
+        value = td.get(key)
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            bad = value[~torch.isfinite(value)][0].item()
+            raise ValueError(
+                f'The state to plan from has "{key}" = {bad}. A state that is not finite '
+                f"cannot be simulated; find the step that wrote it."
+            )
+
+
+def check_masks(masks: np.ndarray, done: np.ndarray, roots: np.ndarray) -> None:
+    """Refuse roots whose episode continues though no option may be taken."""
+    stuck = roots[~(masks.any(-1) | done)] if len(masks) else roots[:0]
+    if len(stuck):
+        raise ValueError(
+            f"Root {stuck[0]} has no option that may be taken: its action mask is all False. "
+            f"Plan from a state that is not a dead end, or mark it as done."
+        )
+
+
 def find_reward_key(env: EnvBase, reward_key: NestedKey | None) -> NestedKey:
     """Return the reward that is asked for, or the only one."""
     keys = [unravel_key(k) for k in env.reward_keys]
     if reward_key is not None:
-        reward_key = entry_key("MCTSPlanner", "reward_key", reward_key)
+        reward_key = nested_key("MCTSPlanner", "reward_key", reward_key)
         if reward_key in keys:
             return reward_key
     if reward_key is not None or len(keys) != 1:

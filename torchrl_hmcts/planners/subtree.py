@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from torchrl_hmcts.planners.novelty import ask
 from torchrl_hmcts.planners.search import Search, Wave
+from torchrl_hmcts.planners.settings import SearchSettings
 from torchrl_hmcts.planners.tree import PRUNED, TERMINAL, TreeArrays
+from torchrl_hmcts.planners.tree_policies import CompiledPolicy
 
 
 def extend(search: Search, wave: Wave) -> Wave:
@@ -56,7 +61,7 @@ def _reopen(search: Search, root: int, pruned: np.ndarray) -> None:
 
     again = np.ones(len(pruned), np.bool_)
     if search.novelty is not None:
-        again = search.accept(*_tested(search.tree, root, pruned))
+        again = ask(search.novelty, *_tested(search.tree, root, pruned))
     for node in pruned[again]:
         subtree_kernels.reopen(search.tree.nodes, search.tree.edges, root, node)
 
@@ -160,3 +165,57 @@ def find_merges(
         if outcomes:
             merges[i] = find_state(tree, root, outcomes, after[i], bool(done[i]), keys)
     return merges
+
+
+def keep_subtrees(
+    search: Search,
+    rows: np.ndarray,
+    options: Sequence[Sequence[int]],
+    states: TensorDictBase,
+    done: np.ndarray,
+    keys: Sequence[NestedKey],
+) -> np.ndarray:
+    """Move roots to where options led, if the tree holds that state; return which, bool ``[B]``."""
+    kept = np.zeros(search.num_roots, np.bool_)
+    for i, root in enumerate(rows.tolist()):
+        path = [option for option in options[i] if option >= 0]
+        if not path or search.settings.is_gumbel:  # halving starts from zero visits
+            continue
+        node = find_end(search.tree, root, path, states[i], bool(done[i]), keys)
+        if node >= 0:
+            reroot(search, root, node)
+            kept[root] = True
+    return kept
+
+
+def check_successor(old: SearchSettings, new: SearchSettings) -> None:
+    """Refuse settings with which a search that was planted with others cannot continue.
+
+    Constants of the tree policy, the waves and the rollouts may differ.
+
+    Raises:
+        ValueError: if another part differs, since what the tree holds would not fit it.
+    """
+    for name in (part.name for part in fields(old)):
+        one, other = getattr(old, name), getattr(new, name)
+        if name in ("leaves_per_wave", "waves_in_flight", "rollout"):
+            continue
+        if name == "tree_policy" and isinstance(one, CompiledPolicy):
+            same = one.continues(other)
+        elif name == "tree_policy":
+            same = not isinstance(other, CompiledPolicy)
+        else:
+            same = _is_same(one, other)
+        if not same:
+            raise ValueError(
+                f"This search was planted with {name}={one!r}; the planner now has "
+                f"{name}={other!r}. What the tree holds does not fit it: plant a new one, "
+                f"or resume it with a planner like the first."
+            )
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Whether two parts do the same; a copy of a search holds copies of them."""
+    if one is other or type(one) is not type(other):
+        return one is other
+    return type(one).__repr__ is object.__repr__ or one == other or repr(one) == repr(other)

@@ -9,6 +9,7 @@ from torchrl_hmcts.planners.kernels import schedule
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     EXPANDED,
+    FORBIDDEN,
     PRUNED,
     REWARDED,
     TERMINAL,
@@ -173,37 +174,50 @@ def solve(trees, links, roots, b, tolerance, max_sweeps):
 # ------------------------------------------------------- for descents that are controlled by Python
 
 
-@njit(error_model="numpy")
-def may_descend(nodes, roots, record):
-    """Which active roots have simulations left, and something to simulate or revisit."""
-    may = np.zeros(roots.shape[0], np.bool_)
-    for b in range(roots.shape[0]):
-        root = roots[b]
-        if root["active"] and root["simulations"] + root["scheduled"] < root["limit"]:
-            endless = root["limit"] == np.iinfo(np.int64).max
-            may[b] = not nodes[b, 0]["flags"] & CLOSED or (record[0]["revisit"] and not endless)
-    return may
-
-
 @njit(error_model="numpy", _nrt=False)
-def refresh_all(nodes, edges, rows, leaves):
-    for i in range(rows.shape[0]):
-        refresh_twins(nodes[rows[i]], edges[rows[i]], leaves[i])
+def walk_on(nodes, edges, roots, record, begins, rows):
+    """Go from the node of every root to what it chose; return how many have to choose again.
 
-
-@njit(error_model="numpy")
-def wants_samples(edges, record, rows, leaves, options):
-    wants = np.zeros(rows.shape[0], np.bool_)
-    for i in range(rows.shape[0]):
-        edge = edges[rows[i], leaves[i], options[i]]
-        wants[i] = edge["child"] >= 0 and wants_sample(edge, record[0])
-    return wants
-
-
-@njit(error_model="numpy")
-def outcomes(nodes, rows, first):
-    chosen = first.copy()
-    for i in range(rows.shape[0]):
-        if nodes[rows[i], first[i]]["sibling"] >= 0:
-            chosen[i] = outcome(nodes[rows[i]], first[i])
-    return chosen
+    Writes those to ``rows``. If the walk ``begins``, every active root with simulations left goes
+    to its node 0. A root has ended where its choice is to be simulated, or -1 at a leaf.
+    """
+    s = record[0]
+    count = 0
+    for b in range(roots.shape[0]):
+        root, tree, links = roots[b], nodes[b], edges[b]
+        n, a = root["at"], root["choice"]
+        if begins:
+            n = 0
+            known = tree[0]["flags"] & CLOSED
+            endless = root["limit"] == np.iinfo(np.int64).max
+            spent = root["simulations"] + root["scheduled"] >= root["limit"]
+            walks = root["active"] and not spent
+            root["queue"] = walks and (not known or (s["revisit"] > 0 and not endless))
+        elif root["queue"]:
+            child = links[n, a]["child"]
+            if child < 0 or wants_sample(links[n, a], s):
+                root["queue"] = 0
+                continue
+            links[n, a]["in_flight"] += 1
+            n = outcome(tree, child) if tree[child]["sibling"] >= 0 else child
+        else:
+            continue
+        root["at"], root["choice"] = n, -1
+        flags = tree[n]["flags"]
+        if flags & (TERMINAL | PRUNED):
+            root["queue"] = 0
+        elif s["expand_all"] and not flags & EXPANDED and tree[n]["open_options"] > 0:
+            root["queue"] = 0
+        if not root["queue"]:
+            continue
+        if s["twins"]:
+            refresh_twins(tree, links, n)
+        root["queue"] = 0
+        for option in range(edges.shape[-1]):
+            closed = links[n, option]["closed"]
+            if not closed or (s["revisit"] > 0 and closed != FORBIDDEN):
+                root["queue"] = 1
+        if root["queue"]:
+            rows[count] = b
+            count += 1
+    return count

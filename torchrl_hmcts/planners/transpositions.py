@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
-from torchrl_hmcts.planners.keys import entry_keys
+from torchrl_hmcts.checks import nested_keys
 
 
 class Transpositions:
@@ -46,7 +46,7 @@ class Transpositions:
     """
 
     def __init__(self, key: NestedKey | Sequence[NestedKey]) -> None:
-        self.in_keys = entry_keys("Transpositions", "key", key)
+        self.in_keys = nested_keys("Transpositions", "key", key)
         self.start(0)
 
     def start(self, num_roots: int) -> None:

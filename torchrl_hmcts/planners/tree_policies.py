@@ -70,6 +70,8 @@ class NodeStatistics(TensorClass, metaclass=KeepsDocstring):
     allowed: Tensor
 
 
+_MOST_HALVED = 2**24  # simulations of Gumbel, whose schedule holds counts in float32
+
 ScoreFunction = Callable[[NodeStatistics], Tensor]
 """A tree policy of your own: statistics ``[d]`` to scores ``[d, A]``, of which the highest wins."""
 
@@ -247,6 +249,29 @@ class Gumbel(CompiledPolicy):
     def continues(self, other: TreePolicy) -> bool:
         """Return whether the other policy has the same schedule."""
         return self == other
+
+    @staticmethod
+    def check_simulations(
+        num_simulations: int | None, expand: str, leaves_per_wave: int, waves_in_flight: int
+    ) -> None:
+        """Refuse simulations whose schedule cannot be planned.
+
+        Raises:
+            ValueError: if their number is unknown or very large, or several come at a time.
+        """
+        if num_simulations is None or expand != "one" or leaves_per_wave * waves_in_flight != 1:
+            raise ValueError(
+                f"Gumbel halves a known number of simulations of one option each; got "
+                f"budget.simulations={num_simulations}, expand={expand!r}, "
+                f"leaves_per_wave={leaves_per_wave}, waves_in_flight={waves_in_flight}. Pass "
+                f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
+                f"leaves_per_wave=1."
+            )
+        if num_simulations > _MOST_HALVED:
+            raise ValueError(
+                f"Gumbel plans every simulation ahead, {_MOST_HALVED:,} at most; got "
+                f"{num_simulations:,}."
+            )
 
     @staticmethod
     def considered_visits(num_considered: int, num_simulations: int) -> list[int]:

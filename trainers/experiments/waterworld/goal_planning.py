@@ -24,7 +24,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
     SearchSettings,
 )
-from torchrl_hmcts.planners.search import Outcomes, RootStates
+from torchrl_hmcts.planners.outcomes import Outcomes, RootStates
 from torchrl_hmcts.planners.tree import EXPANDED, PRUNED, TERMINAL
 from torchrl_hmcts.transforms import PlansGoals, SubgoalTransform
 
