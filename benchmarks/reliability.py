@@ -32,41 +32,25 @@ GROUPS = {  # what is counted, and the tests that show it
     "faults_injected_and_survived": [
         "tests/test_fault_checkpoints.py",
         "tests/test_fault_collectors.py",
-        "tests/test_a3c_trainer.py::TestProcesses::"
-        "test_a_learners_exception_ends_the_run_with_a_checkpoint_its_name_and_its_traceback",
-        "tests/test_a3c_trainer.py::TestProcesses::test_a_killed_learner_is_noticed_soon",
-        "tests/test_a3c_trainer.py::TestProcesses::test_ctrl_c_stops_all_saves_and_says_how_to_go_on",
-        "tests/test_a3c_trainer.py::TestProcesses::test_learners_end_when_their_parent_is_killed",
-        "tests/test_atari_pool.py::test_an_option_is_run_again_when_its_process_crashes",
-        "tests/test_atari_pool.py::test_processes_that_die_again_and_again_are_an_error",
-        "tests/test_atari_pool.py::test_killed_processes_do_not_change_a_search",
+        "tests/test_a3c_trainer.py::TestProcesses",
+        "tests/test_atari_pool.py",
+        *("-k", "fault or ends or end or killed or ctrl_c or crashes or die"),
     ],
     "runs_resumed_and_compared": [  # bit for bit, but for A3C's, whose counters are compared
-        "tests/test_trainer_resume.py::"
-        "test_a_run_resumed_in_a_new_process_ends_bit_for_bit_as_one_that_never_stopped",
-        "tests/test_trainer_resume.py::test_episodes_of_a_collector_go_on_in_another",
-        "tests/test_hmcts_trainer.py::"
-        "test_a_run_resumed_in_a_new_process_is_the_unbroken_run_bit_for_bit",
-        "tests/test_expert_iteration.py::"
-        "test_a_run_that_was_stopped_and_loaded_is_the_run_that_never_stopped",
-        "tests/test_expert_iteration.py::test_a_collector_goes_on_where_another_stopped",
-        "tests/test_growing_skills.py::test_a_resumed_run_is_the_same_as_one_that_never_stopped",
-        "tests/test_a3c_trainer.py::TestCheckpoints::"
-        "test_a_resumed_run_goes_on_with_counters_state_and_curves",
-        "tests/test_atari_agent.py::"
-        "test_play_goes_on_bit_for_bit_from_where_the_tree_is_planted_anew",
-        "tests/test_atari_agent.py::test_a_run_in_pieces_is_the_run_in_one",
-        "tests/test_determinism.py::"
-        "test_an_atari_run_stopped_and_loaded_in_a_new_process_is_the_run_that_never_stopped",
+        "tests/test_trainer_resume.py",
+        "tests/test_hmcts_trainer.py",
+        "tests/test_expert_iteration.py",
+        "tests/test_growing_skills.py",
+        "tests/test_a3c_trainer.py",
+        "tests/test_atari_agent.py",
+        "tests/test_determinism.py",
+        *("-k", "resumed or goes_on or go_on or stopped or in_pieces"),
     ],
     "runs_repeated_and_compared": [
-        "tests/test_determinism.py::test_one_thread_and_two_give_the_same_bits",
-        "tests/test_determinism.py::test_a_search_is_a_function_of_its_seed",
-        "tests/test_demo.py::test_the_same_seed_gives_the_same_figures",
-        "tests/test_a3c_trainer.py::TestInThisProcess::"
-        "test_two_runs_of_a_seed_are_the_same_bit_for_bit_and_those_of_two_seeds_are_not",
-        "tests/test_a3c_trainer.py::TestProcesses::"
-        "test_one_learner_in_a_process_does_what_it_does_in_this_one",
+        "tests/test_determinism.py",
+        "tests/test_demo.py",
+        "tests/test_a3c_trainer.py",
+        *("-k", "same_bits or function_of_its_seed or same_seed or of_a_seed or in_a_process"),
     ],
     "security": ["tests/test_security.py"],
 }

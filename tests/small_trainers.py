@@ -30,19 +30,23 @@ def make_diayn(folder: Path | None, total: int = 48, hidden: int = 8, **other: A
 
 def make_a3c(folder: Path, total: int = 800, length: int = 4, **other: Any) -> A3CTrainer:
     """One learner in this process, in a chain."""
-    torch.manual_seed(1)
-    actor = ProbabilisticActor(
-        TensorDictModule(torch.nn.Embedding(length, 2), ["state"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=torch.distributions.Categorical,
-    )
-    critic = ValueOperator(torch.nn.Embedding(length, 1), in_keys=["state"])
     return A3CTrainer(
         partial(ChainEnv, length=length, batch_size=[8]),
-        A3CLoss(actor, critic, gamma=0.9),
+        A3CLoss(*make_networks(length, seed=1), gamma=0.9),
         total_frames=total,
         segment_steps=5,
         num_learners=0,
         save_dir=folder,
         **other,
     )
+
+
+def make_networks(length: int, seed: int = 0) -> tuple[ProbabilisticActor, ValueOperator]:
+    """Actor and critic of a chain, a weight for each of its states."""
+    torch.manual_seed(seed)
+    actor = ProbabilisticActor(
+        TensorDictModule(torch.nn.Embedding(length, 2), ["state"], ["logits"]),
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
+    )
+    return actor, ValueOperator(torch.nn.Embedding(length, 1), in_keys=["state"])

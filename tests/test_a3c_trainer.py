@@ -12,7 +12,6 @@ import subprocess
 import sys
 import textwrap
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import make_networks
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.checkpoint import CheckpointError, CheckpointRotation
+from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase, GymEnv
 from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import A2CLoss
@@ -33,7 +33,7 @@ from trainer_parts import Bars, weights
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import A3CTrainer, LearnerError, SharedRMSprop
-from torchrl_hmcts.trainers.a3c.actor_learner import ActorLearner, SharedMemory
+from torchrl_hmcts.trainers.a3c.actor_learner import ActorLearner
 
 LENGTH, B, T = 5, 4, 5
 SEGMENT = B * T
@@ -43,18 +43,8 @@ def make_env() -> EnvBase:
     return ChainEnv(LENGTH, batch_size=[B])
 
 
-def make_networks() -> tuple[ProbabilisticActor, ValueOperator]:
-    torch.manual_seed(0)
-    actor = ProbabilisticActor(
-        TensorDictModule(nn.Embedding(LENGTH, 2), ["state"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=torch.distributions.Categorical,
-    )
-    return actor, ValueOperator(nn.Embedding(LENGTH, 1), in_keys=["state"])
-
-
 def make_loss(**settings: Any) -> A3CLoss:
-    return A3CLoss(*make_networks(), gamma=0.9, **settings)
+    return A3CLoss(*make_networks(LENGTH), gamma=0.9, **settings)
 
 
 def make_trainer(
@@ -228,7 +218,7 @@ class TestInThisProcess:
 
     @pytest.mark.parametrize("functional", [True, False])
     def test_torchrls_a2c_loss_can_be_trained_too(self, functional: bool) -> None:
-        loss = A2CLoss(*make_networks(), functional=functional)
+        loss = A2CLoss(*make_networks(LENGTH), functional=functional)
         trainer = make_trainer(loss)
         before = weights(trainer)
         history = trainer.train()
@@ -277,13 +267,6 @@ class TestCheckpoints:
             learner = ActorLearner(trainer.settings, trainer.shared, 0, frames)
             actions.append(learner.collect()["action"])
         assert not torch.equal(*actions)
-
-    def test_a_checkpoint_holds_no_pickle_and_old_ones_are_removed(self, tmp_path: Path) -> None:
-        make_trainer(save_dir=tmp_path, save_interval=2 * SEGMENT, keep_last=3).train()
-        kept = CheckpointRotation(tmp_path, keep_last=3).checkpoints()
-        assert len(kept) == 3
-        files = [Path(name) for path in kept for name in zipfile.ZipFile(path).namelist()]
-        assert {path.suffix for path in files} == {".json", ".memmap"}
 
     def test_a_run_that_is_done_only_says_so(self, tmp_path: Path) -> None:
         done = make_trainer(save_dir=tmp_path).train()
@@ -465,10 +448,3 @@ class TestConstruction:
         make_trainer(loss, optimizer=SharedRMSprop(groups)).train()
         for name, parameter in loss.named_parameters():
             assert torch.equal(parameter, before[name]) == name.startswith("actor")
-
-    def test_the_shared_memory_is_what_the_trainer_says(self) -> None:
-        shared = make_trainer(num_learners=3).shared
-        assert isinstance(shared, SharedMemory)
-        assert shared.board.shape[0] == 3
-        tensors = [*shared.parameters, shared.board, shared.stop]
-        assert all(tensor.is_shared() for tensor in tensors)

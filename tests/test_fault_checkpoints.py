@@ -32,7 +32,6 @@ from torchrl_hmcts.trainers.saving.checkpoints import (
     newest_checkpoint,
     plain_checkpoint,
 )
-from torchrl_hmcts.trainers.saving.files import write_json
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 NAME = "checkpoint-{:012d}.torchrl"
@@ -479,10 +478,3 @@ class TestNaN:
             next(one.loss_module.parameters()).fill_(float("inf"))
         with pytest.raises(FloatingPointError, match="There is no checkpoint: pass save_dir"):
             one.train()
-
-
-def test_numbers_that_are_not_finite_are_null_in_json(tmp_path) -> None:
-    content = {"a": [1, float("nan")], "b": {"c": float("inf"), "d": 0.5}, "e": "nan", "f": None}
-    write_json(tmp_path / "a.json", content)
-    text = (tmp_path / "a.json").read_text()
-    assert json.loads(text) == {"a": [1, None], "b": {"c": None, "d": 0.5}, "e": "nan", "f": None}

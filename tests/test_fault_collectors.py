@@ -57,7 +57,7 @@ class Mortal:
         self.closed = True
 
 
-def mortals(*dies_at: int, frames: int = 40, **kwargs: Any) -> tuple[RestartingCollector, list]:
+def mortals(*dies_at: int, frames: int = 40) -> tuple[RestartingCollector, list]:
     made: list[Mortal] = []
 
     def make(left: int, deaths: int) -> Mortal:
@@ -68,7 +68,7 @@ def mortals(*dies_at: int, frames: int = 40, **kwargs: Any) -> tuple[RestartingC
     def died(collector: Any, error: Exception) -> bool:
         return isinstance(error, Death)
 
-    return RestartingCollector(make, died, frames, **kwargs), made
+    return RestartingCollector(make, died, frames), made
 
 
 def test_the_frames_that_are_left_are_collected_after_each_death(capsys: Any) -> None:
@@ -100,12 +100,12 @@ def test_a_death_outside_of_collecting_is_noticed_too() -> None:
 
 
 def test_deaths_without_a_batch_between_them_end_in_an_error() -> None:
-    collector, made = mortals(2, 0, 0, 0, 0, max_deaths=2)
+    collector, made = mortals(2, 0, 0, 0, 0)
     with pytest.raises(
-        CollectorError, match=r"Death: at 0\), 3 times without a batch.*after 8 base"
+        CollectorError, match=r"Death: at 0\), 4 times without a batch.*after 8 base"
     ):
         list(collector)
-    assert len(made) == 3
+    assert len(made) == 4
 
 
 def test_any_other_error_is_raised_as_it_is() -> None:

@@ -26,10 +26,8 @@ OTHERS = {  # of other packages
 KNOWN = {
     *("_TensorClassMeta", "_alpha", "_alpha_loss"),
     *("_clear_weakrefs", "_compute_target_v2"),
-    *("_decode_state_dict_value", "_encode_state_dict_value", "_foreach_lerp_", "_get_str"),
-    *("_get_time_dim", "_get_tuple", "_modules", "_new_unsafe", "_optim_count"),
-    *("_reduce_loss", "_sources", "_targets", "_traj_pool", "_value_estimator"),
-    *("_version", "_wrapped_policy"),
+    *("_encode_state_dict_value", "_get_str", "_get_time_dim", "_get_tuple", "_modules"),
+    *("_new_unsafe", "_reduce_loss", "_value_estimator", "_version"),
 }
 
 

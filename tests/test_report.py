@@ -230,10 +230,6 @@ def test_a_page_can_be_written_where_no_run_was_recorded(tmp_path) -> None:
     assert "<code>a</code>" in (tmp_path / "index.html").read_text()
 
 
-def test_the_bootstrap_interval_of_one_seed_is_its_value() -> None:
-    assert bootstrap([3.0]) == (3.0, 3.0, 3.0)
-
-
 def test_the_bootstrap_covers_the_mean_about_as_often_as_it_says() -> None:
     generator = np.random.default_rng(1)
     samples = generator.normal(5.0, 2.0, size=(100, 30))

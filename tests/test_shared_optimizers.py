@@ -64,17 +64,6 @@ def test_a_shared_optimiser_steps_as_one_that_is_not(
     assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
 
 
-def test_a_loaded_state_is_shared_again_and_kept() -> None:
-    first, second = (nn.Parameter(torch.tensor([1.0, 2.0])) for _ in range(2))
-    trained, fresh = (share_optimizer(torch.optim.Adam([p], lr=0.1)) for p in (first, second))
-    step_through(trained, first)
-    fresh.load_state_dict(trained.state_dict())
-    share_optimizer(fresh)
-    assert fresh.state[second]["step"].item() == 3.0
-    assert fresh.state[second]["exp_avg"].is_shared()
-    assert torch.equal(fresh.state[second]["exp_avg"], trained.state[first]["exp_avg"])
-
-
 def test_a_parameter_without_gradient_stays() -> None:
     parameters = [nn.Parameter(torch.ones(1)) for _ in range(2)]
     optimizer = SharedRMSprop(parameters, lr=0.1)

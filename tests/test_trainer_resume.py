@@ -111,16 +111,6 @@ def test_a_checkpoint_holds_no_pickle_and_nothing_of_the_memory_that_the_buffer_
     assert not any(tensor.any() for tensor in again[32:].values(True, True))
 
 
-def test_the_newest_checkpoint_of_a_folder_is_loaded_and_old_ones_are_removed(
-    tmp_path: Path,
-) -> None:
-    make_trainer(96, save_dir=tmp_path, keep_last=2, save_trainer_interval=15).train()
-    assert len(CheckpointRotation(tmp_path, keep_last=2).checkpoints()) == 2
-    assert make_trainer(96).load(tmp_path).collected_frames == 96
-    oldest = CheckpointRotation(tmp_path, keep_last=2).checkpoints()[0]
-    assert make_trainer(96).load(oldest).collected_frames == 80
-
-
 def test_a_finished_run_can_be_given_more_base_steps(tmp_path: Path) -> None:
     make_trainer(32, save_dir=tmp_path).train()
     trainer = make_trainer(64).load(tmp_path)

@@ -14,6 +14,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+_MAX_DEATHS = 3  # with no batch between them that are borne
+
 
 class CollectorError(RuntimeError):
     """Processes that collect died again and again.
@@ -49,10 +51,10 @@ class RestartingCollector:
         died: called with the collector and what it raised, it tells whether a process of it died.
             Anything else is raised as it is.
         total_frames: base steps in all.
-        max_deaths: deaths with no batch between them that are borne. Default 3.
 
     Raises:
-        CollectorError: when collecting, saving or sending weights, after more deaths than that.
+        CollectorError: when collecting, saving or sending weights, after four deaths with no batch
+            between them.
     """
 
     def __init__(
@@ -60,11 +62,9 @@ class RestartingCollector:
         make: Callable[[int, int], Any],
         died: Callable[[Any, Exception], bool],
         total_frames: int,
-        *,
-        max_deaths: int = 3,
     ) -> None:
         self._make, self._died = make, died
-        self.total_frames, self.max_deaths = total_frames, max_deaths
+        self.total_frames = total_frames
         self.collected_frames = self.num_restarts = 0
         self._deaths = 0
         self._collector = make(total_frames, 0)
@@ -117,7 +117,7 @@ class RestartingCollector:
                 self._collector.shutdown()
             cause = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}".rstrip(": ")
             what = f"A process that collects died ({cause})"
-            if self._deaths > self.max_deaths:
+            if self._deaths > _MAX_DEATHS:
                 raise CollectorError(
                     f"{what}, {self._deaths} times without a batch between them, after "
                     f"{self.collected_frames} base steps. Look for what ends it: too little "
@@ -141,7 +141,6 @@ def make_ray_collector(
     total_frames: int,
     postproc: Callable[[TensorDictBase], TensorDictBase] | None = None,
     num_collectors: int = 1,
-    num_cpus: int | None = None,
     **collector_kwargs: Any,
 ) -> RestartingCollector:
     """Build TorchRL's ``RayCollector``, for the ``make_collector`` of ``DIAYNTrainer``.
@@ -158,7 +157,6 @@ def make_ray_collector(
         total_frames: steps in all.
         postproc: applied to every batch here. Default: none.
         num_collectors: processes that collect. Default 1.
-        num_cpus: cores of a cluster that is started here. Default: one per collector.
         **collector_kwargs: of the ``Collector`` in each process.
 
     Raises:
@@ -170,7 +168,7 @@ def make_ray_collector(
     trust_policy = bool(collector_kwargs.pop("trust_policy", True))
     if not ray.is_initialized():
         address = os.environ.get("RAY_ADDRESS")
-        own: dict[str, Any] = {"num_cpus": num_cpus or num_collectors, "include_dashboard": False}
+        own: dict[str, Any] = {"num_cpus": num_collectors, "include_dashboard": False}
         ray.init(
             address=address,
             ignore_reinit_error=True,

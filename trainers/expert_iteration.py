@@ -296,13 +296,13 @@ class ExpertIterationTrainer(OffPolicyTrainer):
             **trainer_kwargs,
         )
         self.network, self.planner = network, planner
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations * updates)
-        LRSchedulerHook(schedule, interval="optim").register(self)
+        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations * updates)
+        LRSchedulerHook(self.schedule, interval="optim").register(self)
         self.register_op("post_optim", self.move_progress)
 
     def progress_position(self) -> int:
         """Return the number of updates."""
-        return int(self._optim_count)
+        return int(self.schedule.last_epoch)
 
     def progress_figures(self) -> dict[str, str]:
         counts, searches = self.collector, self.collector.searches

@@ -29,6 +29,8 @@ from torchrl_hmcts.trainers.skills.rounds import PlanningRounds, RoundRecords, s
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
 
 _OWNER = "HMCTSTrainer"
+_PASSED_ON = ("batch_size", "buffer_size", "clip_norm", "target_tau", "progress", "save_dir")
+_KEPT = ("option_steps", "c_p", "updates_per_step", "dataset_fraction")  # when it is resumed
 
 
 class HMCTSTrainer(OffPolicyTrainer):
@@ -130,6 +132,9 @@ class HMCTSTrainer(OffPolicyTrainer):
         ([0, 2], [0, 1])
     """
 
+    _trained_steps = 0  # base steps of S at the latest training
+    _test_env: EnvBase | None = None
+
     def __init__(
         self,
         make_env: Callable[[], EnvBase],
@@ -165,70 +170,46 @@ class HMCTSTrainer(OffPolicyTrainer):
         seed: int = 0,
         **trainer_kwargs: Any,
     ) -> None:
-        _check(locals())
-        keys = list(loss_module.in_keys)
+        _check(given := dict(locals()))
+        keys, actor = list(loss_module.in_keys), loss_module.actor_network
         self.dataset = load_dataset(dataset, keys)
-        actor = loss_module.actor_network
         worker = SkillPolicy(actor) if worker is None else worker
-        test_worker = SkillPolicy(actor, deterministic=True) if test_worker is None else test_worker
         num_skills = getattr(worker, "num_skills", None) or actor.num_skills
         macro = _MacroEnvs(make_options, make_recorder, keys, num_skills, option_steps)
-        if make_planner is None:
-            make_planner = partial(MCTSPlanner, budget=SearchBudget(expansions=50))
-        if reward is None:
-            reward = SkillReward(loss_module.objective)
-        if save_dir is not None:
-            trainer_kwargs.setdefault("save_trainer_interval", 0)
+        make_planner = make_planner or partial(MCTSPlanner, budget=SearchBudget(expansions=50))
         collector = PlanningRounds(
-            macro.recorded(worker, make_env, "make_env"),
-            macro.recorded(worker, make_env, "make_env"),
+            macro.recorded(worker, make_env),
+            macro.recorded(worker, make_env),
             partial(make_planner, tree_policy=UCT(c_p)),
             num_init_samples=num_init_samples,
             interval=retrain_interval,
             rounds=rounds - num_init_samples,
             seed=seed,
         )
+        reward = SkillReward(loss_module.objective) if reward is None else reward
+        union = {"dataset": self.dataset, "batch_size": batch_size, "fraction": dataset_fraction}
         super().__init__(
             lambda: collector,
             loss_module,
             make_skill_optimizer(loss_module) if optimizer is None else optimizer,
             total_frames=2**62 if total_frames is None else total_frames,
             optim_steps_per_batch=1,  # set before every training
-            batch_size=batch_size,
-            buffer_size=buffer_size,
-            clip_norm=clip_norm,
-            target_tau=target_tau,
-            sample=partial(
-                sample_union,
-                dataset=self.dataset,
-                batch_size=batch_size,
-                fraction=dataset_fraction,
-                reward=reward,
-            ),
-            settings={
-                "option_steps": option_steps,
-                "c_p": c_p,
-                "updates_per_step": updates_per_step,
-                "dataset_fraction": dataset_fraction,
-            },
-            progress=progress,
+            sample=partial(sample_union, reward=reward, **union),
+            settings={name: given[name] for name in _KEPT},
             progress_total=collector.rounds,
-            save_dir=save_dir,
-            **{"log_interval": -1, **trainer_kwargs},
+            **{name: given[name] for name in _PASSED_ON},
+            **{"log_interval": -1, "save_trainer_interval": 0, **trainer_kwargs},
         )
         self.seed = seed
         self.retrain_interval, self.test_interval = retrain_interval, test_interval
         self.updates_per_step, self.pretrain_updates = updates_per_step, pretrain_updates
+        self.records, self.test_records = collector.records, RoundRecords()
         self.retrained_at: list[int] = []  # the t of every training
-        self._trained_steps = 0  # base steps of S at the latest training
-        self.records = collector.records
-        self.test_records = RoundRecords()
-        self._planner_for_tests = partial(
-            make_test_planner or make_planner, tree_policy=UCT(c_p), seed=seed
-        )
-        self._test_env: EnvBase | None = None
+        make_test_planner = make_test_planner or make_planner
+        self._planner_for_tests = partial(make_test_planner, tree_policy=UCT(c_p), seed=seed)
         if make_test_env is not None:
-            self._test_env = macro.plain(test_worker, make_test_env, "make_test_env")
+            acts = SkillPolicy(actor, deterministic=True) if test_worker is None else test_worker
+            self._test_env = macro.plain(acts, make_test_env, "make_test_env")
             self._test_env.set_seed(seed)
             self._test_starts = self._test_env.reset(TensorDict(batch_size=[test_rounds]))
         self.register_op("setup", self._begin)
@@ -322,11 +303,9 @@ class _MacroEnvs:
         options = made_by(self.make_options, _OWNER, "make_options", *args, trajectory_keys=keys)
         return TransformedEnv(base, options if recorder is None else Compose(options, recorder))
 
-    def recorded(
-        self, worker: Any, make_env: Callable[[], EnvBase], argument: str
-    ) -> TransformedEnv:
+    def recorded(self, worker: Any, make_env: Callable[[], EnvBase]) -> TransformedEnv:
         recorder = made_by(self.make_recorder, _OWNER, "make_recorder", OptionRecorder, self.keys)
-        return self.plain(worker, make_env, argument, recorder)
+        return self.plain(worker, make_env, "make_env", recorder)
 
 
 def _check(given: Mapping[str, Any]) -> None:

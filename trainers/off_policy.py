@@ -7,7 +7,7 @@ from types import NoneType
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch.optim import Optimizer
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
@@ -154,7 +154,13 @@ class OffPolicyTrainer(ResumableTrainer):
 class _SoftUpdate(SoftUpdate):
     """Moves all targets in one call: 41 us an update instead of 171 in the demo."""
 
+    def __init__(self, loss_module: LossModule, tau: float) -> None:
+        super().__init__(loss_module, tau=tau)
+        params = {n: m for n, m in loss_module.named_children() if n.endswith("_params")}
+        moved = [name for name in params if name.startswith("target_")]
+        self.targets = TensorDict({name: params[name] for name in moved})
+        self.sources = TensorDict({name: params[name.removeprefix("target_")] for name in moved})
+
     @torch.no_grad()
     def step(self) -> None:
-        targets = list(self._targets.values(True, True))
-        torch._foreach_lerp_(targets, list(self._sources.values(True, True)), 1.0 - self.eps)
+        self.targets.lerp_(self.sources, 1.0 - self.eps)

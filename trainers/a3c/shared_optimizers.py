@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from torchrl_hmcts.checks import real_number
@@ -163,3 +163,41 @@ class SharedRMSprop(Optimizer):
                 # The mean is read once: another process may be writing it.
                 parameter.addcdiv_(gradient, (mean + group["eps"]).sqrt_(), value=-group["lr"])
         return loss
+
+
+def share_over(optimizer: Optimizer, parameters: list[nn.Parameter]) -> Optimizer:
+    """Share an optimiser over parameters of a loss; its groups know their first lr."""
+    known = {id(p) for p in parameters}
+    held = [p for group in optimizer.param_groups for p in group["params"]]
+    foreign = sum(id(p) not in known for p in held)
+    if foreign:
+        raise ValueError(
+            f"{foreign} of the optimiser's {len(held)} parameters are not the loss's. Build it "
+            "over loss_module.parameters()."
+        )
+    for group in share_optimizer(optimizer).param_groups:
+        group.setdefault("initial_lr", group["lr"])
+    return optimizer
+
+
+class OptimizerState:
+    """An optimiser's state and settings, which stay in shared memory when they are loaded."""
+
+    def __init__(self, optimizer: Optimizer) -> None:
+        self.optimizer = optimizer
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.optimizer.state_dict()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        saved, own = (
+            sorted({key for entry in state["state"].values() for key in entry})
+            for state in (state_dict, self.optimizer.state_dict())
+        )
+        if saved != own:
+            raise ValueError(
+                f"the checkpoint's optimiser has the state {saved}, this one, "
+                f"{type(self.optimizer).__name__}, has {own}. Continue with the same optimiser."
+            )
+        self.optimizer.load_state_dict(dict(state_dict))
+        share_optimizer(self.optimizer)  # loading has put new tensors in place of the shared ones

@@ -33,7 +33,7 @@ from torchrl_hmcts.trainers.a3c.actor_learner import (
 )
 from torchrl_hmcts.trainers.a3c.learner_log import LearnerLog
 from torchrl_hmcts.trainers.a3c.learner_processes import LearnerProcesses
-from torchrl_hmcts.trainers.a3c.shared_optimizers import SharedRMSprop, share_optimizer
+from torchrl_hmcts.trainers.a3c.shared_optimizers import OptimizerState, SharedRMSprop, share_over
 from torchrl_hmcts.trainers.off_policy import made_by
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
@@ -226,7 +226,11 @@ class A3CTrainer:
             configure_learner=configure_learner,
         )
         parameters = trained_parameters(loss_module)
-        self.optimizer = _make_optimizer(optimizer, parameters, lr)
+        if isinstance(optimizer, str):
+            optimizer = partial(_OPTIMIZERS[_known("optimizer", optimizer, _OPTIMIZERS)], lr=lr)
+        if not isinstance(optimizer, Optimizer):
+            optimizer = made_by(optimizer, _OWNER, "optimizer", Optimizer, parameters)
+        self.optimizer = share_over(optimizer, parameters)
         columns = board_columns(loss_module)
         board = torch.zeros(max(1, num_learners), len(columns), dtype=torch.float64)
         stop = torch.zeros(1, dtype=torch.uint8)
@@ -249,7 +253,7 @@ class A3CTrainer:
         }
         self._checkpoint = plain_checkpoint(
             loss_module=loss_module,
-            optimizer=_OptimizerState(self.optimizer),
+            optimizer=OptimizerState(self.optimizer),
             counters=self.log,
             history=HistoryState(self.log),  # type: ignore[arg-type]
         )
@@ -443,29 +447,6 @@ class A3CTrainer:
         return self._accepted is not None
 
 
-class _OptimizerState:
-    """An optimiser's state and settings, which stay in shared memory when they are loaded."""
-
-    def __init__(self, optimizer: Optimizer) -> None:
-        self.optimizer = optimizer
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.optimizer.state_dict()
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        saved, own = (
-            sorted({key for entry in state["state"].values() for key in entry})
-            for state in (state_dict, self.optimizer.state_dict())
-        )
-        if saved != own:
-            raise ValueError(
-                f"the checkpoint's optimiser has the state {saved}, this one, "
-                f"{type(self.optimizer).__name__}, has {own}. Continue with the same optimiser."
-            )
-        self.optimizer.load_state_dict(dict(state_dict))
-        share_optimizer(self.optimizer)  # loading has put new tensors in place of the shared ones
-
-
 def _check(given: Mapping[str, Any]) -> None:
     """Refuses arguments of the constructor that make no sense."""
     for name in ("total_frames", "segment_steps", "log_interval"):
@@ -497,28 +478,6 @@ def _check(given: Mapping[str, Any]) -> None:
         )
     if given["stop_when"] is not None and given["evaluate"] is None:
         raise ValueError("stop_when looks at what evaluate returns; pass evaluate too.")
-
-
-def _make_optimizer(
-    optimizer: str | MakeOptimizer | Optimizer, parameters: list[nn.Parameter], lr: float
-) -> Optimizer:
-    """Returns a shared optimiser over parameters of the loss, whose groups know their first lr."""
-    if isinstance(optimizer, str):
-        optimizer = _OPTIMIZERS[_known("optimizer", optimizer, _OPTIMIZERS)](parameters, lr=lr)
-    elif not isinstance(optimizer, Optimizer):
-        optimizer = made_by(optimizer, _OWNER, "optimizer", Optimizer, parameters)
-    known = {id(p) for p in parameters}
-    held = [p for group in optimizer.param_groups for p in group["params"]]
-    foreign = sum(id(p) not in known for p in held)
-    if foreign:
-        raise ValueError(
-            f"{foreign} of the optimiser's {len(held)} parameters are not the loss's. Build it "
-            "over loss_module.parameters()."
-        )
-    share_optimizer(optimizer)
-    for group in optimizer.param_groups:
-        group.setdefault("initial_lr", group["lr"])
-    return optimizer
 
 
 def _known(name: str, value: Any, known: Collection[str]) -> str:

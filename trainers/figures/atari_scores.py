@@ -139,7 +139,7 @@ def human_normalised(row: Row, key: str) -> float:
     return float((row[key] - random) / (human - random))
 
 
-def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[float, float, float]:
+def aggregate(scores: Sequence[Sequence[float]]) -> tuple[float, float, float]:
     """Return the interquartile mean over games and seeds with its stratified 95 % interval.
 
     Each game counts as much as another, however many seeds it has: ``scores`` are human-normalised,
@@ -162,7 +162,7 @@ def aggregate(scores: Sequence[Sequence[float]], draws: int = 5_000) -> tuple[fl
         equal = [game.repeat(often // game.shape[-1], -1) for game in samples]
         return interquartile_mean(np.concatenate(equal, -1))
 
-    means = mean([generator.choice(np.array(g), size=(draws, len(g))) for g in scores])
+    means = mean([generator.choice(np.array(g), size=(5_000, len(g))) for g in scores])
     middle = float(mean([np.array(g) for g in scores]))
     low, high = np.percentile(means, [2.5, 97.5])
     return middle, float(low), float(high)

@@ -21,7 +21,7 @@ from torchrl_hmcts.trainers.figures.pages import (
     write_sections,
 )
 from torchrl_hmcts.trainers.figures.pictures import COLORS, refuse_foreign
-from torchrl_hmcts.trainers.figures.run_page import config_tables, damage_of, say_damage
+from torchrl_hmcts.trainers.figures.run_page import config_tables, damage_of, facts_of, say_damage
 from torchrl_hmcts.trainers.saving.files import left_out
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder, flat, is_run
 
@@ -220,18 +220,14 @@ def _config(group: RunGroup) -> Section:
 
 
 def _runs(runs: Sequence[RunFolder]) -> Table:
-    rows = []
-    for run in runs:
-        machine = run.record.get("machine") or {}
-        versions = run.record.get("versions") or {}
-        rows.append(
-            [
-                run.name,
-                str(run.seed),
-                run.status or ("finished" if run.finished else "unknown"),
-                Cell(" ; ".join(run.record.get("commands", [])) or "-", code=True),
-                ", ".join(f"{name} {version}" for name, version in versions.items()),
-                f"{machine['cpus']} CPUs, {machine['platform']}" if machine else "-",
-            ]
-        )
+    rows = [
+        [
+            run.name,
+            str(run.seed),
+            run.status or ("finished" if run.finished else "unknown"),
+            Cell(" ; ".join(run.record.get("commands", [])) or "-", code=True),
+            *(fact or "-" for fact in facts_of(run).values()),
+        ]
+        for run in runs
+    ]
     return Table(rows, ["folder", "seed", "status", "command", "versions", "machine"])

@@ -137,15 +137,13 @@ class LabMap:
         seen = draw_first_person(self.env, state, width=height * 4 // 3, height=height)
         return np.concatenate((above, seen), 1)
 
-    def rooms(
-        self, num: int, maze: int = 0, seed: int = 0
-    ) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
+    def rooms(self, num: int, maze: int = 0) -> dict[str, tuple[MapDrawing, TensorDictBase]]:
         """Return an open room and a maze, with states in their middle.
 
         Each state has a heading of its own: a skill is a direction on the map, whichever way the
         player faces.
         """
-        generator = np.random.default_rng(seed)
+        generator = np.random.default_rng(0)
         layout = self.env.layout
         rows, columns = layout.rows, layout.columns
         inside = "*" + " " * (columns - 2) + "*"

@@ -110,12 +110,7 @@ def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
             if len(curve.steps) > 1
         ]
     files = run.pictures.items()
-    machine = run.record.get("machine") or {}
-    facts = {
-        "versions": ", ".join(f"{k} {v}" for k, v in (run.record.get("versions") or {}).items()),
-        "machine": f"{machine['cpus']} CPUs, {machine['platform']}" if machine else "",
-        "status": run.status,
-    }
+    facts = {**facts_of(run), "status": run.status}
     resume = []
     if not run.finished and "out" in run.config:
         resume = [f"hmcts train {shlex.quote('resume=' + shown_path(str(run.config['out'])))}"]
@@ -136,6 +131,16 @@ def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
             tables=[Table(known)] if known else [],
         ),
     ]
+
+
+def facts_of(run: RunFolder) -> dict[str, str]:
+    """Return the versions and the machine of a run; empty where they are unknown."""
+    machine = run.record.get("machine") or {}
+    versions = run.record.get("versions") or {}
+    return {
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+        "machine": f"{machine['cpus']} CPUs, {machine['platform']}" if machine else "",
+    }
 
 
 def damage_of(run: RunFolder) -> list[str]:

@@ -10,6 +10,7 @@ nothing in a checkpoint can be executed.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import re
 import shutil
@@ -27,19 +28,16 @@ from torchrl.checkpoint import (
     CheckpointRotation,
     StateDictCheckpointAdapter,
 )
-from torchrl.checkpoint._checkpoint import (  # its format, our reading and writing
-    _decode_state_dict_value,
-    _encode_state_dict_value,
-)
+from torchrl.checkpoint._checkpoint import _encode_state_dict_value  # its format, our writing
 
 from torchrl_hmcts import __version__
 from torchrl_hmcts.trainers.saving.files import remove, remove_leftovers, replacing
 from torchrl_hmcts.trainers.saving.sealing import (
     CHECKPOINT_VERSION,
     NewerCheckpointError,
+    check_lengths,
     check_settings,
     find_damage,
-    read_arrays,
     read_manifest,
     seal,
 )
@@ -99,10 +97,8 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
                     f"the checkpoint holds {file.name!r}, and only JSON and plain arrays are "
                     "read: other files could execute code. It was not written by this package."
                 )
-        schema = json.loads((path / self.schema_filename).read_text(encoding="utf-8"))
-        arrays = read_arrays(path / self.state_directory)
-        state = _decode_state_dict_value(schema, arrays, map_location)
-        component.load_state_dict(state, *options["args"], **options["kwargs"])
+        check_lengths(path / self.state_directory)
+        super().load(component, path, map_location=map_location, **options)
 
 
 class _PlainCheckpoint(Checkpoint):
@@ -197,7 +193,6 @@ class DurableRotation(CheckpointRotation):
         self.overwrite = overwrite
         self._began = False
         self._others: tuple[Path, ...] = ()  # of another run, which is overwritten
-        self._good: dict[Path, tuple[int, ...]] = {}  # which files were found whole
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.directory):
@@ -251,7 +246,6 @@ class DurableRotation(CheckpointRotation):
             _write(checkpoint, final, {**(metadata or {}), "torchrl_hmcts": ours}, **chosen)
         except OSError as error:
             raise OSError(error.errno, self._not_written(step, error)) from error
-        self._good[final] = _identity(final)
         for path in set(self._others) - {final}:
             remove(path)
         self._others = ()
@@ -275,21 +269,10 @@ class DurableRotation(CheckpointRotation):
         for path in reversed(self.checkpoints()):
             if whole == self.keep_last:
                 remove(path)
-                self._good.pop(path, None)
                 removed.append(path)
             else:
-                whole += self._is_good(path)
+                whole += _is_good(path, _identity(path))
         return tuple(removed)
-
-    def _is_good(self, path: Path) -> bool:
-        if self._good.get(path) != _identity(path):
-            try:
-                if find_damage(path) is not None:
-                    return False
-            except NewerCheckpointError:  # not ours to judge, and not to remove
-                return False
-            self._good[path] = _identity(path)
-        return True
 
     def _not_written(self, step: int, error: OSError) -> str:
         kept = [path.name for path in self.checkpoints()]
@@ -380,6 +363,14 @@ def _check_whole(path: Path) -> None:
             f"The checkpoint {str(path)!r} is damaged ({damage}). Pass its folder to continue from "
             "the newest one that is whole."
         )
+
+
+@functools.lru_cache(maxsize=64)
+def _is_good(path: Path, identity: tuple[int, ...]) -> bool:
+    try:
+        return find_damage(path) is None
+    except NewerCheckpointError:  # not ours to judge, and not to remove
+        return False
 
 
 def _identity(path: Path) -> tuple[int, ...]:

@@ -15,7 +15,7 @@ except ImportError:  # no POSIX system
     fcntl = None  # type: ignore[assignment]
 
 LOCK_NAME = ".lock"
-_held: dict[int, Path] = {}  # open files of locks that this process holds
+_held: set[int] = set()  # open files of locks that this process holds
 
 
 class FolderInUse(RuntimeError):
@@ -66,7 +66,7 @@ def folder_locked(
         yield
     finally:
         if handle is not None:
-            _held.pop(handle, None)
+            _held.discard(handle)
             with contextlib.suppress(OSError):
                 path.unlink()  # while it is ours
             with contextlib.suppress(OSError):  # closed by a fork
@@ -114,7 +114,7 @@ def _take(path: Path, wait: bool) -> int | None:
                 os.truncate(handle, 0)
                 since = time.strftime("%Y-%m-%d %H:%M:%S")
                 os.write(handle, f"process {os.getpid()}, since {since},".encode())
-                _held[handle] = path
+                _held.add(handle)
                 return handle
         os.close(handle)
 

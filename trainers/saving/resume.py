@@ -125,8 +125,8 @@ class ResumableTrainer(Trainer):
         if isinstance(collector, Collector):
             self._episodes = RunningEpisodes(collector)
             self.register_module("running_episodes", self._episodes)
-            policy = collector._wrapped_policy  # the one that acts
-            self.register_module("generators", GeneratorStates(env=collector.env, policy=policy))
+            generators = GeneratorStates(env=collector.env, policy=collector.policy)
+            self.register_module("generators", generators)
 
     @property
     def history(self) -> dict[str, list[float]]:
@@ -163,14 +163,19 @@ class ResumableTrainer(Trainer):
         if self._episodes is not None:
             self._episodes.new_episodes = new_episodes
         self.load_from_file(found)
-        if not all(type(n) is int and n >= 0 for n in (self.collected_frames, self._optim_count)):
+        frames, updates = self.collected_frames, self._num_updates()
+        if not all(type(n) is int and n >= 0 for n in (frames, updates)):
             raise CheckpointError(
-                f"The checkpoint {str(found)!r} has {self.collected_frames!r} base steps and "
-                f"{self._optim_count!r} updates, which are no counts. Load an older one."
+                f"The checkpoint {str(found)!r} has {frames!r} base steps and {updates!r} "
+                "updates, which are no counts. Load an older one."
             )
         if isinstance(self.checkpoint_rotation, DurableRotation):
             self.checkpoint_rotation.continue_from(found)
         return self
+
+    def _num_updates(self) -> int:
+        count: int = self.state_dict()["state"]["_optim_count"]
+        return count
 
     def train(self) -> None:
         """Train until ``total_frames`` are collected.
@@ -238,7 +243,7 @@ class ResumableTrainer(Trainer):
         """Return the error of a figure that is not finite, which names the last checkpoint."""
         again = self.last_good_checkpoint()
         return FloatingPointError(
-            f"{name} is {float(value)} in update {self._optim_count}, after "
+            f"{name} is {float(value)} in update {self._num_updates()}, after "
             f"{self.collected_frames} base steps. The update was not applied. {again} Look for "
             "rewards or observations that are not finite, or lower the learning rate."
         )

@@ -127,9 +127,7 @@ def read_run(path: str | Path) -> RunFolder:
             "folder that was given as out=DIR."
         )
     if not record:  # of a run that was not started by the command line
-        config = metrics.get("config", {})
-        record = {"config": config}
-        record["versions"] = metrics.get("versions", {})
+        record = {name: metrics.get(name, {}) for name in ("config", "versions")}
     page = _json(path / "page.json", damage, pictures=dict, title=str)
     captions = page.get("pictures")
     if captions is None:

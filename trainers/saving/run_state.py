@@ -78,8 +78,8 @@ class RunningEpisodes:
             "entries": carrier.to_dict(convert_tensors=False),
         }
         if self.collector.track_traj_ids:
-            # The numbers of episodes; put back once the collector has loaded, see below.
-            state["traj_pool"] = self.collector._traj_pool.state_dict()
+            # The number of the next episode; put back once the collector has loaded, see below.
+            state["traj_pool"] = self.collector.state_dict()["traj_pool"]
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
@@ -108,12 +108,14 @@ class RunningEpisodes:
                 f"The checkpoint has episodes of an env of batch size {list(saved)}; this one has "
                 f"{list(old.batch_size)}. Resume with as many copies as before."
             )
+        if "traj_pool" in state_dict and self.collector.track_traj_ids:
+            # Whenever a collector loads, it numbers an episode of each copy that it would begin.
+            next_id = state_dict["traj_pool"]["traj_id"] - self.collector.n_env
+            pool = {"traj_pool": {"traj_id": next_id}}
+            self.collector.load_state_dict({**self.collector.state_dict(), **pool}, strict=False)
         self.collector._carrier = TensorDict(
             dict(state_dict["entries"]), batch_size=saved, device=old.device
         )
-        if "traj_pool" in state_dict and self.collector.track_traj_ids:
-            # The collector's own load has given out numbers for the episodes it would have begun.
-            self.collector._traj_pool.load_state_dict(state_dict["traj_pool"])
 
 
 class GeneratorStates:

@@ -14,7 +14,7 @@ import os
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -136,30 +136,20 @@ def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
         )
 
 
-def read_arrays(folder: Path) -> dict[str, torch.Tensor]:
-    """Read the arrays of a component, as TorchRL writes them, with ordinary reads.
-
-    TorchRL's own reader picks a class by a name in ``meta.json`` and may unpickle other files.
-    """
-    arrays = {}
-    for key, (dtype, shape, file, size) in _array_files(folder).items():
-        data = bytearray(file.read_bytes()[:size]) if size else bytearray()
-        if len(data) < size:
-            raise CheckpointError(f"{file.name} is cut off: {len(data)} bytes of {size}")
-        flat = torch.frombuffer(data, dtype=dtype) if size else torch.empty(0, dtype=dtype)
-        arrays[key] = flat.reshape(shape)
-    return arrays
+def check_lengths(folder: Path) -> None:
+    """Refuse arrays that are shorter than they say."""
+    for size, file in _array_files(folder):
+        if file.stat().st_size < size:
+            raise CheckpointError(f"{file.name} of {folder.parent.name} is cut off")
 
 
-def _array_files(folder: Path) -> dict[str, tuple[torch.dtype, list[int], Path, int]]:
-    """Type, shape, file and bytes of each array."""
-    found = {}
+def _array_files(folder: Path) -> Iterator[tuple[int, Path]]:
+    """Yield bytes and file of each array."""
     for key, entry in json.loads((folder / "meta.json").read_text(encoding="utf-8")).items():
         if isinstance(entry, dict) and "dtype" in entry:
             dtype = getattr(torch, entry["dtype"].removeprefix("torch."))
             size = math.prod(entry["shape"]) * dtype.itemsize
-            found[key] = (dtype, entry["shape"], folder / f"{Path(key).name}.memmap", size)
-    return found
+            yield size, folder / f"{Path(key).name}.memmap"
 
 
 def _digest(file: Any, end: int) -> bytes:
@@ -223,7 +213,5 @@ def _folder_damage(folder: Path, manifest: Mapping[str, Any]) -> str | None:
         if file.is_symlink() or not file.is_file():
             return f"{name} is {'a link' if file.is_symlink() else 'missing'}"
         if file.name == "meta.json":
-            for _, _, array, size in _array_files(file.parent).values():
-                if array.stat().st_size < size:
-                    return f"{array.name} of {file.parent.parent.name} is cut off"
+            check_lengths(file.parent)
     return None

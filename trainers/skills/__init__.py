@@ -1,3 +1,3 @@
-"""What the trainers of skills are made of: data, curves, coverage, growth, terminations."""
+"""What the trainers of skills are made of: data, rounds, curves, coverage, control, growth."""
 
 __all__: list[str] = []  # what is public is exported by torchrl_hmcts.trainers
