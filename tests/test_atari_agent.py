@@ -116,7 +116,7 @@ def test_a_short_run_of_two_processes_leaves_its_figures(tmp_path) -> None:
     with (tmp_path / "curves.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {"score", "score_max"} <= {row["name"] for row in rows}
-    assert int(rows[0]["step"]) * 4 == pytest.approx(metrics["episodes"][0]["frames"], abs=4)
+    assert int(rows[0]["base_steps"]) * 4 == pytest.approx(metrics["episodes"][0]["frames"], abs=4)
     for name in ("index.html", "scores.png", "episode.gif"):
         assert (tmp_path / name).stat().st_size > 100
     checkpoints = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())

@@ -196,7 +196,7 @@ def test_without_the_module_it_says_what_to_install(monkeypatch: pytest.MonkeyPa
     [
         ({"maze_seeds": []}, "needs maze_seeds"),
         ({"maze_seeds": [-1]}, r"0 to 2\*\*31 - 1; got \[-1\]"),
-        ({"num_steps": 0}, "num_steps from 1"),
+        ({"num_steps": 0}, "num_steps >= 1"),
         ({"observations": {"SONAR": "sonar"}}, r"SONAR"),
         ({"observations": {"VEL.ROT": "velocity"}}, "'velocity', which is taken"),
         ({"observations": {"INSTR": "instruction"}}, "numbers of a fixed shape"),

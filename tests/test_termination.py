@@ -121,7 +121,7 @@ class TestStallTransform:
     def test_what_it_cannot_do_is_refused(self):
         with pytest.raises(ValueError, match="tolerance >= 0.*got -1"):
             StallTransform("state", -1)
-        with pytest.raises(KeyError, match="'place', which the env before it does not have"):
+        with pytest.raises(KeyError, match="'place', which the env before it does not write"):
             check_env_specs(TransformedEnv(ChainEnv(6), StallTransform("place")))
         with pytest.raises(KeyError, match="missing from the tensordict to step"):
             StallTransform("x")._step(TensorDict(), TensorDict(x=torch.zeros(1)))

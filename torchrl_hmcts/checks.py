@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,15 +22,19 @@ def whole_number(owner: str, name: str, value: Any, *, least: int = 0) -> int:
         TypeError: if it is no integer: text, a bool or a float, 1e3 included.
         ValueError: if it is smaller.
     """
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, numbers.Integral):
+    try:
+        number = None if isinstance(value, (bool, np.bool_)) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None:
         hint = f" Write {int(value)}." if isinstance(value, float) and value.is_integer() else ""
         raise TypeError(
             f"{owner} needs a whole number for {name}; got {value!r}, a {type(value).__name__}."
             f"{hint}"
         )
-    if value < least:
-        raise ValueError(f"{owner} needs {name} >= {least}; got {value}.")
-    return min(int(value), NO_LIMIT)
+    if number < least:
+        raise ValueError(f"{owner} needs {name} >= {least}; got {number}.")
+    return min(number, NO_LIMIT)
 
 
 def real_number(

@@ -6,7 +6,7 @@ Letters: *B batch of the tensordict, n its elements, M mazes, R rows and C colum
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -181,7 +181,7 @@ class LabMazeEnv(MazeEnv):
         real_number(name, "clock_phase[1]", clock_phase[1], least=-100, most=100)
         instance(name, "read_outs", read_outs, tuple, list)
         instance(name, "mazes", mazes, tuple, list, type(None))
-        instance(name, "maze_seeds", maze_seeds, Sequence)
+        instance(name, "maze_seeds", maze_seeds, Iterable)
         instance(name, "actions", actions, Mapping, type(None))
         if mazes is None:
             mazes = [lab_maze(s, rows, columns) for s in maze_seeds]
