@@ -5,7 +5,8 @@
 In turns, for as many rounds as asked: a plain loop over the same env, with the same worker and an
 option drawn every 10 steps, and a search of :class:`MCTSPlanner` over an :class:`OptionPool`, which
 is planner, tree, snapshots and bookkeeping. CPU time is that of all processes. The figure is the
-ratio within a round, so that a busy machine slows both.
+ratio within a round, so that a busy machine slows both. Values are scaled, so that rewards of any
+size leave the tree as broad and its waves as full.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from torchrl.envs import GymWrapper
 from torchrl_hmcts.envs import OptionPool, SkillWorker
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.modules import SkillActor
-from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
+from torchrl_hmcts.planners import PUCT, MCTSPlanner, SearchBudget
 from torchrl_hmcts.processes import cpu_ticks
 
 ENVS: dict[str, dict[str, Any]] = {
@@ -85,7 +86,12 @@ class Planned:
         budget = SearchBudget(base_steps=steps, until_plan=False)
         waves = 2 if processes else 1
         self.planner = MCTSPlanner(
-            self.pool, expand="one", leaves_per_wave=192, waves_in_flight=waves, budget=budget
+            self.pool,
+            tree_policy=PUCT(normalize="siblings"),
+            expand="one",
+            leaves_per_wave=240 // waves,
+            waves_in_flight=waves,
+            budget=budget,
         )
         self.planner.search(self.pool.reset())  # starts the processes
 
