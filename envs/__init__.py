@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from torchrl_hmcts.arguments import name_all_arguments
 from torchrl_hmcts.envs.atari.goals import (
     ByteGoal,
     FollowGoals,
@@ -11,14 +10,13 @@ from torchrl_hmcts.envs.atari.goals import (
 )
 from torchrl_hmcts.envs.atari.pool import AtariOptionPool
 from torchrl_hmcts.envs.atari.ram import AtariRAMEnv
-from torchrl_hmcts.envs.atari.workers import OptionWorker, RepeatActions, SharedMLP
+from torchrl_hmcts.envs.atari.workers import RepeatActions, SharedMLP
+from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
+from torchrl_hmcts.envs.gym.option_pool import OptionPool
+from torchrl_hmcts.envs.gym.option_run import OptionWorker
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv
-from torchrl_hmcts.envs.gym.snapshots import (
-    AttributeSnapshot,
-    ReplaySnapshot,
-    Snapshot,
-    SnapshotError,
-)
+from torchrl_hmcts.envs.gym.skill_worker import SkillWorker
+from torchrl_hmcts.envs.gym.snapshots import ReplaySnapshot, Snapshot, SnapshotError
 from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
 from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS
 from torchrl_hmcts.envs.lab.deepmind_lab import DeepMindLabEnv
@@ -28,7 +26,6 @@ from torchrl_hmcts.envs.lab.mazes import lab_maze
 from torchrl_hmcts.envs.lab.recordings import replay_recording
 from torchrl_hmcts.envs.mazes.gridworld import GridworldMazeEnv
 from torchrl_hmcts.envs.mazes.layouts import (
-    check_mazes,
     free_tiles,
     generate_mazes,
     maze_from_text,
@@ -36,7 +33,6 @@ from torchrl_hmcts.envs.mazes.layouts import (
     maze_to_text,
     shortest_path,
     shortest_path_lengths,
-    wall_centers,
 )
 from torchrl_hmcts.envs.mazes.rendering import draw_maze
 from torchrl_hmcts.envs.mazes.waterworld import WaterworldMazeEnv
@@ -54,17 +50,18 @@ __all__ = [
     "LAB_ACTIONS",
     "LabMazeEnv",
     "OccasionalAction",
+    "OptionPool",
     "OptionWorker",
     "RepeatActions",
     "ReplaySnapshot",
     "SettableGymEnv",
     "SharedMLP",
+    "SkillWorker",
     "Snapshot",
     "SnapshotError",
     "StatelessSimulator",
     "TorchRLGymnasiumEnv",
     "WaterworldMazeEnv",
-    "check_mazes",
     "draw_first_person",
     "draw_maze",
     "free_tiles",
@@ -73,12 +70,9 @@ __all__ = [
     "maze_from_text",
     "maze_pool",
     "maze_to_text",
-    "register_envs",
     "replay_recording",
     "shortest_path",
     "shortest_path_lengths",
-    "wall_centers",
 ]
 
-name_all_arguments(globals(), __all__)
 register_envs()

@@ -16,12 +16,6 @@ from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
 from torchrl_hmcts.envs.mazes.gridworld import GridworldMazeEnv
 from torchrl_hmcts.envs.mazes.waterworld import WaterworldMazeEnv
 
-ENV_IDS = (
-    "torchrl_hmcts/WaterworldMaze-v0",
-    "torchrl_hmcts/GridworldMaze-v0",
-    "torchrl_hmcts/LabMaze-v0",
-)
-
 
 class TorchRLGymnasiumEnv(gymnasium.Env):
     """Present a stateless TorchRL env with a discrete action as a ``gymnasium.Env``.
@@ -133,45 +127,39 @@ def _box(spec: Any) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(low, high, dtype=low.dtype.type)
 
 
-def make_gridworld(render_mode: str | None = None, **kwargs: Any) -> TorchRLGymnasiumEnv:
-    """Make ``torchrl_hmcts/GridworldMaze-v0``; keywords go to :class:`GridworldMazeEnv`."""
-    return TorchRLGymnasiumEnv(GridworldMazeEnv(**kwargs), render_mode)
+def make_maze(name: str, render_mode: str | None = None, **kwargs: Any) -> TorchRLGymnasiumEnv:
+    """Make one of the registered envs; keywords go to its class.
 
-
-def make_waterworld(render_mode: str | None = None, **kwargs: Any) -> TorchRLGymnasiumEnv:
-    """Make ``torchrl_hmcts/WaterworldMaze-v0``; keywords go to :class:`WaterworldMazeEnv`."""
-    return TorchRLGymnasiumEnv(WaterworldMazeEnv(**kwargs), render_mode)
-
-
-def make_lab_maze(render_mode: str | None = None, **kwargs: Any) -> TorchRLGymnasiumEnv:
-    """Make ``torchrl_hmcts/LabMaze-v0``; keywords go to :class:`LabMazeEnv`.
-
-    The read-outs are ``"observation"`` and those asked for.
+    The read-outs of the lab maze are ``"observation"`` and those asked for.
     """
-    read_outs = dict.fromkeys([*kwargs.pop("read_outs", ()), "observation"])
-    return TorchRLGymnasiumEnv(LabMazeEnv(read_outs=tuple(read_outs), **kwargs), render_mode)
+    if name == "LabMaze":
+        kwargs["read_outs"] = tuple(dict.fromkeys([*kwargs.get("read_outs", ()), "observation"]))
+    return TorchRLGymnasiumEnv(_MAZES[name](**kwargs), render_mode)
+
+
+_MAZES: dict[str, Callable[..., EnvBase]] = {
+    "WaterworldMaze": WaterworldMazeEnv,
+    "GridworldMaze": GridworldMazeEnv,
+    "LabMaze": LabMazeEnv,
+}
 
 
 def register_envs() -> None:
-    """Register the maze environments with Gymnasium; again and again does no harm.
+    """Register the maze environments with Gymnasium; a second call does nothing.
 
     ``import torchrl_hmcts.envs`` does it already. Keywords of ``gymnasium.make`` go to the TorchRL
     env.
 
     Example:
         >>> import gymnasium
-        >>> from torchrl_hmcts.envs import register_envs
+        >>> from torchrl_hmcts.envs.gym_envs import register_envs
         >>> register_envs()
         >>> env = gymnasium.make("torchrl_hmcts/GridworldMaze-v0", max_steps=50)
         >>> env.reset(seed=1)[0].shape
         (66,)
     """
-    entry_points: tuple[Callable[..., Any], ...] = (
-        make_waterworld,
-        make_gridworld,
-        make_lab_maze,
-    )
-    for env_id, entry_point in zip(ENV_IDS, entry_points, strict=True):
+    for name in _MAZES:
+        env_id = f"torchrl_hmcts/{name}-v0"
         if env_id not in gymnasium.registry:
             # A string, so that the spec can be written to JSON and sent to other processes.
-            gymnasium.register(env_id, entry_point=f"{__name__}:{entry_point.__name__}")
+            gymnasium.register(env_id, entry_point=f"{__name__}:make_maze", kwargs={"name": name})

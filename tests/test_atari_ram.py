@@ -245,8 +245,8 @@ def test_an_unknown_game_names_the_nearest_ones():
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"frame_skip": 0}, "frame_skip is an int >= 1 and < 2\\*\\*31; got 0"),
-        ({"repeat_action_probability": 1.0}, r"in \[0, 1\)"),
+        ({"frame_skip": 0}, "frame_skip >= 1; got 0"),
+        ({"repeat_action_probability": 1.0}, "repeat_action_probability .*<= 0.999.*got 1.0"),
         ({"mode": 99}, "mode is one of"),
         ({"reward_clip": 0.0}, "reward_clip"),
         ({"life_loss_penalty": -1.0}, "life_loss_penalty >= 0"),
@@ -287,9 +287,9 @@ def test_a_missing_or_damaged_file_of_a_game_is_an_error(content, tmp_path, monk
         AtariRAMEnv("Pong")
 
 
-def test_more_frames_than_the_emulator_can_count_are_refused() -> None:
-    with pytest.raises(ValueError, match="max_frames is an int"):
-        AtariRAMEnv("Pong", max_frames=2**31)
+def test_more_frames_than_the_emulator_can_count_are_no_limit() -> None:
+    env = AtariRAMEnv("Pong", max_frames=2**31, seed=0)
+    assert not env.rollout(3)["next", "truncated"].any()
 
 
 @pytest.mark.parametrize("sticky", [0.0, 0.25])

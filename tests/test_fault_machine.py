@@ -436,7 +436,7 @@ def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
         "    few = len(os.listdir('/proc/self/fd')) + 2 * number + pipes + 16\n"
         "    resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
         "    check(number, pipes)\n"
-        "import torchrl_hmcts.envs.atari.process as a\n"
+        "import torchrl_hmcts.envs.gym.processes as a\n"
         "import torchrl_hmcts.trainers.a3c.learner_processes as b\n"
         "a.need_descriptors = b.need_descriptors = limit\n"
     )

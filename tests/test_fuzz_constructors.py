@@ -290,8 +290,9 @@ EXCLUDED = {  # why public names are not fuzzed here
     "Evaluation GoalEpisodes GoalTrack Options Controllability",
     "a protocol": "NoveltyTest PlansGoals OptionWorker",
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
-    "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv",
+    "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
+    "SkillWorker "
     "AttributeSnapshot ReplaySnapshot SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",
     "hands its arguments to SkillReward": "SkillRewardHook",

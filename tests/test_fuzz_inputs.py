@@ -25,11 +25,11 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, MultiOneHot, O
 from torchrl_hmcts.envs import (
     GridworldMazeEnv,
     WaterworldMazeEnv,
-    check_mazes,
     maze_from_text,
     maze_pool,
     maze_to_text,
 )
+from torchrl_hmcts.envs.mazes.layouts import check_mazes
 from torchrl_hmcts.modules import SkillActor
 from torchrl_hmcts.planners import Root, Transition, tree_search
 from torchrl_hmcts.trainers.experiments.settings import (

@@ -18,8 +18,8 @@ from torchrl_hmcts.envs import (
     TorchRLGymnasiumEnv,
     WaterworldMazeEnv,
     maze_from_text,
-    register_envs,
 )
+from torchrl_hmcts.envs.gym_envs import register_envs
 
 IDS = {
     "torchrl_hmcts/GridworldMaze-v0": (GridworldMazeEnv, 5),

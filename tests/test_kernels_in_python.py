@@ -385,18 +385,16 @@ def test_the_same_walls_grow() -> None:
 
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_a_network_takes_the_same_actions(deterministic: bool) -> None:
-    plain = in_python("torchrl_hmcts.envs.atari.workers")
+    plain = in_python("torchrl_hmcts.envs.gym.shared_network")
     rng = np.random.default_rng(0)
-    worker, other = (
-        kind(2, 4, hidden=(5, 6), deterministic=deterministic)
-        for kind in (SharedMLP, plain.SharedMLP)
-    )
-    weights = torch.from_numpy(rng.normal(size=len(worker.weights)).astype(np.float32))
-    worker.weights.copy_(weights)
-    other.weights.copy_(weights)
-    draws = [np.random.default_rng(1) for _ in range(2)]
+    worker = SharedMLP(2, 4, hidden=(5, 6), deterministic=deterministic)
+    worker.weights.copy_(torch.from_numpy(rng.normal(size=len(worker.weights))))
+    logits, draws = np.zeros(4, np.float32), [np.random.default_rng(1) for _ in range(2)]
     for _ in range(20):
         ram = (rng.integers(0, 256, 128) * (rng.random(128) < 0.3)).astype(np.uint8)
         for option in range(2):
-            assert other.act(ram, option, draws[0]) == worker.act(ram, option, draws[1])
-            np.testing.assert_allclose(other._logits, worker._logits, rtol=1e-4, atol=1e-4)
+            draw = -1.0 if deterministic else draws[0].random()
+            arrays = worker._array, worker._sizes, worker._heads[option], logits
+            action = plain.choose(ram, *arrays, draw, 255.0)
+            assert action == worker.act(ram, option, draws[1])
+            np.testing.assert_allclose(logits, worker._logits, rtol=1e-4, atol=1e-4)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 import math
-import pickle
 import re
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import gymnasium
-import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.envs import ParallelEnv, RewardSum, SerialEnv, TransformedEnv
+from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import LAB_ACTIONS, LabMazeEnv
@@ -424,72 +421,8 @@ class TestReset:
         assert quarter.bincount().tolist() == pytest.approx([750] * 4, abs=120)
         assert td["heading"].norm(dim=-1).tolist() == pytest.approx([1.0] * 3000)
 
-    def test_same_seed_same_episodes(self):
-        def episodes(seed):
-            env = LabMazeEnv(maze_seeds=range(3))
-            env.set_seed(seed)
-            torch.manual_seed(0)
-            return env.rollout(20, break_when_any_done=False)
-
-        assert (episodes(3) == episodes(3)).all()
-        assert not (episodes(3) == episodes(4)).all()
-
-    def test_only_the_elements_asked_for_are_reset(self):
-        env = LabMazeEnv(maze_seeds=range(3), seed=0)
-        td = play(env, env.reset(TensorDict(batch_size=[3])), [FORWARD] * 3)[-1]
-        before = td.clone()
-        td["_reset"] = torch.tensor([[True], [False], [True]])
-        after = env.reset(td, set_state=False)
-        assert (after[1].select(*STATE_KEYS) == before[1].select(*STATE_KEYS)).all()
-        assert after["level"][:, 3].tolist() == [0, 3, 0]
-
 
 class TestState:
-    @pytest.mark.parametrize("batch", BATCHES)
-    @pytest.mark.parametrize("clock", ["constant", "exact"])
-    def test_set_to_a_state_and_stepped_equals_the_unbroken_run(self, batch, clock):
-        """Bit for bit, in any order of states, through walls, apples, goals and new places."""
-        kwargs = {"maze_seeds": range(5), "clock": clock, "terminate_on_goal": False}
-        env = LabMazeEnv(**kwargs, seed=0, num_steps=3, read_outs=READ_OUTS)
-        td = env.reset(TensorDict(batch_size=batch))
-        goal = env.layout.goal[td["maze_index"].numpy()]
-        td["position"] = torch.from_numpy(np.asarray(goal)).reshape(td["position"].shape).clone()
-        td = env.reset(td, set_state=True)
-        actions = torch.randint(9, (100, *batch))
-        states, unbroken = [], []
-        for action in actions:
-            states.append(td.select(*STATE_KEYS).clone())
-            td = play(env, td, [action])[-1]
-            unbroken.append(td.clone())
-        assert torch.stack([td["reward"] for td in unbroken]).max() >= 10
-        other = LabMazeEnv(**kwargs, seed=1, num_steps=3, read_outs=READ_OUTS)
-        for t in torch.randperm(100).tolist():
-            (after,) = play(other, other.reset(states[t], set_state=True), [actions[t]])
-            assert (after == unbroken[t]).all()
-
-    def test_elements_of_a_batch_step_as_they_would_alone(self):
-        env = LabMazeEnv(maze_seeds=range(5), seed=0)
-        td = env.reset(TensorDict(batch_size=[2, 40]))
-        for _ in range(10):
-            td = play(env, td, [torch.randint(9, (2, 40))] * 5)[-1]
-            td["action"] = torch.randint(9, (2, 40))
-            together = env._step(td)
-            for i, j in ((0, 0), (0, 7), (1, 39)):
-                assert (env._step(td[i, j]) == together[i, j]).all()
-
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_step_leaves_its_input_unchanged(self, batch):
-        env = LabMazeEnv(maze_seeds=range(5), seed=0)
-        td = env.reset(TensorDict(batch_size=batch)).set("action", torch.full(batch, FORWARD))
-        before = td.clone()
-        env._step(td)
-        assert (td == before).all()
-
-    def test_a_state_need_not_be_contiguous(self):
-        env = LabMazeEnv(maze_seeds=range(5), seed=0)
-        td = env.reset(TensorDict(batch_size=[2, 3])).set("action", torch.full((2, 3), BACK))
-        assert (env.step(td.transpose(0, 1)).transpose(0, 1) == env.step(td)).all()
-
     def test_made_states_have_what_a_reset_has(self):
         env = LabMazeEnv(maze_seeds=[1, 2], read_outs=READ_OUTS)
         td = env.make_state([0, 1], START, heading=[0.0, -90.0], frame=[3, 4])
@@ -499,15 +432,6 @@ class TestState:
         for key, spec in env.observation_spec.items():
             assert spec.expand(td[key].shape).is_in(td[key]), key
         assert (env.reset(td.clone(), set_state=True) == td).all()
-
-    @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
-    def test_a_copy_continues_as_the_original(self, duplicate):
-        env = LabMazeEnv(maze_seeds=range(3), seed=0)
-        env.rollout(3)
-        twin = duplicate(env)
-        actions = torch.randint(9, (30,))
-        ends = [play(e, e.reset(), actions)[-1] for e in (env, twin)]
-        assert (ends[0] == ends[1]).all()
 
 
 class TestTorchRL:
@@ -524,37 +448,6 @@ class TestTorchRL:
         check_env_specs(TransformedEnv(env, RewardSum()))
         assert env.to("cpu") is env
         assert env.rollout(3).device == torch.device("cpu")
-
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_rollouts_of_any_batch_shape_stay_within_the_specs(self, batch):
-        env = LabMazeEnv(
-            maze_seeds=range(5), max_frames=60, num_steps=10, read_outs=READ_OUTS, seed=0
-        )
-        td = env.rollout(
-            20,
-            policy=lambda td: td.set("action", torch.randint(9, td.shape)),
-            tensordict=env.reset(TensorDict(batch_size=batch)),
-            auto_reset=False,
-            break_when_any_done=False,
-        )
-        assert td.shape == (*batch, 20)
-        for key in env.observation_spec.keys():
-            value = td["next", key]
-            assert env.observation_spec[key].expand(value.shape).is_in(value), key
-        assert td["next", "level"][..., 3].max() == 60  # and reset afterwards
-        assert td["next", "level"][..., -1, 3].max() < 60
-
-    @pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
-    def test_batched_envs_run_it(self, batched):
-        envs = batched(2, partial(LabMazeEnv, maze_seeds=[1, 2], max_frames=5))
-        try:
-            envs.set_seed(0)
-            td = envs.rollout(12, break_when_any_done=False)
-            assert td.shape == (2, 12)
-            assert td["next", "truncated"].sum(1).min() >= 1
-            assert not (td[0]["position"] == td[1]["position"]).all()
-        finally:
-            envs.close()
 
     def test_the_stock_level_is_an_argument_away(self):
         env = LabMazeEnv(maze_seeds=[1], rows=15, columns=15, terminate_on_goal=False, actions=None)
@@ -594,13 +487,13 @@ class TestBadInput:
             ({"mazes": [["***", "*P*", "***"], ["****", "*PP*", "****"]]}, "one size"),
             ({"mazes": [["***", "*x*", "***"]]}, r"the letters \['x'\]"),
             ({"mazes": [["****", "*GG*", "****"]]}, "2 goals and 0 spawn"),
-            ({"num_steps": 0}, "num_steps from 1 .*; got 0"),
-            ({"max_frames": 0}, "max_frames from 1"),
-            ({"fps": 1000}, "fps from 15 to 240; got 1000"),
-            ({"friction": 0.0}, "friction from 1.0"),
+            ({"num_steps": 0}, "num_steps >= 1; got 0"),
+            ({"max_frames": 0}, "max_frames >= 1"),
+            ({"fps": 1000}, "fps >= 15 and <= 240; got 1000"),
+            ({"friction": 0.0}, "friction >= 1.0"),
             ({"friction": math.nan}, "friction .* got nan"),
             ({"clock": "sundial"}, "'sundial'"),
-            ({"clock_phase": (99, 0)}, r"clock_phase .* got \(99, 0\)"),
+            ({"clock_phase": (99, 0)}, r"clock_phase\[0\] .* got 99"),
             ({"read_outs": ["pixels"]}, r"read-outs .* got \['pixels'\]"),
             ({"read_outs": ["goal", "goal"]}, "at most once"),
             ({"actions": {}}, "At least one action"),
@@ -671,11 +564,6 @@ class TestBadInput:
         td = env.make_state(0, START).set("action", native(look=513))
         with pytest.raises(ValueError, match=r"action \[513, 0, .* the engine's seven"):
             env.step(td)
-
-    def test_only_one_state_is_drawn(self):
-        env = make_env()
-        with pytest.raises(ValueError, match=r"draws one state, got a batch \[2\]"):
-            env.render(env.make_state([0, 0], START))
 
 
 def test_the_blocks_of_its_page_run():

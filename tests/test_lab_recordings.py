@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from torchrl_hmcts.envs import lab_maze, replay_recording
-from torchrl_hmcts.envs.lab.mazes import _distances
+from torchrl_hmcts.envs import lab_maze, replay_recording, shortest_path_lengths
 from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
 
 DATA = Path(__file__).parent / "data" / "lab_recordings.json.gz"
@@ -130,7 +130,7 @@ def test_mazes_have_the_statistics_of_the_level(
         maze = letters(lab_maze(seed, size, size))
         counts.append([(maze == letter).sum() for letter in "*PAG"])
         goal = tuple(np.argwhere(maze == "G")[0])
-        distance = np.array(_distances((maze != "*").tolist(), goal))
+        distance = shortest_path_lengths(torch.from_numpy(maze == "*"), goal).numpy()
         assert ((maze == "P") == (distance > 5)).all()
         assert ((maze == "A") == ((distance > 0) & (distance < 5))).all()
         assert goal[0] % 2 == goal[1] % 2 == 1
@@ -154,10 +154,10 @@ def test_mazes_differ_from_seed_to_seed_and_by_the_mixer_seed() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"rows": 8}, "odd number of rows, at least 5; got 8"),
-        ({"columns": 3}, "odd number of columns, at least 5; got 3"),
-        ({"seed": -1}, "seed from 0 to .*; got -1"),
-        ({"mixer_seed": 2**32}, "mixer_seed from 0"),
+        ({"rows": 8}, "odd numbers of rows and columns; got 8, 9"),
+        ({"columns": 3}, "columns >= 5; got 3"),
+        ({"seed": -1}, "seed >= 0; got -1"),
+        ({"mixer_seed": 2**32}, r"mixer_seed below 2\*\*32; got 1, 4294967296"),
     ],
 )
 def test_bad_sizes_and_seeds_of_mazes_are_refused(arguments: dict[str, int], message: str) -> None:

@@ -27,7 +27,7 @@ ROOMS: dict[str, tuple[str, list[str]]] = {
     "all trainers": (r"trainers", ["command line"]),
     "mazes": (r"envs\.mazes", ["shared envs"]),
     "lab": (r"envs\.lab", ["mazes"]),
-    "gym": (r"envs\.(gym|option_pool)", ["shared envs"]),
+    "gym": (r"envs\.gym", ["shared envs", "modules"]),
     "atari": (r"envs\.atari", ["gym"]),
     "shared envs": (r"envs\.\w+", ["base"]),
     "all envs": (r"envs", ["lab", "atari"]),
@@ -37,7 +37,7 @@ ROOMS: dict[str, tuple[str, list[str]]] = {
     "modules": (r"modules", ["env parts"]),
     "planners": (r"planners", ["env parts"]),
     "env parts": (r"nesting|carried_state|direct_calls", ["base"]),
-    "base": (r"arguments|checks|compiling|processes|", []),
+    "base": (r"checks|compiling|processes|", []),
 }
 DEPENDENCIES = {"torch", "tensordict", "torchrl", "numpy", "numba"}  # of components
 # What a component may import inside a function, for those who have it.
@@ -46,9 +46,7 @@ OPTIONAL = {"planners.drawing": "matplotlib", "planners.export": "networkx"}
 KNOWN = {
     "envs.gym_envs": "lab mazes",
 }
-KNOWN_CIRCLES = {
-    f"envs.gym.snapshots envs.gym.{n}" for n in "atari box2d minigrid mujoco tables".split()
-}
+KNOWN_CIRCLES: set[str] = set()
 
 
 def modules() -> dict[str, Path]:

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_hmcts.envs import (
-    check_mazes,
     free_tiles,
     generate_mazes,
     maze_from_text,
@@ -20,9 +19,9 @@ from torchrl_hmcts.envs import (
     maze_to_text,
     shortest_path,
     shortest_path_lengths,
-    wall_centers,
 )
 from torchrl_hmcts.envs.mazes import layouts
+from torchrl_hmcts.envs.mazes.layouts import check_mazes, wall_centers
 from torchrl_hmcts.envs.mazes.pool_cache import pool_cache_path, pool_digest, read_pool, write_pool
 from torchrl_hmcts.envs.mazes.wall_growing import draw_mazes
 

@@ -14,8 +14,8 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import AttributeSnapshot, ReplaySnapshot, SettableGymEnv, SnapshotError
+from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.settable import PrivateRandom
-from torchrl_hmcts.envs.gym.snapshots import snapshot_of
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ContractError, check_settable
 
@@ -24,8 +24,11 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::UserWarning"),
 ]
 FAMILIES = [
-    ("CartPole-v1", "AttributeSnapshot", None, {}),
-    ("Pendulum-v1", "AttributeSnapshot", None, {}),
+    ("CartPole-v1", "ClassicSnapshot", None, {}),
+    ("Pendulum-v1", "ClassicSnapshot", None, {}),
+    ("MountainCar-v0", "ClassicSnapshot", None, {}),
+    ("MountainCarContinuous-v0", "ClassicSnapshot", None, {}),
+    ("Acrobot-v1", "ClassicSnapshot", None, {}),
     ("FrozenLake-v1", "ToyTextSnapshot", None, {}),  # slips: its generator is part of the state
     ("Taxi-v4", "ToyTextSnapshot", None, {}),
     ("Blackjack-v1", "ToyTextSnapshot", None, {}),  # observes a tuple
@@ -153,7 +156,7 @@ def test_an_attribute_that_cannot_be_stored_is_named() -> None:
 
 def test_a_state_wider_than_the_cap_is_refused() -> None:
     with pytest.raises(SnapshotError, match=r"cap=64\..*larger cap"):
-        SettableGymEnv("CartPole-v1", cap=64)
+        SettableGymEnv("FrozenLake-v1", cap=64)
 
 
 @pytest.mark.parametrize(

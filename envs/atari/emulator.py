@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs.atari.states import EmulatorStates
 
 _NO_OP = 0
@@ -64,25 +65,14 @@ class AtariEmulator:
             "noop_max": noop_max,
         }
         self.game, rom = find_game(game)
-        for name, value, low in (
-            ("frame_skip", frame_skip, 1),
-            ("max_frames", max_frames, 1),
-            ("noop_max", noop_max, 0),
-        ):
-            if isinstance(value, bool) or not isinstance(value, int) or not low <= value < 2**31:
-                raise ValueError(
-                    f"{self.game}: {name} is an int >= {low} and < 2**31; got {value!r}."
-                )
-        if not 0.0 <= repeat_action_probability < 1.0:
-            raise ValueError(
-                f"{self.game}: repeat_action_probability is in [0, 1), 0.25 for sticky actions and "
-                f"0 for a deterministic emulator; got {repeat_action_probability}."
-            )
-        self.frame_skip = frame_skip
-        self.noop_max = noop_max
-        self.sticky = repeat_action_probability > 0.0
+        self.frame_skip = whole_number(self.game, "frame_skip", frame_skip, least=1)
+        self.noop_max = whole_number(self.game, "noop_max", noop_max)
+        max_frames = min(whole_number(self.game, "max_frames", max_frames, least=1), 2**31 - 1)
+        name = "repeat_action_probability"
+        sticky = real_number(self.game, name, repeat_action_probability, least=0.0, most=0.999)
+        self.sticky = sticky > 0.0
         # ALE keeps the probability in single precision, and compares it with a double.
-        self._probability = float(np.float32(repeat_action_probability))
+        self._probability = float(np.float32(sticky))
         self._state_type = ale_py.ALEState
         ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
         self.ale = ale_py.ALEInterface()
@@ -105,6 +95,7 @@ class AtariEmulator:
         self.states = EmulatorStates(raw, self.game)
         """Turns states into rows of bytes and back."""
         self.screen_is_stale = False
+        self._drawing: AtariEmulator | None = None
         self._sent = self._held = _NO_OP
         self._twister: Any = np.random.MT19937(0)  # ALE's own generator, followed draw by draw
         self._follow(EmulatorStates.rng_of(self._serialize(include_rng=True)))
@@ -293,6 +284,18 @@ class AtariEmulator:
         picture: np.ndarray = self.ale.getScreenRGB()
         return picture
 
+    def draw(self, row: np.ndarray) -> np.ndarray:
+        """Return the picture of a state, uint8 ``[210, 160, 3]``, drawn by another emulator.
+
+        A state has no picture: it is that of one frame later, in which nothing is done.
+        """
+        if self._drawing is None:
+            config: Any = {**self._config, "frame_skip": 1, "repeat_action_probability": 0.0}
+            self._drawing = AtariEmulator(**config)
+        self._drawing.set_state(row)
+        self._drawing.act(0)
+        return self._drawing.screen()
+
 
 # Games for two, of which ALE ends the whole process when they are loaded for one player.
 _FOR_TWO = {"combat", "joust", "maze_craze", "warlords"}
@@ -304,16 +307,15 @@ def find_game(game: str) -> tuple[str, str]:
     names = {rom.title().replace("_", ""): rom for rom in roms if rom not in _FOR_TWO}
     asked = str(game).removeprefix("ALE/").removesuffix("-v5")
     plain = {name.lower(): name for name in names}
-    found = plain.get(asked.replace("_", "").replace(" ", "").lower())
-    if found is None and asked.replace("_", "").replace(" ", "").lower() in {
-        rom.replace("_", "") for rom in _FOR_TWO
-    }:
+    word = asked.replace("_", "").replace(" ", "").lower()
+    found = plain.get(word)
+    if word in {rom.replace("_", "") for rom in _FOR_TWO}:
         raise ValueError(
             f"{game!r} is a game for two players only; ale-py plays it for two or more. Choose one "
             f"of the {len(names)} games for one player, e.g. Breakout, Pong, Seaquest."
         )
     if found is None:
-        near = difflib.get_close_matches(asked.replace("_", "").lower(), list(plain), 3, 0.4)
+        near = difflib.get_close_matches(word, list(plain), 3, 0.4)
         hint = ", ".join(plain[name] for name in near) or "e.g. Breakout, Pong, Seaquest"
         raise ValueError(f"ale-py has no game {game!r}. Nearest: {hint}; it has {len(names)}.")
     return found, names[found]

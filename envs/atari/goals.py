@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_hmcts.envs.atari.workers import OptionWorker
+from torchrl_hmcts.envs.gym.option_run import OptionWorker
 
 
 @dataclass(frozen=True)

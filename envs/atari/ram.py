@@ -11,10 +11,18 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_hmcts.checks import real_number
 from torchrl_hmcts.envs.atari.emulator import AtariEmulator
 
 NO_OP_STARTS = 30
 """Most frames of doing nothing at the beginning, where nothing else differs between episodes."""
+
+
+def no_op_starts(noop_max: int | None, repeat_action_probability: float) -> int:
+    """Return ``noop_max``, by default none where actions are sticky, as in Gymnasium."""
+    if noop_max is not None:
+        return noop_max
+    return 0 if repeat_action_probability > 0.0 else NO_OP_STARTS
 
 
 class AtariRAMEnv(EnvBase):
@@ -107,17 +115,11 @@ class AtariRAMEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        if noop_max is None:
-            noop_max = 0 if repeat_action_probability > 0.0 else NO_OP_STARTS
-        if not 0.0 <= life_loss_penalty < float("inf"):
-            raise ValueError(
-                f"AtariRAMEnv takes life_loss_penalty >= 0 off the reward; got {life_loss_penalty}."
-            )
-        if reward_clip is not None and not reward_clip > 0.0:
-            raise ValueError(
-                f"AtariRAMEnv clips rewards to [-reward_clip, reward_clip], which is positive; got "
-                f"{reward_clip}."
-            )
+        noop_max = no_op_starts(noop_max, repeat_action_probability)
+        name = "AtariRAMEnv"
+        self.life_loss_penalty = real_number(name, "life_loss_penalty", life_loss_penalty, least=0)
+        if reward_clip is not None:
+            reward_clip = real_number(name, "reward_clip", reward_clip, above=0.0)
         unknown = sorted(set(read_outs) - {"ram", "observation"})
         if unknown or isinstance(read_outs, str):
             raise ValueError(
@@ -140,24 +142,36 @@ class AtariRAMEnv(EnvBase):
         self.repeat_action_probability = float(repeat_action_probability)
         self.noop_max = noop_max
         self.terminal_on_life_loss = bool(terminal_on_life_loss)
-        self.life_loss_penalty = float(life_loss_penalty)
         self.reward_clip = reward_clip
         self.max_frames = max_frames
         self.action_names = emulator.action_names
         self.include_state, self.include_rng = bool(include_state), bool(include_rng)
         self._read_outs = tuple(read_outs)
         self._emulator = emulator
-        self._drawing: AtariEmulator | None = None  # made when first needed
         self._ram = np.zeros(128, np.uint8)
         self._set_specs()
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
 
     def _set_specs(self) -> None:
+        def numbers(width: int, dtype: torch.dtype, high: float) -> Bounded:
+            return Bounded(0, high, shape=(width,), dtype=dtype, device=self.device)
+
         states = self._emulator.states
         width = states.width_with_rng if self.include_rng else states.width
-        self.state_spec, self.observation_spec = atari_specs(
-            self._read_outs, width if self.include_state else None, (), self.device
-        )
+        observed = {
+            "lives": numbers(1, torch.int64, 255),
+            "episode_frame": numbers(1, torch.int64, 2**31),
+            "ram": numbers(128, torch.uint8, 255),
+            "observation": numbers(128, torch.float32, 1.0),
+        }
+        for name in {"ram", "observation"} - set(self._read_outs):
+            del observed[name]
+        state = {}
+        if self.include_state:
+            state["emulator_state"] = numbers(width, torch.uint8, 255)
+            observed["emulator_state"] = state["emulator_state"].clone()
+        self.state_spec = Composite(state, device=self.device)
+        self.observation_spec = Composite(observed, device=self.device)
         self.action_spec = Categorical(self._emulator.num_actions, shape=(), device=self.device)
         self.reward_spec = Unbounded((1,), dtype=torch.float32, device=self.device)
         done = {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
@@ -240,36 +254,4 @@ class AtariRAMEnv(EnvBase):
         row = None if tensordict is None else tensordict.get("emulator_state", None)
         if row is None and not self._emulator.screen_is_stale:
             return self._emulator.screen()
-        if self._drawing is None:
-            config = {**self._config, "frame_skip": 1, "repeat_action_probability": 0.0}
-            self._drawing = AtariEmulator(**config)
-        shown = self._emulator.state() if row is None else row.numpy(force=True)
-        self._drawing.set_state(shown)
-        self._drawing.act(0)
-        return self._drawing.screen()
-
-
-def atari_specs(
-    read_outs: Sequence[str],
-    state_width: int | None,
-    batch_size: Sequence[int],
-    device: torch.device | None,
-) -> tuple[Composite, Composite]:
-    """Return the specs of the state and of all that is observed of an Atari game."""
-
-    def numbers(width: int, dtype: torch.dtype, high: float) -> Bounded:
-        return Bounded(0, high, shape=(width,), dtype=dtype, device=device)
-
-    state = {}
-    if state_width is not None:
-        state["emulator_state"] = numbers(state_width, torch.uint8, 255)
-    observed: dict[str, Any] = {key: spec.clone() for key, spec in state.items()}
-    observed["lives"] = numbers(1, torch.int64, 255)
-    observed["episode_frame"] = numbers(1, torch.int64, 2**31)
-    if "ram" in read_outs:
-        observed["ram"] = numbers(128, torch.uint8, 255)
-    if "observation" in read_outs:
-        observed["observation"] = numbers(128, torch.float32, 1.0)
-    return tuple(  # type: ignore[return-value]
-        Composite(entries, device=device).expand(*batch_size) for entries in (state, observed)
-    )
+        return self._emulator.draw(self._emulator.state() if row is None else row.numpy(force=True))

@@ -7,7 +7,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.snapshots import AttributeSnapshot, SnapshotError
+from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
+from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
 
 class ALESnapshot(AttributeSnapshot):

@@ -9,7 +9,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.snapshots import AttributeSnapshot, RowUnpickler, SnapshotError
+from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot, RowUnpickler
+from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
 _UNMOVED = frozenset({"wall", "floor", "goal", "lava"})
 _CHANGES = 1_024  # bytes for cells and objects that differ from the reference

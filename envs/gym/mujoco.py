@@ -7,7 +7,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.snapshots import AttributeSnapshot, SnapshotError, env_layers
+from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
+from torchrl_hmcts.envs.gym.snapshots import SnapshotError, env_layers
 
 # What envs read of the last step before they take the next one: it lags behind the positions.
 _DERIVED = (
@@ -42,6 +43,7 @@ class MujocoSnapshot(AttributeSnapshot):
         MuJoCo documentation, "Simulation: state and control".
     """
 
+    skipped_attributes = AttributeSnapshot.skipped_attributes | {"observation_structure"}
     plain_types = AttributeSnapshot.plain_types | {np.ndarray}
 
     def __init__(self, env: gymnasium.Env, *, cap: int = 1 << 16) -> None:

@@ -18,11 +18,17 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.envs import GymWrapper
 
-from torchrl_hmcts.envs.gym.snapshots import DEFAULT_CAP, Snapshot, SnapshotError, snapshot_of
+from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.envs.gym.families import snapshot_of
+from torchrl_hmcts.envs.gym.snapshots import (
+    DEFAULT_CAP,
+    SNAPSHOT_KEY,
+    Snapshot,
+    SnapshotError,
+)
 
 # Packages that register their envs when they are imported, and the extra that installs them.
 _PACKAGES = ("gymnasium_robotics", "minigrid", "ogbench", "ale_py")
-_KEY = "snapshot"
 
 
 class PrivateRandom(gymnasium.Wrapper):
@@ -37,14 +43,19 @@ class PrivateRandom(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
-        self._states = _seeded_states(0)
+        self.seed(0)
+
+    def seed(self, seed: int) -> None:
+        """Seed its own states of the global generators."""
+        state = np.random.RandomState(seed % 2**32).get_state()
+        self._states: tuple[Any, Any] = state, random.Random(seed).getstate()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the env; a seed also seeds its own states of the global generators."""
         if seed is not None:
-            self._states = _seeded_states(seed)
+            self.seed(seed)
         return self._inside(lambda: self.env.reset(seed=seed, options=options))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -156,10 +167,6 @@ def _set_global_states(states: tuple[Any, Any]) -> None:
     random.setstate(states[1])
 
 
-def _seeded_states(seed: int) -> tuple[Any, Any]:
-    return np.random.RandomState(seed % 2**32).get_state(), random.Random(seed).getstate()
-
-
 class SettableGymEnv(GymWrapper):
     """A Gymnasium env that a planner can set to any state, right to the bit.
 
@@ -170,7 +177,7 @@ class SettableGymEnv(GymWrapper):
         env (str, gymnasium.Env or callable): an id, an env, or a function that makes one. It is
             reset.
         snapshot (type, tuple of two functions, or callable, optional): how its state is stored,
-            see :func:`~torchrl_hmcts.envs.gym.snapshots.snapshot_of`. Default: found by itself, and
+            see :func:`~torchrl_hmcts.envs.gym.families.snapshot_of`. Default: found by itself, and
             named in the ``repr``.
         cap (int): bytes of the attributes in a row at most. Default 65,536.
         seed (int, optional): of the starts of its episodes. Default: drawn from torch's global
@@ -189,7 +196,7 @@ class SettableGymEnv(GymWrapper):
         >>> first = env.step(env.rand_action(start.clone()))["next", "observation"]
         >>> _ = env.reset(start, set_state=True)
         >>> env
-        SettableGymEnv(CartPole-v1, snapshot=AttributeSnapshot, ... bytes)
+        SettableGymEnv(CartPole-v1, snapshot=ClassicSnapshot, 80 bytes)
 
     Reference:
         Towers et al., "Gymnasium: A Standard Interface for Reinforcement Learning Environments",
@@ -217,14 +224,13 @@ class SettableGymEnv(GymWrapper):
         self.__dict__["_snapshot"] = stored
         super().__init__(made, categorical_action_encoding=True, device=device, **theirs)
         row = Unbounded((stored.width,), dtype=torch.uint8, device=device)
-        self.observation_spec[_KEY] = row
+        self.observation_spec[SNAPSHOT_KEY] = row
         self.state_spec = self.observation_spec.clone()
         self._discrete = type(made.action_space) is spaces.Discrete and made.action_space.start == 0
         self._single = None if isinstance(made.observation_space, spaces.Dict) else "observation"
         self._generator = torch.Generator()
-        self._generator.manual_seed(
-            int(torch.randint(2**31, ())) if seed is None else _checked_seed(seed)
-        )
+        seed = int(torch.randint(2**31, ())) if seed is None else seed
+        self._set_seed(seed)
 
     @property
     def snapshot(self) -> Snapshot:
@@ -234,7 +240,7 @@ class SettableGymEnv(GymWrapper):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self._generator.manual_seed(_checked_seed(seed))
+            self._generator.manual_seed(whole_number("SettableGymEnv", "seed", seed))
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any
@@ -253,7 +259,7 @@ class SettableGymEnv(GymWrapper):
                 "reset(td, set_state=True) needs the entries that the env wrote: "
                 f"{sorted(map(str, keys))}; missing: {given or 'all'}."
             )
-        self.snapshot.restore(tensordict.get(_KEY).cpu().numpy())
+        self.snapshot.restore(tensordict.get(SNAPSHOT_KEY).cpu().numpy())
         return tensordict.select(*keys)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -275,7 +281,7 @@ class SettableGymEnv(GymWrapper):
 
     def _with_row(self, td: TensorDictBase) -> TensorDictBase:
         row = torch.from_numpy(self.snapshot.read())
-        return td.set(_KEY, row if self.device is None else row.to(self.device))
+        return td.set(SNAPSHOT_KEY, row if self.device is None else row.to(self.device))
 
     def __repr__(self) -> str:
         spec = self._env.spec
@@ -297,9 +303,3 @@ def _entries(observation: Any, name: str | None) -> dict[str, Any]:
 def _tensor(value: Any) -> torch.Tensor:
     """A copy: some envs write each observation into the same array."""
     return torch.from_numpy(np.array(value))
-
-
-def _checked_seed(seed: int) -> int:
-    if not 0 <= int(seed) < 2**63:
-        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}.")
-    return int(seed)

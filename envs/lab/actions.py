@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from torchrl_hmcts.checks import instance
+
 LAB_ACTIONS: Mapping[str, tuple[int, int, int, int]] = {
     "forward": (0, 0, 0, 1),
     "back": (0, 0, 0, -1),
@@ -48,6 +50,7 @@ def action_table(actions: Mapping[str, Sequence[int]]) -> np.ndarray:
         raise ValueError("At least one action is needed; got none. Leave the default LAB_ACTIONS.")
     bounds = list(NATIVE_ACTIONS.values())[:4]
     for name, action in actions.items():
+        instance("LabMazeEnv", f"the action {name!r} of actions", action, Sequence)
         if len(action) != 4 or any(int(x) != x for x in action):
             raise ValueError(
                 f"The action {name!r} must be four integers (look right, look down, strafe right, "

@@ -23,14 +23,9 @@ from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
 from torchrl_hmcts.envs.lab.read_outs import READ_OUTS
 
 _MODULE = "deepmind_lab"
+_NUMBERS = ("uint8", "int32", "int64", "float32", "float64")
 _POSITION, _ROTATION, _VELOCITY = "DEBUG.POS.TRANS", "DEBUG.POS.ROT", "VEL.TRANS"
-_TYPES = {
-    np.dtype(np.uint8): torch.uint8,
-    np.dtype(np.int32): torch.int32,
-    np.dtype(np.int64): torch.int64,
-    np.dtype(np.float32): torch.float32,
-    np.dtype(np.float64): torch.float64,
-}
+_TYPES = {np.dtype(name): getattr(torch, name) for name in _NUMBERS}
 
 
 class DeepMindLabEnv(EnvBase):

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_hmcts.envs.lab.kernels import EAST, NORTH, SOUTH, WEST
+from torchrl_hmcts.checks import instance
+from torchrl_hmcts.envs.lab.kernels import CELL, EAST, NORTH, SOUTH, WEST
 from torchrl_hmcts.envs.lab.mazes import APPLE, GOAL, OPEN, SPAWN, WALL
 
-_CELL = 100.0
 _NOWHERE = -1.0e6
 
 
@@ -43,6 +43,8 @@ class LabLayout:
     def __init__(self, mazes: Sequence[Sequence[str]]) -> None:
         if not len(mazes):
             raise ValueError("LabMazeEnv needs at least one maze; got none.")
+        for maze in mazes:
+            instance("LabMazeEnv", "each of mazes", maze, Sequence)
         text = [tuple(maze) for maze in mazes]
         sizes = {(len(maze), len(row)) for maze in text for row in maze}
         if len(sizes) != 1:
@@ -94,8 +96,8 @@ class LabLayout:
         out = np.full((len(where), max(1, int(counts.max())), 2), _NOWHERE, np.float32)
         for maze, cells in enumerate(where):
             row, column = np.nonzero(cells)
-            out[maze, : len(row), 0] = _CELL * column + _CELL / 2
-            out[maze, : len(row), 1] = _CELL * (self.rows - 1 - row) + _CELL / 2
+            out[maze, : len(row), 0] = CELL * column + CELL / 2
+            out[maze, : len(row), 1] = CELL * (self.rows - 1 - row) + CELL / 2
         return out, counts.astype(np.int64)
 
     def _faces(self) -> np.ndarray:

@@ -5,8 +5,8 @@ Letters: *B batch of the tensordict, n its elements, M mazes, R rows and C colum
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from operator import index
 from typing import Any, Literal
 
 import numpy as np
@@ -14,9 +14,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.base import NO_DEFAULT
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Categorical
 
+from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 from torchrl_hmcts.envs.lab.kernels import (
     APPLES,
@@ -32,8 +32,10 @@ from torchrl_hmcts.envs.lab.kernels import (
 from torchrl_hmcts.envs.lab.layout import LabLayout
 from torchrl_hmcts.envs.lab.mazes import lab_maze
 from torchrl_hmcts.envs.lab.read_outs import PAIRS, READ_OUTS, LabReadOuts
-from torchrl_hmcts.envs.lab.states import STATE, TRAILING, LabStates
-from torchrl_hmcts.envs.lab.view import draw_lab_maze, heading_degrees
+from torchrl_hmcts.envs.lab.states import STATE, TRAILING, check_place, state_specs
+from torchrl_hmcts.envs.lab.view import heading_degrees
+from torchrl_hmcts.envs.mazes.maze_env import MazeEnv
+from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, draw_maze
 
 CLOCK_PHASE: Mapping[int, tuple[int, int]] = {
     60: (46, -3),
@@ -45,7 +47,7 @@ CLOCK_PHASE: Mapping[int, tuple[int, int]] = {
 """Phase of the engine's clock in the first episode of a process, by frames per second."""
 
 
-class LabMazeEnv(EnvBase):
+class LabMazeEnv(MazeEnv):
     r"""Walk through DeepMind Lab's random maze: momentum, friction, and a goal far away.
 
     The level ``demos/random_maze`` with the engine's ground movement, frame by frame: friction,
@@ -135,8 +137,7 @@ class LabMazeEnv(EnvBase):
     CELL = 100.0
     """World units along the side of a cell."""
 
-    batch_locked = False
-    _supports_set_state = True
+    make_state_call = "env.make_state(maze_index, position, heading)"
     metadata = {"render_modes": ["rgb_array"], "render_fps": 60}
 
     def __init__(
@@ -161,82 +162,52 @@ class LabMazeEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        if mazes is None:
-            mazes = [lab_maze(s, rows, columns) for s in maze_seeds]
-        for name, value, low, high in (
-            ("num_steps", num_steps, 1, 10**9),
-            ("max_frames", max_frames, 1, 2**62),
-            ("fps", fps, 15, 240),
-            ("friction", friction, 1.0, 60.0),
-            ("apple_reward", apple_reward, -1e6, 1e6),
-            ("goal_reward", goal_reward, -1e6, 1e6),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"LabMazeEnv needs {name} from {low} to {high}; got {value}.")
+        name = "LabMazeEnv"
+        self.num_steps = whole_number(name, "num_steps", num_steps, least=1)
+        self.max_frames = whole_number(name, "max_frames", max_frames, least=1)
+        self.fps = int(real_number(name, "fps", fps, least=15, most=240))
+        self.friction = real_number(name, "friction", friction, least=1.0, most=60.0)
+        self.apple_reward = real_number(name, "apple_reward", apple_reward)
+        self.goal_reward = real_number(name, "goal_reward", goal_reward)
+        instance(name, "clock", clock, str)
         if clock not in ("constant", "exact"):
             raise ValueError(f'LabMazeEnv has the clocks "constant" and "exact"; got {clock!r}.')
         if clock_phase is None:
             clock_phase = CLOCK_PHASE.get(fps, CLOCK_PHASE[60])
-        if len(clock_phase) != 2 or not 0 <= clock_phase[0] < 50 or abs(clock_phase[1]) > 100:
-            raise ValueError(
-                f"LabMazeEnv needs a clock_phase (0 to 49, -100 to 100) in milliseconds; got "
-                f"{tuple(clock_phase)}."
-            )
-        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        instance(name, "clock_phase", clock_phase, tuple, list)
+        if len(clock_phase) != 2:
+            raise ValueError(f"{name} needs two numbers for clock_phase; got {clock_phase}.")
+        real_number(name, "clock_phase[0]", clock_phase[0], least=0, most=49)
+        real_number(name, "clock_phase[1]", clock_phase[1], least=-100, most=100)
+        instance(name, "read_outs", read_outs, tuple, list)
+        instance(name, "mazes", mazes, tuple, list, type(None))
+        instance(name, "maze_seeds", maze_seeds, Sequence)
+        instance(name, "actions", actions, Mapping, type(None))
+        if mazes is None:
+            mazes = [lab_maze(s, rows, columns) for s in maze_seeds]
+        self._start(batch_size, device, terminate_on_goal=terminate_on_goal)
         self.layout = LabLayout(mazes)
         self.num_mazes = len(self.layout)
-        self.num_steps = int(num_steps)
+        self._table = action_table(LAB_ACTIONS if actions is None else actions)
         self.actions = None if actions is None else {k: tuple(v) for k, v in actions.items()}
-        self._table = action_table(LAB_ACTIONS if self.actions is None else self.actions)
         self.terminate_on_goal = bool(terminate_on_goal)
-        self.max_frames = int(max_frames)
-        self.fps = int(fps)
         self.frame_msec = int(960 / fps + 0.5)
         """Nominal milliseconds of a frame, in the engine's time."""
         self.exact_clock = clock == "exact"
         self.clock_phase = tuple(int(x) for x in clock_phase)
-        self.friction = float(friction)
-        self.apple_reward, self.goal_reward = float(apple_reward), float(goal_reward)
         self._read = LabReadOuts(self.layout, read_outs)
-        self._states = LabStates(self.layout, self.max_frames)
-        self._set_specs()
-        self.set_seed(
-            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
-        )
+        if self.actions is not None:
+            action: Any = Categorical(len(self.actions), shape=(), device=self.device)
+        else:
+            low, high = (torch.tensor(x) for x in zip(*NATIVE_ACTIONS.values(), strict=True))
+            action = Bounded(low, high, dtype=torch.int64, device=self.device)
+        state = state_specs(self.layout, self.max_frames, self.device)
+        self._set_up(state, self._read.specs(self.device), action, seed, free=("position",))
 
     @property
     def read_outs(self) -> tuple[str, ...]:
         """Names of the read-outs that it writes."""
         return self._read.names
-
-    # ---------------------------------------------------------------- specs
-
-    def _set_specs(self) -> None:
-        device, batch_size = self.device, self.batch_size
-        states, read_outs = self._states.specs, self._read.specs
-        self.state_spec = Composite(states(device), device=device).expand(batch_size)
-        self.observation_spec = Composite(
-            {**states(device), **read_outs(device)}, device=device
-        ).expand(batch_size)
-        if self.actions is not None:
-            action: Any = Categorical(len(self.actions), shape=(), device=device)
-        else:
-            low, high = zip(*NATIVE_ACTIONS.values(), strict=True)
-            action = Bounded(
-                torch.tensor(low), torch.tensor(high), dtype=torch.int64, device=device
-            )
-        self.action_spec = action.expand(*batch_size, *action.shape)
-        reward = Unbounded((1,), dtype=torch.float32, device=device)
-        self.reward_spec = reward.expand(*batch_size, 1)
-        done = {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(done, device=device).expand(batch_size)
-
-    def _set_seed(self, seed: int | None) -> None:
-        self._generator = torch.Generator()
-        if seed is None:
-            self._generator.seed()
-        else:
-            self._generator.manual_seed(index(seed))
 
     # ---------------------------------------------------------------- stepping
 
@@ -328,10 +299,7 @@ class LabMazeEnv(EnvBase):
 
     # ---------------------------------------------------------------- resets
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if kwargs.get("set_state"):
-            return self._reset_to_state(tensordict)
-        shape = self.batch_size if tensordict is None else tensordict.batch_size
+    def _begin(self, shape: torch.Size) -> TensorDict:
         count = shape.numel()
 
         def draw(high: int) -> np.ndarray:
@@ -356,8 +324,9 @@ class LabMazeEnv(EnvBase):
         return [maze.astype(np.int64), position.astype(np.float32), at_rest, at_rest.copy(), level]
 
     def _reset_to_state(self, tensordict: TensorDictBase | None) -> TensorDict:
-        self._states.check(tensordict)
+        maze, position, *_ = self._state_of(tensordict)
         assert tensordict is not None
+        check_place(self.layout, position, maze)
         return self.read_state(tensordict)
 
     def make_state(
@@ -400,7 +369,7 @@ class LabMazeEnv(EnvBase):
         shape = torch.broadcast_shapes(
             maze.shape, gone.shape, degrees.shape, place.shape[:-1], moving.shape[:-1]
         )
-        self._states.check_range("maze_index", maze)
+        self._check_form({"maze_index": maze}, maze.shape)
         units = (degrees * (65536 / 360)).round().long() % 65536
         _, at, speed, turned, level = state = self._fresh(
             maze.expand(shape).reshape(-1).numpy(),
@@ -441,40 +410,30 @@ class LabMazeEnv(EnvBase):
 
     # ---------------------------------------------------------------- pictures
 
-    def render(self, tensordict: TensorDictBase, **options: Any) -> np.ndarray:
-        """Draw one state from above: player (blue, with its heading), goal (green), apples (red).
-
-        Args:
-            tensordict (TensorDictBase): state without batch dimensions.
-            **options: keywords of :func:`~torchrl_hmcts.envs.draw_maze`; ``paths`` in cells, x to
-                the east and y to the south.
-
-        Returns:
-            uint8 numpy array ``[h, w, 3]``.
-
-        Raises:
-            ValueError: if the tensordict has batch dimensions.
-
-        Example:
-            >>> env = LabMazeEnv(maze_seeds=[1], seed=0)
-            >>> env.render(env.reset()).shape
-            (304, 304, 3)
-        """
-        if tensordict.batch_size:
-            raise ValueError(
-                f"render draws one state, got a batch {list(tensordict.batch_size)}. Index it, "
-                f"e.g. env.render(td[0])."
-            )
+    def _draw(self, tensordict: TensorDictBase, options: dict[str, Any]) -> np.ndarray:
         maze, position, _, turned, level = (
             tensordict.get(key).numpy(force=True)[None] for key in STATE
         )
-        degrees = heading_degrees(turned[:, 0], level[:, SPAWN_HEADING])
-        return draw_lab_maze(
-            self.layout,
-            int(maze[0]),
-            position[0],
-            float(degrees[0]),
-            int(level[0, APPLES]),
+        layout = self.layout
+        (degrees,) = heading_degrees(turned[:, 0], level[:, SPAWN_HEADING])
+        angle = math.radians(float(degrees))
+
+        def in_picture(points: np.ndarray) -> np.ndarray:
+            x, y = (points.astype(np.float64) / self.CELL).T
+            return np.stack((x, layout.rows - y), -1)
+
+        player, number = in_picture(position[0]), int(maze[0])
+        nose = np.stack((player, player + 0.38 * np.array((math.cos(angle), -math.sin(angle)))))
+        apples = int(level[0, APPLES])
+        left = [k for k in range(int(layout.num_apples[number])) if apples >> k & 1]
+        goal = layout.goal[number]
+        options = {"dots": in_picture(layout.apples[number, left]), **options}
+        options["paths"] = [*options.get("paths", ()), (nose, PLAYER_COLOR)]
+        return draw_maze(
+            layout.walls[number],
+            player=player.tolist(),
+            player_radius=0.15,
+            target=in_picture(goal).tolist() if goal[0] >= 0 else None,
             **options,
         )
 

@@ -5,11 +5,11 @@ Letters: R rows, C columns of the text map, border included; M mazes.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
-from operator import index
+import torch
 
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
+from torchrl_hmcts.envs.mazes.layouts import shortest_path_lengths
 
 WALL, OPEN, APPLE, SPAWN, GOAL = "*", " ", "A", "P", "G"
 OPENING_PROBABILITY = 0.15
@@ -53,14 +53,20 @@ def lab_maze(seed: int, rows: int = 9, columns: int = 9, *, mixer_seed: int = 0)
         *AAAAGAA*
         *********
     """
-    for name, size in (("rows", rows), ("columns", columns)):
-        if size < 5 or size % 2 == 0:
-            raise ValueError(f"lab_maze needs an odd number of {name}, at least 5; got {size}.")
-    # Those of NumPy overflow, and are another type.
-    seed, mixer_seed, rows, columns = map(index, (seed, mixer_seed, rows, columns))
-    for name, value in (("seed", seed), ("mixer_seed", mixer_seed)):
-        if not 0 <= value < 2**32:
-            raise ValueError(f"lab_maze needs a {name} from 0 to 2**32 - 1; got {value}.")
+    rows, columns = (
+        whole_number("lab_maze", name, size, least=5)
+        for name, size in (("rows", rows), ("columns", columns))
+    )
+    if rows % 2 == 0 or columns % 2 == 0:
+        raise ValueError(f"lab_maze needs odd numbers of rows and columns; got {rows}, {columns}.")
+    seed, mixer_seed = (
+        whole_number("lab_maze", name, value)
+        for name, value in (("seed", seed), ("mixer_seed", mixer_seed))
+    )
+    if max(seed, mixer_seed) >= 2**32:
+        raise ValueError(
+            f"lab_maze needs seed and mixer_seed below 2**32; got {seed}, {mixer_seed}."
+        )
     mixer = mixer_seed << 32
     level_seed = MersenneTwister64(seed ^ mixer).uniform_int(1, 2**31 - 1)
     random = MersenneTwister64(level_seed ^ mixer)
@@ -70,7 +76,7 @@ def lab_maze(seed: int, rows: int = 9, columns: int = 9, *, mixer_seed: int = 0)
             if random.uniform_real() < OPENING_PROBABILITY:
                 is_open[row][column] = True
     goal = _even_cell(random, rows, columns)
-    distance = _distances(is_open, goal)
+    distance = shortest_path_lengths(~torch.tensor(is_open), goal).tolist()
     return tuple(
         "".join(
             _letter(is_open[row][column], distance[row][column], (row, column) == goal)
@@ -115,26 +121,3 @@ def _carve(random: MersenneTwister64, rows: int, columns: int) -> list[list[bool
         is_open[(row + r) // 2][(column + c) // 2] = is_open[r][c] = True
         path.append((r, c))
     return is_open
-
-
-def _distances(is_open: Sequence[Sequence[bool]], start: tuple[int, int]) -> list[list[int]]:
-    """Steps between neighbouring open cells from a cell, -1 where there is no way."""
-    distance = [[-1] * len(row) for row in is_open]
-    distance[start[0]][start[1]] = 0
-    queue = deque([start])
-    while queue:
-        row, column = queue.popleft()
-        for r, c in _neighbours(row, column):
-            if (
-                0 <= r < len(is_open)
-                and 0 <= c < len(is_open[0])
-                and is_open[r][c]
-                and distance[r][c] < 0
-            ):
-                distance[r][c] = distance[row][column] + 1
-                queue.append((r, c))
-    return distance
-
-
-def _neighbours(row: int, column: int) -> Iterator[tuple[int, int]]:
-    yield from ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1))

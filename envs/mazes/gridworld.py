@@ -6,23 +6,21 @@ tile index is ``row * W + col``.
 
 from __future__ import annotations
 
-from operator import index
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.base import NO_DEFAULT
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Categorical
 
-from torchrl_hmcts.envs.mazes.layouts import check_mazes, free_tiles, maze_pool, wall_centers
+from torchrl_hmcts.envs.mazes.maze_env import TileMazeEnv
 from torchrl_hmcts.envs.mazes.rendering import draw_maze
 
 _MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1), (0, 0))  # (row, col) of up, down, left, right, none
 
 
-class GridworldMazeEnv(EnvBase):
+class GridworldMazeEnv(TileMazeEnv):
     r"""Walk from tile to tile of a random maze until the target's tile is reached.
 
     Stateless and batched: the state is in the tensordict, any batch shape is stepped at once, and
@@ -68,8 +66,11 @@ class GridworldMazeEnv(EnvBase):
         torch.Size([5])
     """
 
-    batch_locked = False
-    _supports_set_state = True
+    tables = (*TileMazeEnv.tables, "_next_tile", "_centers")
+    make_state_call = (
+        "env.make_state(maze_index, player, target) or "
+        "env.state_from_positions(maze_index, position, target)"
+    )
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(
@@ -81,79 +82,26 @@ class GridworldMazeEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        mazes = maze_pool("train") if mazes is None else mazes
-        check_mazes(mazes)
-        if max_steps < 1:
-            raise ValueError(
-                f"max_steps must be at least 1, got {max_steps}. Use 10**9 for almost no limit."
-            )
-        super().__init__(device=device, batch_size=[])
-        self.num_mazes, self.height, self.width = mazes.shape
-        self.num_walls = int(mazes[0].sum())
-        self.max_steps = max_steps
+        super().__init__(mazes, max_steps, observation, (), device)
         self._num_tiles = self.height * self.width
-        self._writes_observation = observation
-        # Plain attributes, not buffers: EnvBase makes the lookup of a buffer slower than the step.
-        self.mazes = mazes.to(self.device).clone()  # [M, H, W]
         self._next_tile = _next_tile_table(self.mazes)  # [M, H*W, A]
-        self._wall_centers = wall_centers(self.mazes).flatten(1)  # [M, 2K]
-        self._free_tiles = free_tiles(self.mazes)  # [M, F]
         tiles = torch.arange(self._num_tiles, device=self.device)
         columns_rows = torch.stack((tiles % self.width, tiles // self.width), -1)
         self._centers = columns_rows + 0.5  # [H*W, 2]
-        self._set_specs()
-        self.set_seed(
-            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
-        )
-
-    def _set_specs(self) -> None:
-        device = self.device
-
-        def state() -> dict[str, Any]:
-            return {
-                "player_tile": Categorical(self._num_tiles, shape=(), device=device),
-                "target_tile": Categorical(self._num_tiles, shape=(), device=device),
-                "maze_index": Categorical(self.num_mazes, shape=(), device=device),
-                "step_count": Bounded(
-                    0, self.max_steps, shape=(1,), dtype=torch.int64, device=device
-                ),
-            }
-
         low, high = torch.tensor([0.5, 0.5]), torch.tensor([self.width, self.height]) - 0.5
 
-        def centers(count: int, shape: tuple[int, ...]) -> Bounded:
-            return Bounded(
-                low.repeat(count).view(shape), high.repeat(count).view(shape), device=device
-            )
+        def centers(count: int) -> Bounded:
+            return Bounded(low.repeat(count), high.repeat(count), device=self.device)
 
-        read_outs = {"position": centers(1, (2,)), "target": centers(1, (2,))}
+        state = {
+            "player_tile": Categorical(self._num_tiles, shape=(), device=self.device),
+            "target_tile": Categorical(self._num_tiles, shape=(), device=self.device),
+            **self._counted(),
+        }
+        read_outs: dict[str, Any] = {"position": centers(1), "target": centers(1)}
         if self._writes_observation:
-            num_points = 2 + self.num_walls
-            read_outs["observation"] = centers(num_points, (2 * num_points,))
-        self.state_spec = Composite(state(), shape=(), device=device)
-        self.observation_spec = Composite({**state(), **read_outs}, shape=(), device=device)
-        self.action_spec = Categorical(len(_MOVES), shape=(), device=device)
-        self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32, device=device)
-        self.done_spec = Composite(
-            {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")},
-            shape=(),
-            device=device,
-        )
-
-    def to(self, device: torch.device | str) -> GridworldMazeEnv:
-        """Move the env, its mazes and its tables to a device, in place."""
-        super().to(device)
-        for name in ("mazes", "_next_tile", "_wall_centers", "_free_tiles", "_centers"):
-            setattr(self, name, getattr(self, name).to(device))
-        return self
-
-    def _set_seed(self, seed: int | None) -> None:
-        # On the CPU whatever the device: a seed gives the same episodes everywhere.
-        self._generator = torch.Generator()
-        if seed is None:
-            self._generator.seed()
-        else:
-            self._generator.manual_seed(index(seed))
+            read_outs["observation"] = centers(2 + self.num_walls)
+        self._set_up(state, read_outs, Categorical(len(_MOVES), shape=(), device=self.device), seed)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         entry = tensordict._get_str  # TensorDict.get takes five times as long
@@ -195,45 +143,19 @@ class GridworldMazeEnv(EnvBase):
             position=position,
             target=target_position,
         )
-        if self._writes_observation:
-            walls = torch.embedding(self._wall_centers, maze)
-            entries["observation"] = torch.cat((position, target_position, walls), -1)
+        self._observe(entries, position, target_position)
         # The checks of TensorDict's constructor would cost as much as the arithmetic.
         return TensorDict._new_unsafe(entries, batch_size, device=self.device)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if kwargs.get("set_state"):
-            return self._reset_to_state(tensordict)
-        shape = self.batch_size if tensordict is None else tensordict.batch_size
-        num_free = self._free_tiles.shape[1]
-
-        def draw(high: int) -> Tensor:
-            return torch.randint(high, shape, generator=self._generator).to(self.device)
-
-        maze, player, target = draw(self.num_mazes), draw(num_free), draw(num_free - 1)
-        target += target >= player  # uniform over the free tiles other than the player's
-        offset = maze * num_free
-        return self._write_state(
-            self._free_tiles.take(offset + player),
-            self._free_tiles.take(offset + target),
-            maze,
-            torch.zeros((*shape, 1), dtype=torch.int64, device=self.device),
-            shape,
-        )
+    def _begin(self, shape: torch.Size) -> TensorDict:
+        maze, player, target, steps = self._draw_tiles(shape)
+        return self._write_state(player, target, maze, steps, shape)
 
     def _reset_to_state(self, tensordict: TensorDictBase | None) -> TensorDict:
-        keys = ("player_tile", "target_tile", "maze_index", "step_count")
-        missing = [key for key in keys if tensordict is None or key not in tensordict.keys()]
-        if tensordict is None or missing:
-            raise ValueError(
-                f"reset(td, set_state=True) needs the whole state in td; missing: {missing}. Build "
-                f"it with env.make_state(maze_index, player, target) or "
-                f"env.state_from_positions(maze_index, position, target)."
-            )
-        player, target, maze, step_count = (tensordict.get(key) for key in keys)
-        batch_size = tensordict.batch_size
-        self._check_state(player, target, maze, step_count, batch_size)
-        out = self._write_state(player, target, maze, step_count, batch_size)
+        player, target, maze, steps = self._state_of(tensordict)
+        assert tensordict is not None
+        self._check_tiles(player, target, maze)
+        out = self._write_state(player, target, maze, steps, tensordict.batch_size)
         for key, tile_key in (("position", "player_tile"), ("target", "target_tile")):
             given = tensordict.get(key, None)
             if given is not None and not torch.equal(given, out.get(key)):
@@ -245,31 +167,9 @@ class GridworldMazeEnv(EnvBase):
                 )
         return out
 
-    def _check_state(
-        self,
-        player: Tensor,
-        target: Tensor,
-        maze: Tensor,
-        step_count: Tensor,
-        batch_size: torch.Size,
-    ) -> None:
-        num_tiles = self._num_tiles
-        for key, value, shape, high, fix in (
-            ("maze_index", maze, batch_size, self.num_mazes, "an index into env.mazes"),
-            ("player_tile", player, batch_size, num_tiles, "row * width + col"),
-            ("target_tile", target, batch_size, num_tiles, "row * width + col"),
-            ("step_count", step_count, (*batch_size, 1), self.max_steps + 1, "base steps so far"),
-        ):
-            if value.dtype != torch.int64 or value.shape != torch.Size(shape):
-                raise ValueError(
-                    f'"{key}" must be int64 {list(shape)}, {fix}; got {value.dtype} '
-                    f"{list(value.shape)}."
-                )
-            if ((value < 0) | (value >= high)).any():
-                bad = value[(value < 0) | (value >= high)].flatten()[0].item()
-                raise ValueError(f'"{key}" = {bad} is out of range: use {fix}, 0 to {high - 1}.')
+    def _check_tiles(self, player: Tensor, target: Tensor, maze: Tensor) -> None:
         for key, tile in (("player_tile", player), ("target_tile", target)):
-            in_wall = self.mazes.flatten().take(maze * num_tiles + tile)
+            in_wall = self.mazes.flatten().take(maze * self._num_tiles + tile)
             if in_wall.any():
                 bad_tile, bad_maze = int(tile[in_wall][0]), int(maze[in_wall][0])
                 raise ValueError(
@@ -323,7 +223,9 @@ class GridworldMazeEnv(EnvBase):
             x.to(torch.int64).clone() for x in torch.broadcast_tensors(maze, *tiles, steps)
         )
         steps = steps.unsqueeze(-1)
-        self._check_state(player_tile, target_tile, maze, steps, maze.shape)
+        values = (player_tile, target_tile, maze, steps)
+        self._check_form(dict(zip(self._limits, values, strict=True)), maze.shape)
+        self._check_tiles(player_tile, target_tile, maze)
         state = self._write_state(player_tile, target_tile, maze, steps, maze.shape)
         return state.update(self.full_done_spec.zero(maze.shape))
 
@@ -365,31 +267,7 @@ class GridworldMazeEnv(EnvBase):
             tiles.append(point.floor().to(torch.int64).flip(-1))
         return self.make_state(maze_index, *tiles, step_count=step_count)
 
-    def render(self, tensordict: TensorDictBase, **options: Any) -> Any:
-        """Draw one state.
-
-        Args:
-            tensordict (TensorDictBase): state without batch dimensions, as from ``reset`` or
-                ``step(...)["next"]``.
-            **options: keywords of :func:`~torchrl_hmcts.envs.draw_maze` (``paths``, ``dots``,
-                ``tile_pixels``, radii).
-
-        Returns:
-            uint8 numpy array ``[h, w, 3]``.
-
-        Raises:
-            ValueError: if the tensordict has batch dimensions.
-
-        Example:
-            >>> env = GridworldMazeEnv(seed=0)
-            >>> env.render(env.reset()).shape
-            (304, 304, 3)
-        """
-        if tensordict.batch_size:
-            raise ValueError(
-                f"render draws one state, got a batch {list(tensordict.batch_size)}. Index it, "
-                f"e.g. env.render(td[0])."
-            )
+    def _draw(self, tensordict: TensorDictBase, options: dict[str, Any]) -> Any:
         return draw_maze(
             self.mazes[tensordict["maze_index"]].cpu(),
             player=tensordict["position"].tolist(),

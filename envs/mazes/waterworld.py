@@ -7,26 +7,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import index
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Categorical
 
 from torchrl_hmcts.envs.mazes.chipmunk import ChipmunkMazes
-from torchrl_hmcts.envs.mazes.layouts import check_mazes, free_tiles, maze_pool, wall_centers
+from torchrl_hmcts.envs.mazes.maze_env import TileMazeEnv
 from torchrl_hmcts.envs.mazes.rendering import draw_maze
 
 _DIRECTIONS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))  # (x, y) of up, down, left, right
-_STATE_KEYS = ("position", "velocity", "target", "maze_index", "step_count")
 _OVERLAP_TOLERANCE = 1e-3  # tiles; a disc in contact is up to 2e-5 inside the wall
 
 
-class WaterworldMazeEnv(EnvBase):
+class WaterworldMazeEnv(TileMazeEnv):
     r"""Steer a disc through a random maze by thrust in four directions until it meets its target.
 
     The physics is Chipmunk's (pymunk), with collisions that are inelastic and frictionless: the
@@ -93,8 +90,7 @@ class WaterworldMazeEnv(EnvBase):
     """Largest speed along an axis that a state may have, tiles per second; thrust reaches 2.1. Even
     along a diagonal it moves the disc by less than its radius per step, so none passes a wall."""
 
-    batch_locked = False
-    _supports_set_state = True
+    make_state_call = "env.make_state(maze_index, position, target)"
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 
     def __init__(
@@ -107,52 +103,25 @@ class WaterworldMazeEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        mazes = maze_pool("train") if mazes is None else mazes
-        check_mazes(mazes)
-        if max_steps < 1:
-            raise ValueError(
-                f"max_steps must be at least 1, got {max_steps}. Use 10**9 for almost no limit."
-            )
-        super().__init__(device=device, batch_size=torch.Size(batch_size))
-        self.num_mazes, self.height, self.width = mazes.shape
-        self.num_walls = int(mazes[0].sum())
-        self.max_steps = max_steps
-        self._writes_observation = observation
-        # Plain attributes, not buffers: EnvBase makes the lookup of a buffer slower than the step.
-        self.mazes = mazes.to(self.device).clone()  # [M, H, W]
-        self._wall_centers = wall_centers(self.mazes).flatten(1)  # [M, 2K]
-        self._free_tiles = free_tiles(self.mazes)  # [M, F]
+        super().__init__(mazes, max_steps, observation, batch_size, device)
         self._acceleration = np.array(_DIRECTIONS, np.float32) * np.float32(self.THRUST)  # [A, 2]
         self._touch = self.PLAYER_RADIUS + self.TARGET_RADIUS
         self._physics = ChipmunkMazes(
-            mazes.cpu().numpy(),
+            self.mazes.cpu().numpy(),
             radius=self.PLAYER_RADIUS,
             damping=self.DAMPING,
             time_step=self.TIME_STEP,
         )
-        self._set_specs()
-        self.set_seed(
-            int(torch.empty((), dtype=torch.int64).random_()) if seed is None else index(seed)
-        )
-
-    def _set_specs(self) -> None:
-        device, batch_size = self.device, self.batch_size
+        device = self.device
         size = torch.tensor([self.width, self.height], dtype=torch.float32, device=device)
-        zero = torch.zeros_like(size)
-        half = torch.full_like(size, 0.5)
-
-        def state() -> dict[str, Any]:
-            speed = torch.full_like(size, self.MAX_SPEED)
-            return {
-                "position": Bounded(zero, size, device=device),
-                "velocity": Bounded(-speed, speed, device=device),
-                "target": Bounded(zero, size, device=device),
-                "maze_index": Categorical(self.num_mazes, shape=(), device=device),
-                "step_count": Bounded(
-                    0, self.max_steps, shape=(1,), dtype=torch.int64, device=device
-                ),
-            }
-
+        zero, half = torch.zeros_like(size), torch.full_like(size, 0.5)
+        speed = torch.full_like(size, self.MAX_SPEED)
+        state = {
+            "position": Bounded(zero, size, device=device),
+            "velocity": Bounded(-speed, speed, device=device),
+            "target": Bounded(zero, size, device=device),
+            **self._counted(),
+        }
         read_outs: dict[str, Any] = {}
         if self._writes_observation:
             read_outs["observation"] = Bounded(
@@ -160,30 +129,8 @@ class WaterworldMazeEnv(EnvBase):
                 torch.cat((size, size, (size - 0.5).repeat(self.num_walls))),
                 device=device,
             )
-        done = {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
-        reward = Unbounded(shape=(1,), dtype=torch.float32, device=device)
-        self.state_spec = Composite(state(), device=device).expand(batch_size)
-        self.observation_spec = Composite({**state(), **read_outs}, device=device).expand(
-            batch_size
-        )
-        self.action_spec = Categorical(len(_DIRECTIONS), shape=(), device=device).expand(batch_size)
-        self.reward_spec = reward.expand(*batch_size, 1)
-        self.done_spec = Composite(done, device=device).expand(batch_size)
-
-    def to(self, device: torch.device | str) -> WaterworldMazeEnv:
-        """Move the env, its mazes and its tables to a device, in place."""
-        super().to(device)
-        for name in ("mazes", "_wall_centers", "_free_tiles"):
-            setattr(self, name, getattr(self, name).to(device))
-        return self
-
-    def _set_seed(self, seed: int | None) -> None:
-        # On the CPU whatever the device: a seed gives the same episodes everywhere.
-        self._generator = torch.Generator()
-        if seed is None:
-            self._generator.seed()
-        else:
-            self._generator.manual_seed(index(seed))
+        action = Categorical(len(_DIRECTIONS), shape=(), device=device)
+        self._set_up(state, read_outs, action, seed, free=("position", "target"))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         # Small arrays: numpy does in one microsecond what torch does in three.
@@ -237,87 +184,27 @@ class WaterworldMazeEnv(EnvBase):
             maze_index=maze,
             step_count=step_count,
         )
-        if self._writes_observation:
-            walls = torch.embedding(self._wall_centers, maze)
-            entries["observation"] = torch.cat((position, target, walls), -1)
+        self._observe(entries, position, target)
         # The checks of TensorDict's constructor would cost as much as the arithmetic.
         return TensorDict._new_unsafe(entries, batch_size, device=self.device)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if kwargs.get("set_state"):
-            return self._reset_to_state(tensordict)
-        shape = self.batch_size if tensordict is None else tensordict.batch_size
-        num_free = self._free_tiles.shape[1]
-
-        def draw(high: int) -> Tensor:
-            return torch.randint(high, shape, generator=self._generator).to(self.device)
-
-        maze, player, target = draw(self.num_mazes), draw(num_free), draw(num_free - 1)
-        target += target >= player  # uniform over the free tiles other than the player's
-        offset = maze * num_free
-        position = self._tile_center(self._free_tiles.take(offset + player))
-        return self._write_state(
-            position,
-            torch.zeros_like(position),
-            self._tile_center(self._free_tiles.take(offset + target)),
-            maze,
-            torch.zeros((*shape, 1), dtype=torch.int64, device=self.device),
-            shape,
-        )
+    def _begin(self, shape: torch.Size) -> TensorDict:
+        maze, player, target, steps = self._draw_tiles(shape)
+        position = self._tile_center(player)
+        at_rest = torch.zeros_like(position)
+        return self._write_state(position, at_rest, self._tile_center(target), maze, steps, shape)
 
     def _tile_center(self, tile: Tensor) -> Tensor:
         column_row = torch.stack((tile % self.width, tile // self.width), -1)
         return column_row + 0.5
 
     def _reset_to_state(self, tensordict: TensorDictBase | None) -> TensorDict:
-        missing = [k for k in _STATE_KEYS if tensordict is None or k not in tensordict.keys()]
-        if tensordict is None or missing:
-            raise ValueError(
-                f"reset(td, set_state=True) needs the whole state in td; missing: {missing}. Build "
-                f"it with env.make_state(maze_index, position, target)."
-            )
-        shape = tensordict.batch_size
-        position, velocity, target, maze, steps = (tensordict.get(key) for key in _STATE_KEYS)
-        self._check_state(position, velocity, target, maze, steps, shape)
-        return self._write_state(position, velocity, target, maze, steps, shape)
+        position, velocity, target, maze, steps = self._state_of(tensordict)
+        assert tensordict is not None
+        self._check_places(position, target, maze)
+        return self._write_state(position, velocity, target, maze, steps, tensordict.batch_size)
 
-    def _check_state(
-        self,
-        position: Tensor,
-        velocity: Tensor,
-        target: Tensor,
-        maze: Tensor,
-        step_count: Tensor,
-        batch_size: torch.Size,
-    ) -> None:
-        for key, value, dtype, shape in (
-            ("maze_index", maze, torch.int64, batch_size),
-            ("step_count", step_count, torch.int64, (*batch_size, 1)),
-            ("position", position, torch.float32, (*batch_size, 2)),
-            ("velocity", velocity, torch.float32, (*batch_size, 2)),
-            ("target", target, torch.float32, (*batch_size, 2)),
-        ):
-            if value.dtype != dtype or value.shape != torch.Size(shape):
-                raise ValueError(
-                    f'"{key}" must be {dtype} {list(shape)}; got {value.dtype} '
-                    f"{list(value.shape)}. env.make_state(...) builds a state of the right form."
-                )
-            if not torch.isfinite(value).all():
-                raise ValueError(
-                    f'"{key}" = {value[~torch.isfinite(value)][0].item()} is not finite. A state '
-                    f"with NaN or infinity cannot be simulated; find the step that wrote it."
-                )
-        for key, value, low, high in (
-            ("maze_index", maze, 0, self.num_mazes - 1),
-            ("step_count", step_count, 0, self.max_steps),
-            ("velocity", velocity, -self.MAX_SPEED, self.MAX_SPEED),
-        ):
-            bad = (value < low) | (value > high)
-            if bad.any():
-                raise ValueError(
-                    f'"{key}" = {value[bad][0].item()} is out of range: {low} to {high} are '
-                    f"allowed."
-                )
+    def _check_places(self, position: Tensor, target: Tensor, maze: Tensor) -> None:
         size = torch.tensor([self.width, self.height], device=position.device)
         for key, point in (("position", position), ("target", target)):
             if ((point < 0) | (point >= size)).any():
@@ -397,35 +284,13 @@ class WaterworldMazeEnv(EnvBase):
         maze, steps = (x.to(torch.int64).expand(shape).clone() for x in (maze, steps))
         at, moving, goal = (point.expand(*shape, 2).clone() for point in points)
         steps = steps.unsqueeze(-1)
-        self._check_state(at, moving, goal, maze, steps, shape)
+        values = (at, moving, goal, maze, steps)
+        self._check_form(dict(zip(self._limits, values, strict=True)), shape)
+        self._check_places(at, goal, maze)
         state = self._write_state(at, moving, goal, maze, steps, shape)
         return state.update({k: torch.zeros_like(steps, dtype=torch.bool) for k in self.done_keys})
 
-    def render(self, tensordict: TensorDictBase, **options: Any) -> Any:
-        """Draw one state.
-
-        Args:
-            tensordict (TensorDictBase): state without batch dimensions, as from ``reset`` or
-                ``step(...)["next"]``.
-            **options: keywords of :func:`~torchrl_hmcts.envs.draw_maze` (``paths``, ``dots``,
-                ``tile_pixels``).
-
-        Returns:
-            uint8 numpy array ``[h, w, 3]``.
-
-        Raises:
-            ValueError: if the tensordict has batch dimensions.
-
-        Example:
-            >>> env = WaterworldMazeEnv(seed=0)
-            >>> env.render(env.reset()).shape
-            (304, 304, 3)
-        """
-        if tensordict.batch_size:
-            raise ValueError(
-                f"render draws one state, got a batch {list(tensordict.batch_size)}. Index it, "
-                f"e.g. env.render(td[0])."
-            )
+    def _draw(self, tensordict: TensorDictBase, options: dict[str, Any]) -> np.ndarray:
         return draw_maze(
             self.mazes[tensordict["maze_index"]].cpu(),
             player=tensordict["position"].tolist(),

@@ -1,17 +1,18 @@
-"""Processes that run options on emulators, one emulator each, fed through shared memory.
+"""Processes that run options, an env in each, fed through shared memory.
 
 Jobs are slots of a shared array: a state, an option and a seed go in, the outcome comes back in the
-same slot. What goes through pipes is the number of a slot, once per option: all processes read from
-one pipe, so that whoever is free takes the next.
+same slot. What goes through pipes are the numbers of slots, up to eight in a message: all processes
+read from one pipe, so that whoever is free takes the next. The messages of a batch get shorter
+towards its end, so that all processes end at about the same time.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import select
 import signal
+import struct
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,8 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_hmcts.envs.atari.emulator import AtariEmulator
-from torchrl_hmcts.envs.atari.workers import OptionWorker
+from torchrl_hmcts.envs.gym.option_run import OptionRun
 from torchrl_hmcts.processes import (
     Silence,
     cpu_ticks,
@@ -36,120 +36,14 @@ from torchrl_hmcts.processes import (
 NUM_SLOTS = 512
 """Options that can be under way at once; larger batches are run in several goes."""
 
-_NUMBER = np.dtype("<i4")
-_MAX_MESSAGE = 4000  # of an error; what a pipe takes at once
+_MESSAGE = struct.Struct("<8i")  # numbers of slots, then -1
+_MOST = 8
+_MAX_ERROR = 4000  # of an error; what a pipe takes at once
 _DEATHS_IN_A_ROW = 5
 _SILENCES_IN_A_ROW = 2
 _LOOK_MILLISECONDS = 500
-_PRELOAD = __name__.replace("process", "preload")
-
-
-@dataclass(frozen=True)
-class OptionRun:
-    """How options are run.
-
-    Attributes:
-        emulator: keywords of :class:`AtariEmulator`.
-        max_steps: steps after which an option ends.
-        gamma: discount per step.
-        end_on_life_loss: whether an option ends when a life is lost.
-        record: whether the steps inside the option are kept.
-    """
-
-    emulator: dict[str, Any]
-    max_steps: int
-    gamma: float
-    end_on_life_loss: bool = False
-    record: bool = False
-
-
-def slot_type(width: int, run: OptionRun) -> np.dtype:
-    """Return the type of a job and its outcome, for states of ``width`` bytes."""
-    fields: list[Any] = [
-        ("state", np.uint8, (width,)),  # in
-        ("option", np.int64),
-        ("seed", np.int64),
-        ("after", np.uint8, (width,)),  # out
-        ("ram", np.uint8, (128,)),
-        ("reward", np.float64),  # discounted sum
-        ("score", np.float64),  # plain sum
-        ("life_losses", np.float64),  # discounted sum
-        ("duration", np.int64),
-        ("lives", np.int64),
-        ("episode_frame", np.int64),
-        ("terminated", np.bool_),
-        ("truncated", np.bool_),
-    ]
-    if run.record:
-        fields += [
-            ("inner_ram", np.uint8, (run.max_steps, 128)),  # before each action
-            ("inner_action", np.int64, (run.max_steps,)),
-            ("inner_reward", np.float32, (run.max_steps,)),
-        ]
-    return np.dtype(fields, align=True)
-
-
-def run_option(
-    emulator: AtariEmulator,
-    worker: OptionWorker,
-    run: OptionRun,
-    slots: np.ndarray,
-    index: int,
-    frames: np.ndarray,
-) -> None:
-    """Run the option in one slot to its end and write the outcome.
-
-    Args:
-        emulator: set to the slot's state first.
-        worker: chooses the actions.
-        run: when the option ends, and what is kept.
-        slots: ``[S]`` of :func:`slot_type`.
-        index: which slot.
-        frames: int64 ``[1]``, counted up by the frames emulated, step by step.
-    """
-    slot = slots[index]
-    option = int(slot["option"])
-    seed = _mixed(int(slot["seed"]), option, slots["state"][index])
-    generator = np.random.default_rng(seed)
-    ends = getattr(worker, "ends", None)
-    before = emulator.num_frames
-    ram = slots["ram"][index]
-    emulator.set_state(slots["state"][index], seed & 0x7FFFFFFF)
-    emulator.read_ram(ram)
-    reward = score = life_losses = 0.0
-    discount = 1.0
-    for step in range(run.max_steps):
-        action = worker.act(ram, option, generator)
-        gained, lost = emulator.act(action)
-        frames[0] += emulator.num_frames - before
-        before = emulator.num_frames
-        if run.record:
-            slots["inner_ram"][index, step] = ram
-            slots["inner_action"][index, step] = action
-            slots["inner_reward"][index, step] = gained
-        emulator.read_ram(ram)
-        score += gained
-        reward += discount * gained
-        life_losses += discount * lost
-        discount *= run.gamma
-        if (
-            (lost and run.end_on_life_loss)
-            or emulator.ale.game_over()
-            or (ends is not None and ends(ram, option, step + 1))
-        ):
-            break
-    slot["duration"] = step + 1
-    slot["reward"], slot["score"], slot["life_losses"] = reward, score, life_losses
-    slot["lives"], slot["episode_frame"] = emulator.lives, emulator.episode_frame
-    slot["terminated"], slot["truncated"] = emulator.terminated, emulator.truncated
-    slots["after"][index] = emulator.state()
-
-
-def _mixed(seed: int, option: int, state: np.ndarray) -> int:
-    """What an option draws its random numbers from: a function of its three arguments."""
-    numbers = seed.to_bytes(8, "little") + option.to_bytes(4, "little")
-    digest = hashlib.blake2b(numbers + state.tobytes(), digest_size=8).digest()
-    return int.from_bytes(digest, "little")
+_STALLS, _LEAST_STALL = 10, 120.0  # step_seconds, and seconds, without a step but computing
+_PRELOAD = __name__.replace("processes", "preload")
 
 
 @dataclass
@@ -157,35 +51,38 @@ class Channel:
     """What the processes share with their owner."""
 
     slots: Tensor  # uint8, the memory of the slots
-    frames: Tensor  # [P] int64, frames emulated by each
+    work: Tensor  # [P] int64, steps taken by each
     jobs: Any = None  # ends of pipes
     results: Any = None
     errors: Any = None
 
-    def views(self, slot: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Return slots and frames as arrays that share their memory."""
-        return self.slots.numpy().view(slot), self.frames.numpy()
 
-
-def serve(rank: int, run: OptionRun, worker: OptionWorker, channel: Channel) -> None:
+def serve(rank: int, kind: type[OptionRun], arguments: tuple[Any, ...], channel: Channel) -> None:
     """Run options until the owner closes the pipe of jobs or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the owner's to handle
     wake_with_parent()
     torch.set_num_threads(1)
     jobs, results = channel.jobs.fileno(), channel.results.fileno()
     try:
-        emulator = AtariEmulator(**run.emulator)
-        slots, frames = channel.views(slot_type(emulator.states.width, run))
-        while message := os.read(jobs, _NUMBER.itemsize):
-            index = int.from_bytes(message, "little")
-            run_option(emulator, worker, run, slots, index, frames[rank : rank + 1])
+        run = kind(*arguments)
+        run.work = memoryview(channel.work.numpy()[rank : rank + 1])
+        slots = fields_of(channel.slots.numpy().view(run.slot_type()))
+        while message := os.read(jobs, _MESSAGE.size):
+            for index in _MESSAGE.unpack(message):
+                if index >= 0:
+                    run.run(slots, index)
             os.write(results, message)
     except BrokenPipeError:  # the owner has gone
         pass
     except Exception:
-        text = f"process {rank}: {traceback.format_exc()[-_MAX_MESSAGE:]}"
+        text = f"process {rank}: {traceback.format_exc()[-_MAX_ERROR:]}"
         with contextlib.suppress(BrokenPipeError):
-            os.write(channel.errors.fileno(), text.encode()[:_MAX_MESSAGE])
+            os.write(channel.errors.fileno(), text.encode()[:_MAX_ERROR])
+
+
+def fields_of(slots: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the fields of a structured array, which share its memory."""
+    return {name: slots[name] for name in slots.dtype.names or ()}
 
 
 @dataclass
@@ -199,23 +96,22 @@ class _Running:
     poll: Any = field(default_factory=lambda: select.poll())
 
 
-class EmulatorProcesses:
+class OptionProcesses:
     """Runs the options in the slots on several processes.
 
-    A process that dies, by a signal or a crash of the emulator, costs what was under way: all
-    processes are started again, and the options without an outcome run again. So does a process
-    that is stopped or hangs, after ``step_seconds``. An error that is raised in a process, e.g. by
-    the worker, is raised here.
+    A process that dies, by a signal or a crash of the env, costs what was under way: all processes
+    are started again, and the options without an outcome run again. So does a process that is
+    stopped or hangs. An error that is raised in a process, e.g. by the worker, is raised here.
 
     Args:
+        owner: name of the pool, for messages.
         num_processes: P.
-        width: bytes of a state.
-        run: how options are run.
-        worker: sent to the processes once; what it shares with them (tensors in shared memory)
+        run: built in each process from its arguments; what these share (tensors in shared memory)
             stays shared.
         start_method: ``"forkserver"`` or ``"spawn"``.
-        step_seconds: longest time in which no process takes a step of its emulator, or uses any
-            processor time, while options are waited for.
+        step_seconds: longest time in which no process takes a step of its env, or uses any
+            processor time, while options are waited for. Processes that compute without a step may
+            do so ten times as long, and two minutes at least.
 
     Raises:
         OSError: if there is too little shared memory, or a process cannot be started.
@@ -223,35 +119,29 @@ class EmulatorProcesses:
     """
 
     def __init__(
-        self,
-        num_processes: int,
-        width: int,
-        run: OptionRun,
-        worker: OptionWorker,
-        start_method: str = "forkserver",
-        step_seconds: float = 60.0,
+        self, owner: str, num_processes: int, run: OptionRun, start_method: str, step_seconds: float
     ) -> None:
-        self.num_processes, self.step_seconds = num_processes, step_seconds
-        self.run, self.worker = run, worker
+        self.owner, self.num_processes, self.step_seconds = owner, num_processes, step_seconds
+        self._job = (type(run), run.arguments)
         self.num_restarts = 0
-        """Processes that died and were started anew."""
+        """Processes that died and were started again."""
         self._context: Any = start_context(start_method)
         if self._context.get_start_method() == "forkserver":  # imports once for all processes
             self._context.set_forkserver_preload([_PRELOAD])
-        slot = slot_type(width, run)
+        slot = run.slot_type()
         memory = torch.zeros(NUM_SLOTS * slot.itemsize, dtype=torch.uint8)
-        frames = torch.zeros(num_processes, dtype=torch.int64)
-        share([memory, frames], "AtariOptionPool")
-        self._memory = Channel(memory, frames)
-        self.slots, self._frames = self._memory.views(slot)
+        work = torch.zeros(num_processes, dtype=torch.int64)
+        share([memory, work], owner)
+        self._memory = Channel(memory, work)
+        self.slots: np.ndarray = memory.numpy().view(slot)
         self._running: _Running | None = None
         self._waiting: set[int] = set()  # slots whose options are under way
         self._lost: set[int] = set()  # slots whose options will not be run
 
     @property
-    def num_frames(self) -> int:
-        """Frames emulated by all processes, those of options that were lost included."""
-        return int(self._frames.sum())
+    def work(self) -> int:
+        """Steps of all processes, those of options that were lost included."""
+        return int(self._memory.work.sum())
 
     @property
     def pids(self) -> list[int]:
@@ -261,7 +151,7 @@ class EmulatorProcesses:
     def start(self) -> None:
         """Start the processes, if they do not run."""
         if self._running is None:
-            with system_errors(f"AtariOptionPool cannot start {self.num_processes} processes"):
+            with system_errors(f"{self.owner} cannot start {self.num_processes} processes"):
                 self._start()
 
     def _start(self) -> None:
@@ -277,13 +167,13 @@ class EmulatorProcesses:
             for end in (*theirs, *ours):
                 end.close()
             raise
-        channel = Channel(self._memory.slots, self._memory.frames, *theirs)
+        channel = Channel(self._memory.slots, self._memory.work, *theirs)
         running = _Running([], *ours)
         running.poll.register(running.results.fileno(), select.POLLIN)
         try:
             for rank in range(self.num_processes):
                 process = self._context.Process(
-                    target=serve, args=(rank, self.run, self.worker, channel), daemon=True
+                    target=serve, args=(rank, *self._job, channel), daemon=True
                 )
                 process.start()
                 running.processes.append(process)
@@ -317,10 +207,10 @@ class EmulatorProcesses:
             )
         try:
             deaths = silences = 0
-            silence = Silence()
+            silences_of = Silence(), Silence()
             while not self._waiting.isdisjoint(slots):
                 before = len(self._waiting)
-                dead = self._listen(silence)
+                dead = self._listen(*silences_of)
                 if len(self._waiting) < before:
                     deaths = silences = 0
                 deaths += len(dead)
@@ -351,18 +241,26 @@ class EmulatorProcesses:
 
     def _write(self, slots: Sequence[int]) -> None:
         assert self._running is not None
+        content, at = b"", 0
+        while at < len(slots):
+            most = max(1, min(_MOST, (len(slots) - at) // (2 * self.num_processes)))
+            part = slots[at : at + most]
+            content += _MESSAGE.pack(*part, *(-1,) * (_MOST - len(part)))
+            at += len(part)
         with contextlib.suppress(BrokenPipeError):  # all have died
-            os.write(self._running.jobs.fileno(), np.array(slots, _NUMBER).tobytes())
+            os.write(self._running.jobs.fileno(), content)
 
-    def _listen(self, silence: Silence) -> list[int | None]:
+    def _listen(self, silence: Silence, stall: Silence) -> list[int | None]:
         """Take what is done, or stop all if one died or all are silent; return exit codes."""
         running = self._running
         assert running is not None
         results = running.results.fileno()
         ready = [fd for fd, _ in running.poll.poll(_LOOK_MILLISECONDS)]
         if not ready:
-            marks = (self.num_frames, *map(cpu_ticks, self.pids))
-            if silence.look(marks) >= self.step_seconds:
+            marks = (self.work, *map(cpu_ticks, self.pids))
+            longest = max(_STALLS * self.step_seconds, _LEAST_STALL)
+            still = silence.look(marks) >= self.step_seconds
+            if stall.look(self.work) >= longest or still:
                 self._kill()
             return []
         if results in ready:
@@ -370,7 +268,7 @@ class EmulatorProcesses:
         if ready == [results]:
             return []
         if running.errors.poll():
-            text = os.read(running.errors.fileno(), _MAX_MESSAGE).decode(errors="replace")
+            text = os.read(running.errors.fileno(), _MAX_ERROR).decode(errors="replace")
             if text:
                 raise RuntimeError(f"An option failed in {text}")
         codes = [p.exitcode for p in running.processes if not p.is_alive()]
@@ -409,5 +307,5 @@ class EmulatorProcesses:
 
 def _numbers(pipe: int) -> list[int]:
     """The numbers of slots that wait in a pipe, none at its end."""
-    message = os.read(pipe, NUM_SLOTS * _NUMBER.itemsize)
-    return np.frombuffer(message, _NUMBER).tolist() if message else []
+    message = os.read(pipe, NUM_SLOTS * _MESSAGE.size)
+    return [number for part in _MESSAGE.iter_unpack(message) for number in part if number >= 0]

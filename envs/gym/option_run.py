@@ -1,0 +1,316 @@
+"""Options taken to their end in one env, by a worker: what each process of a pool does.
+
+Letters: S slots, T ``max_steps``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+from gymnasium.wrappers import TimeLimit
+from torchrl.data.utils import CloudpickleWrapper
+
+from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
+from torchrl_hmcts.envs.gym.families import snapshot_of
+from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
+from torchrl_hmcts.envs.gym.snapshots import SNAPSHOT_KEY, Snapshot, env_layers
+
+Shape = tuple[tuple[int, ...], Any]
+"""Shape and dtype of an entry."""
+_ROW_BEFORE, _ROW_AFTER = f"before {SNAPSHOT_KEY}", f"after {SNAPSHOT_KEY}"
+
+
+class OptionWorker(Protocol):
+    """The part of an agent that acts inside options: any object that can be pickled.
+
+    It may have ``ends(observation, option, steps) -> bool`` too: whether the option ends after so
+    many steps.
+
+    Example:
+        >>> class LeftOrRight:
+        ...     num_options = 2
+        ...     def act(self, observation, option, generator):
+        ...         return option
+        >>> from torchrl_hmcts.envs import OptionPool
+        >>> pool = OptionPool("CartPole-v1", LeftOrRight(), max_steps=4, num_processes=0)
+        >>> pool.num_options
+        2
+    """
+
+    num_options: int
+
+    def act(self, observation: Any, option: int, generator: np.random.Generator) -> Any:
+        """Return the next action.
+
+        Args:
+            observation: as the env gives it; of :class:`AtariOptionPool` the RAM, uint8 ``[128]``.
+                It may be overwritten in the next step.
+            option: which option runs.
+            generator: of all random choices.
+        """
+        ...
+
+
+class OptionRun(ABC):
+    """Runs options in one env.
+
+    A subclass is built from ``arguments``, in each process anew, so that what it opens is never
+    sent.
+
+    Attributes:
+        state_keys: entries that are the state.
+        outputs: shape and dtype of the entries that a state and an outcome have.
+        work: memory of one int64, counted up while options run.
+        step: takes a step as an env of Gymnasium does.
+    """
+
+    state_keys: list[Any]
+    outputs: dict[Any, Shape]
+    step: Callable[[Any], tuple[Any, Any, Any, Any, Any]]
+
+    def __init__(self, worker: OptionWorker, max_steps: int, gamma: float) -> None:
+        self.worker, self.max_steps, self.gamma = worker, max_steps, gamma
+        self.ends: Callable[..., bool] | None = getattr(worker, "ends", None)
+        self.work: Any = memoryview(np.zeros(1, np.int64))
+        self.arguments: tuple[Any, ...] = ()
+
+    def __reduce__(self) -> Any:
+        return type(self), self.arguments
+
+    def slot_type(self) -> np.dtype:
+        """Return the type of a job, and of its outcome after it."""
+        fields: list[Any] = [("option", np.int64), ("seed", np.int64)]
+        fields += [
+            (f"before {key}", dtype, shape)
+            for key, (shape, dtype) in self.outputs.items()
+            if key in self.state_keys
+        ]
+        fields += [(f"after {key}", dtype, shape) for key, (shape, dtype) in self.outputs.items()]
+        fields += [
+            ("reward", np.float32, (1,)),
+            ("duration", np.int64, (1,)),
+            ("terminated", np.bool_, (1,)),
+            ("truncated", np.bool_, (1,)),
+        ]
+        return np.dtype(fields, align=True)
+
+    def run(self, slots: dict[str, np.ndarray], index: int) -> None:
+        """Run the option in one slot to its end and write the outcome.
+
+        Args:
+            slots: the fields of the slots, each ``[S, ...]``.
+            index: which slot.
+        """
+        option = int(slots["option"][index])
+        observation, generator = self.begin(slots, index)
+        act, ends, take, gamma = self.worker.act, self.ends, self.step, self.gamma
+        reward, discount, work = 0.0, 1.0, self.work
+        for step in range(1, self.max_steps + 1):
+            action = act(observation, option, generator)
+            observation, gained, terminated, truncated, _ = take(action)
+            work[0] += 1
+            reward += discount * gained
+            discount *= gamma
+            if terminated or truncated or (ends is not None and ends(observation, option, step)):
+                break
+        slots["reward"][index] = reward
+        slots["duration"][index] = step
+        slots["terminated"][index], slots["truncated"][index] = terminated, truncated
+        self.write(slots, index, observation)
+
+    @abstractmethod
+    def reset(self, generator: np.random.Generator, seed: int | None) -> Any:
+        """Begin an episode, of a seed or of one that is drawn; return its observation."""
+
+    @staticmethod
+    def seed_of(slots: dict[str, np.ndarray], index: int, mark: bytes) -> int:
+        """Return the seed of all draws in an option, a function of the job and a mark of its state.
+
+        The mark must be the same in every process.
+        """
+        numbers = int(slots["seed"][index]).to_bytes(8, "little")
+        numbers += int(slots["option"][index]).to_bytes(4, "little")
+        digest = hashlib.blake2b(numbers + mark, digest_size=8).digest()
+        return int.from_bytes(digest, "little")
+
+    @abstractmethod
+    def begin(self, slots: dict[str, np.ndarray], index: int) -> tuple[Any, np.random.Generator]:
+        """Restore the state of a job; return its observation and the worker's generator."""
+
+    @abstractmethod
+    def write(self, slots: dict[str, np.ndarray], index: int, observation: Any) -> None:
+        """Write the entries of the present state, which has this observation."""
+
+    @abstractmethod
+    def check_action(self, action: Any) -> str:
+        """Return what actions there are, if that is none of them, else nothing."""
+
+    @abstractmethod
+    def render(self, slots: dict[str, np.ndarray], index: int) -> Any:
+        """Draw the state of a job."""
+
+    def check_worker(self, owner: str) -> None:
+        """Refuse a worker that cannot act, before it is sent to the processes."""
+        worker = self.worker
+        count = getattr(worker, "num_options", None)
+        if not isinstance(count, int) or count < 1 or not hasattr(worker, "act"):
+            raise ValueError(
+                f"{owner} needs a worker with num_options (an int >= 1) and act(observation, "
+                f"option, generator) -> action; got {worker!r}. See RepeatActions and SkillWorker "
+                f"in torchrl_hmcts.envs."
+            )
+        observation = self.first_observation()
+        for option in range(count):
+            action = worker.act(observation, option, np.random.default_rng(0))
+            if wanted := self.check_action(action):
+                raise ValueError(
+                    f"The worker {type(worker).__name__} took the action {action!r} in option "
+                    f"{option}; {wanted}."
+                )
+
+    def first_observation(self) -> Any:
+        """Return an observation of an episode's beginning."""
+        return self.reset(np.random.default_rng(0), 0)
+
+
+class GymRun(OptionRun):
+    """Runs options in a Gymnasium env, whose state a snapshot stores.
+
+    Args:
+        env: an id, or a function that makes the env.
+        keywords: of ``gymnasium.make``, or the function.
+        snapshot, cap: as in :func:`snapshot_of`.
+        worker, max_steps, gamma: as in :class:`OptionPool`.
+        redrawing: whether the env's own generators begin every option with new draws.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        keywords: dict[str, Any],
+        snapshot: Any,
+        cap: int,
+        worker: Any,
+        max_steps: int,
+        gamma: float,
+        redrawing: bool,
+    ) -> None:
+        super().__init__(worker, max_steps, gamma)
+        if callable(env) and not isinstance(env, CloudpickleWrapper):
+            env = CloudpickleWrapper(env)
+        self.arguments = (env, keywords, snapshot, cap, worker, max_steps, gamma, redrawing)
+        self.env: gymnasium.Env = make_gym(env, **keywords)
+        self.snapshot: Snapshot = snapshot_of(self.env, snapshot, cap=cap)
+        self._layers = env_layers(self.env)
+        self._clocks = [vars(layer) for layer in self._layers if type(layer) is TimeLimit]
+        self._redrawing = redrawing
+        self._bits: Any = np.random.PCG64(0)
+        self._draws = np.random.Generator(self._bits)
+        noting = type(self.snapshot).note_step
+        unread = (Snapshot.note_step, AttributeSnapshot.note_step)
+        self._notes_actions = noting not in unread
+        self.step = self._noted_step if self._notes_actions else self.env.step
+        observation = self.first_observation()
+        self._paths = _paths(observation)
+        self._single = self._paths == [()]
+        leaves = [_leaf(observation, path) for path in self._paths]
+        # A number, e.g. of a Discrete space, reaches the worker as a number.
+        self._kinds = [None if isinstance(leaf, np.ndarray) else type(leaf) for leaf in leaves]
+        keys = [_key(path) for path in self._paths]
+        self._before = [f"before {key}" for key in keys]
+        self._after = [f"after {key}" for key in keys]
+        arrays = [np.asarray(leaf) for leaf in leaves]
+        self.outputs = {
+            key: (array.shape, array.dtype) for key, array in zip(keys, arrays, strict=True)
+        }
+        self.outputs[SNAPSHOT_KEY] = ((self.snapshot.width,), np.dtype(np.uint8))
+        self.state_keys = list(self.outputs)
+
+    def reset(self, generator: np.random.Generator, seed: int | None) -> Any:
+        seed = int(generator.integers(2**31)) if seed is None else seed & 0x7FFFFFFF
+        self.snapshot.note_reset(seed)
+        return self.env.reset(seed=seed)[0]
+
+    def begin(self, slots: dict[str, np.ndarray], index: int) -> tuple[Any, np.random.Generator]:
+        self.snapshot.restore(slots[_ROW_BEFORE][index])
+        values = [slots[name][index] for name in self._before]
+        # Rows of equal states may differ: objects may have been pickled in another order.
+        mark = b"".join([value.tobytes() for value in values])
+        for clock in self._clocks:
+            mark += b"%d " % (clock["_elapsed_steps"] or 0)
+        seed = self.seed_of(slots, index, mark)
+        if self._redrawing:
+            self._redraw(seed)
+        self._bits.state = {
+            "bit_generator": "PCG64",
+            "state": {"state": seed << 64 | seed, "inc": seed << 1 | 1},
+            "has_uint32": 0,
+            "uinteger": 0,
+        }
+        values = [
+            value.copy() if kind is None else kind(value)
+            for value, kind in zip(values, self._kinds, strict=True)
+        ]
+        if not self._notes_actions:  # one note is enough
+            self.snapshot.note_step(None)
+        return (values[0] if self._single else _nested(self._paths, values)), self._draws
+
+    def _redraw(self, seed: int) -> None:
+        for number, layer in enumerate(self._layers):
+            if vars(layer).get("_np_random") is not None:
+                layer._np_random = np.random.default_rng((seed, number))
+            if isinstance(layer, PrivateRandom):
+                layer.seed(seed)
+
+    def _noted_step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
+        self.snapshot.note_step(action)
+        return self.env.step(action)
+
+    def write(self, slots: dict[str, np.ndarray], index: int, observation: Any) -> None:
+        slots[_ROW_AFTER][index] = self.snapshot.read()
+        for name, path in zip(self._after, self._paths, strict=True):
+            slots[name][index] = _leaf(observation, path)
+
+    def check_action(self, action: Any) -> str:
+        space = self.env.action_space
+        if isinstance(space, gymnasium.spaces.Box):  # whose bounds the env itself keeps
+            fits = np.shape(action) == space.shape and bool(np.isfinite(action).all())
+        else:
+            fits = space.contains(action)
+        return "" if fits else f"the actions of {self.env} are {space}"
+
+    def render(self, slots: dict[str, np.ndarray], index: int) -> Any:
+        self.begin(slots, index)
+        return self.env.render()
+
+
+def _paths(observation: Any) -> list[tuple[str, ...]]:
+    """Where the arrays of an observation are; ``[()]`` where it is one."""
+    if not isinstance(observation, dict):
+        return [()]
+    return [(name, *path) for name, part in observation.items() for path in _paths(part)]
+
+
+def _key(path: tuple[str, ...]) -> Any:
+    return "observation" if not path else path[0] if len(path) == 1 else path
+
+
+def _leaf(observation: Any, path: tuple[str, ...]) -> Any:
+    for name in path:
+        observation = observation[name]
+    return observation
+
+
+def _nested(paths: list[tuple[str, ...]], values: list[Any]) -> dict[str, Any]:
+    whole: dict[str, Any] = {}
+    for (*outer, name), value in zip(paths, values, strict=True):
+        part = whole
+        for key in outer:
+            part = part.setdefault(key, {})
+        part[name] = value
+    return whole

@@ -1,0 +1,152 @@
+"""A trained skill actor as the worker of a pool.
+
+Letters: F features, Z skills, D numbers of an action.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from torchrl_hmcts.checks import instance
+from torchrl_hmcts.envs.gym.shared_network import SharedNetwork, choose, run_network
+from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillMLP
+from torchrl_hmcts.processes import share
+
+# NormalParamExtractor's mapping of the raw scale: softplus(x + shift) + least, 1 at x = 0.
+_LEAST_SCALE = 0.01
+_SHIFT = float(np.log(np.expm1(1.0 - _LEAST_SCALE)))
+
+
+class SkillWorker:
+    r"""Acts as a :class:`SkillActor` inside the processes of a pool.
+
+    Its options are the actor's skills. The weights are a copy in shared memory: :meth:`load` writes
+    new ones, which the processes use from their next step on. For a ``SkillMLP`` or
+    ``ConcatSkillMLP`` of linear layers and ReLU, one forward pass takes a few microseconds; another
+    network runs in torch.
+
+    Args:
+        actor (SkillActor): of discrete or continuous actions; its ``in_keys`` name entries of the
+            env's observation, ``"observation"`` where that is one array.
+        deterministic (bool): take the most probable action, or the squashed mean, instead of a
+            sample. Default False.
+
+    Raises:
+        TypeError: if ``actor`` is something else.
+        OSError: if there is too little shared memory.
+
+    Reference:
+        This project's; the actors are those of :mod:`torchrl_hmcts.modules`.
+
+    Example:
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_hmcts.envs import OptionPool, SkillWorker
+        >>> from torchrl_hmcts.modules import SkillActor
+        >>> actor = SkillActor(4, Categorical(2), num_skills=3, in_keys=["observation"])
+        >>> pool = OptionPool("CartPole-v1", SkillWorker(actor), max_steps=5, num_processes=0)
+        >>> pool.num_options
+        3
+    """
+
+    def __init__(self, actor: SkillActor, *, deterministic: bool = False) -> None:
+        instance("SkillWorker", "actor", actor, SkillActor)
+        self.num_options = int(actor.num_skills)
+        self.deterministic = bool(deterministic)
+        self.keys = [k if isinstance(k, tuple) else (k,) for k in actor.module[0].in_keys[:-1]]
+        self._bounds: tuple[np.ndarray, np.ndarray] | None = None
+        if not hasattr(actor, "num_actions"):  # continuous
+            space = actor.spec[actor.action_key].space
+            low, high = space.low.cpu().numpy(), space.high.cpu().numpy()
+            self._bounds = (high - low) / 2, (high + low) / 2
+        network = actor.network
+        self._shown = isinstance(network, ConcatSkillMLP)  # the network is shown the skill
+        self._weights: SharedNetwork | None = None
+        self._module: nn.Module | None = None
+        if type(network) in (SkillMLP, ConcatSkillMLP) and _is_plain(network):
+            layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+            widths = [layer.out_features for layer in layers[:-1]]
+            heads = 1 if self._shown else self.num_options
+            self._weights = SharedNetwork(
+                layers[0].in_features, layers[-1].out_features // heads, heads, widths
+            )
+        else:
+            self._module = copy.deepcopy(network).cpu().requires_grad_(False)
+            share([*self._module.parameters(), *self._module.buffers()], "SkillWorker")
+        self.load(actor)
+
+    def load(self, actor: SkillActor) -> None:
+        """Take over the weights of an actor of the same shape, in the processes too.
+
+        Args:
+            actor: as that of the constructor.
+
+        Raises:
+            ValueError: if its network has other sizes.
+        """
+        if self._weights is not None:
+            self._weights.load(actor.network.parameters())
+            return
+        assert self._module is not None
+        with torch.no_grad():
+            own = self._module.state_dict()
+            for name, value in actor.network.state_dict().items():
+                own[name].copy_(value)
+
+    def act(self, observation: Any, option: int, generator: np.random.Generator) -> Any:
+        """Return an action of a skill: an index, or float32 ``[D]``."""
+        x = self._features(observation)
+        draw = -1.0 if self.deterministic else generator.random() if self._bounds is None else 0.0
+        if self._weights is None:
+            outputs = self._run_module(x, option)
+            if self._bounds is None:
+                return _pick(outputs, draw)
+        else:
+            net, head = self._weights, option
+            if self._shown:
+                x, head = np.concatenate([x, np.eye(1, self.num_options, option)[0]]), 0
+            arrays = x, net._array, net._sizes, net._heads[head], net._logits
+            if self._bounds is None:
+                return int(choose(*arrays, draw, 1.0))
+            run_network(*arrays, 1.0)
+            outputs = net._logits
+        loc, raw = np.split(outputs, 2)
+        if not self.deterministic:
+            scale = np.logaddexp(0.0, raw + _SHIFT) + _LEAST_SCALE
+            loc = loc + scale * generator.standard_normal(len(loc))
+        half, middle = self._bounds
+        return (half * np.tanh(loc) + middle).astype(half.dtype)
+
+    def _features(self, observation: Any) -> np.ndarray:
+        if not isinstance(observation, dict):
+            return np.asarray(observation, np.float32).reshape(-1)
+        parts = []
+        for path in self.keys:
+            part = observation
+            for name in path:
+                part = part[name]
+            parts.append(np.asarray(part, np.float32).reshape(-1))
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _run_module(self, x: np.ndarray, option: int) -> np.ndarray:
+        assert self._module is not None
+        with torch.no_grad():
+            return self._module(torch.from_numpy(x), torch.tensor(option)).numpy()
+
+
+def _pick(logits: np.ndarray, draw: float) -> int:
+    """The most probable action, or that at which the cumulative probability passes ``draw``."""
+    if draw < 0.0:
+        return int(logits.argmax())
+    shares = np.exp(logits - logits.max())
+    return int(min(np.searchsorted(np.cumsum(shares), draw * shares.sum()), len(shares) - 1))
+
+
+def _is_plain(network: nn.Module) -> bool:
+    """Whether a network has nothing but linear layers and ReLU."""
+    leaves = [layer for layer in network.modules() if not list(layer.children())]
+    return all(type(layer) in (nn.Linear, nn.ReLU) for layer in leaves)
