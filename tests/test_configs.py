@@ -93,7 +93,7 @@ NOT_CONFIGURED = {
     "torchrl_hmcts.objectives": {"NStepReturn", "SkillObjective"},
     "torchrl_hmcts.transforms": {"PlansGoals"},
     # Own processes and workers; another program.
-    "torchrl_hmcts.envs": {"AtariOptionPool", "DeepMindLabEnv"},
+    "torchrl_hmcts.envs": {"AtariOptionPool", "DeepMindLabEnv", "OptionPool"},
 }  # fmt: skip
 
 
