@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment, find_experiment
+from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.runs.config import config_keys
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 ALL = [*EXPERIMENTS.values()]
 
@@ -70,6 +71,7 @@ def test_ctrl_c_ends_with_the_command_that_continues(tmp_path, capsys, monkeypat
     monkeypatch.setattr("torchrl_hmcts.trainers.experiments.goals.run_goals", interrupted)
     assert main(["train", "experiment=waterworld_a3c", "out=runs/my own"]) == 130
     assert "Continue with: hmcts train 'resume=runs/my own'" in capsys.readouterr().err
+    assert read_run("runs/my own").record["status"] == "stopped"
 
 
 def test_the_demo_lists_its_keys_with_their_meaning(capsys) -> None:
@@ -77,10 +79,6 @@ def test_the_demo_lists_its_keys_with_their_meaning(capsys) -> None:
         main(["demo", "--help"])
     assert stop.value.code == 0
     assert f"  gamma={DemoConfig().gamma}\n      Discount per base step." in capsys.readouterr().out
-
-
-def test_an_experiment_is_found_by_name() -> None:
-    assert find_experiment("labmaze").name == "labmaze"
 
 
 @pytest.mark.parametrize(

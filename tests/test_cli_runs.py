@@ -99,27 +99,6 @@ def test_on_a_full_disk_an_evaluation_is_printed(run: Path, tmp_path, monkeypatc
     ]
 
 
-def test_resume_goes_on_with_the_saved_config(tmp_path, monkeypatch) -> None:
-    seen = []
-
-    def remembered(config) -> dict:
-        seen.append(config)
-        return {}
-
-    path = "torchrl_hmcts.trainers.experiments.skills.run_skills"
-    monkeypatch.setattr(path, remembered)
-    out = tmp_path / "run"
-    assert main(["train", "experiment=labmaze", "seed=7", "train_frames=8000", f"out={out}"]) == 0
-    assert main(["train", f"resume={out}"]) == 0
-    assert main(["train", "experiment=labmaze", "seed=7", f"out={out}", "resume=true"]) == 0
-    first, second, third = seen
-    assert (first.resume, second.resume, third.resume) == (False, True, True)
-    assert (second.seed, second.train_frames, second.out) == (7, 8_000, str(out))
-    assert third.train_frames == 40_000
-    record = json.loads((out / "run.json").read_text())
-    assert len(record["commands"]) == 3
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -131,20 +110,6 @@ def test_resume_goes_on_with_the_saved_config(tmp_path, monkeypatch) -> None:
 def test_what_cannot_be_gone_on_with_is_said(run: Path, capsys, words, message) -> None:
     assert main(["train", *(word.format(run=run) for word in words)]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_going_on_without_a_checkpoint_says_so(tmp_path, capsys) -> None:
-    assert main([*TRAIN, f"out={tmp_path}", "resume=true"]) == 1
-    assert "There is no checkpoint in" in capsys.readouterr().err
-
-
-def test_a_run_that_is_stopped_is_recorded_so(tmp_path, monkeypatch, capsys) -> None:
-    def interrupted(config) -> dict:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("torchrl_hmcts.trainers.experiments.skills.run_skills", interrupted)
-    assert main(["train", "experiment=labmaze", f"out={tmp_path}"]) == 130
-    assert json.loads((tmp_path / "run.json").read_text())["status"] == "stopped"
 
 
 def test_log_level_warning_is_silent_on_standard_output(tmp_path, monkeypatch, capsys) -> None:

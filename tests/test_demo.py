@@ -10,7 +10,6 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-from torchrl_hmcts.trainers.figures.run_page import write_page
 from torchrl_hmcts.trainers.runs.config import parse_overrides
 
 TIMES = ("seconds", "config", "versions")
@@ -78,15 +77,6 @@ def test_a_folder_that_cannot_be_made_is_named_before_any_work(tmp_path, capsys)
     captured = capsys.readouterr()
     assert "Choose another folder with out=DIR" in captured.err
     assert "Learning" not in captured.out
-
-
-def test_the_page_escapes_what_it_shows(tmp_path):
-    path = tmp_path / "index.html"
-    write_page(path, title="<b>", metrics={"a<script>": {"x": "<i>"}}, pictures={"p.png": '"<u>'})
-    page = path.read_text()
-    for raw in ("<b>", "<script>", "<i>", '"<u>'):
-        assert raw not in page
-    assert "a&lt;script&gt;.x" in page
 
 
 def test_keys_may_be_written_as_those_of_a_hydra_group() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
 from torchrl_hmcts.trainers.evaluation import Results
-from torchrl_hmcts.trainers.experiments import find_experiment, skills
+from torchrl_hmcts.trainers.experiments import skills
 from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.lab import (
     TRAINING_MAZES,
@@ -180,10 +180,6 @@ def test_algorithm_3_learns_within_its_frames_and_logs_the_same_losses() -> None
     losses = ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator")
     assert {len(trained.history[name]) for name in losses} == {1 + trained.rounds // 2}
     assert len(frames_curve(trained.tests, 4, 10_800)["frames"]) >= 2
-
-
-def test_the_experiment_is_registered() -> None:
-    assert find_experiment("labmaze").config_class is LabMazeConfig
 
 
 @pytest.mark.parametrize(

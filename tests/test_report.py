@@ -134,14 +134,6 @@ def test_a_damaged_file_is_named_once_and_spares_all_else(
             assert "bad/run.json cannot be read" in capsys.readouterr().err
 
 
-def test_an_unfinished_run_has_a_page_too(tmp_path) -> None:
-    run = write_run(tmp_path / "one", finished=False)
-    write_run_page(read_run(run))
-    page = (run / "index.html").read_text()
-    assert "not finished" in page
-    assert any(source.startswith("data:image/svg") for source in sources(page))
-
-
 def test_whatever_a_run_says_is_escaped(tmp_path) -> None:
     run = write_run(tmp_path / "one", total_frames=EVIL)
     record = json.loads((run / "run.json").read_text())

@@ -169,6 +169,9 @@ class TestResuming:
         assert main(["demo", "mazes=20", "train_base_steps=20032", "out=run"]) == 0
         assert main(["train", "resume=run"]) == 0
         assert ran[1] == DemoConfig(mazes=20, train_base_steps=20_032, out="run", resume=True)
+        assert main(["demo", "mazes=20", "out=run", "resume=true"]) == 0  # not the saved ones
+        assert (ran[2].train_base_steps, ran[2].resume) == (40_000, True)
+        assert len(read_run("run").record["commands"]) == 3
 
     def test_other_settings_are_refused_before_anything_is_touched(self, ran, capsys) -> None:
         assert main(["demo", "out=run"]) == 0

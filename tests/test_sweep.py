@@ -187,12 +187,6 @@ def test_a_trial_that_lags_behind_is_given_up(tmp_path) -> None:
     assert run["status"] == "given up"
 
 
-def test_a_folder_of_another_sweep_is_refused(tmp_path, capsys) -> None:
-    assert sweep(tmp_path, "x=[1,2]", "trials=1") == 0
-    assert sweep(tmp_path, "z=[1,2]", "trials=1") == 2
-    assert "sweep of something else" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("storage", ["", "storage=sqlite:///{out}/trials.db"])
 def test_a_sweep_continues_where_its_folder_was_moved(tmp_path, storage: str) -> None:
     def words(out: Path) -> list[str]:
@@ -279,6 +273,7 @@ def test_no_value_is_drawn_twice_by_a_sweep_that_continues(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["z=[1,2]"], "has a sweep of something else: space"),
         (["x=[1,2]", "steps=5"], "has a sweep of something else: fixed {}"),
         (["x=[1,2]", "objective=-test.cost"], "has a sweep of something else: objective test.y"),
     ],

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_hmcts.trainers.command_line.words import set_log_level
 from torchrl_hmcts.trainers.experiments.registry import Experiment
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.run import open_run
@@ -140,7 +140,11 @@ def printing(log_level: str) -> Iterator[None]:
     Args:
         log_level: one of ``LOG_LEVELS``.
     """
-    if set_log_level(log_level):
+    # TorchRL's own messages (a collector that shuts down, ...) are for those who ask for them.
+    os.environ.setdefault("RL_LOGGING_LEVEL", {"info": "WARNING"}.get(log_level, log_level.upper()))
+    logging.getLogger("torchrl").setLevel(os.environ["RL_LOGGING_LEVEL"])
+    logging.getLogger("torchrl_hmcts").setLevel(log_level.upper())
+    if log_level in ("debug", "info"):
         yield
         return
     os.environ["TQDM_DISABLE"] = "1"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -144,21 +143,3 @@ def folders_of(words: Sequence[str], own: Sequence[str]) -> list[str]:
         if separator and not os.path.isdir(home(word)):
             raise ValueError(unknown_key(key, [*own, "log_level"]))
     return [home(word) for word in words]
-
-
-def set_log_level(level: str) -> bool:
-    """Set how much this process prints; return whether progress is shown.
-
-    Args:
-        level: one of ``LOG_LEVELS``.
-
-    Example:
-        >>> set_log_level("info")
-        True
-    """
-    # TorchRL's own messages (a collector that shuts down, ...) are for those who ask for them.
-    others = {"info": "WARNING"}.get(level, level.upper())
-    os.environ.setdefault("RL_LOGGING_LEVEL", others)
-    logging.getLogger("torchrl").setLevel(os.environ["RL_LOGGING_LEVEL"])
-    logging.getLogger("torchrl_hmcts").setLevel(level.upper())
-    return level in ("debug", "info")

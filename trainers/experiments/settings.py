@@ -80,13 +80,7 @@ class SkillsConfig(RunConfig):
         *("seed", "toy", "options", "algorithm", "objective", "loss", "trainer", "planner"),
         "num_skills",
     )
-    LEAST = dict.fromkeys(
-        (
-            *("mazes", "num_skills", "option_steps", "skill_steps", "init_options", "expansions"),
-            *("retrain_interval", "round_expansions", "leaves_per_wave", "curve_mazes"),
-        ),
-        1,
-    ) | {"curve_points": 0}
+    LEAST = {"curve_points": 0}
     ABOVE_ZERO = ("novelty_radius", "updates_per_step")
     CHOICES = {
         "options": ("learned", "actions"),
@@ -153,7 +147,6 @@ class DemoConfig(SkillsConfig):
 
     EXPERIMENT, KIT = "demo", "waterworld"
     KEPT = (*SkillsConfig.KEPT, "skill_steps")
-    LEAST = {**SkillsConfig.LEAST, "train_base_steps": 1}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -243,15 +236,7 @@ class LabMazeConfig(SkillsConfig):
         *("option_frames", "frames_per_step", "updates_per_step", "skill_frames", "init_options"),
         *("retrain_interval", "round_expansions", "novelty_radius", "gamma"),
     )
-    LEAST = {
-        **dict.fromkeys(
-            ("option_frames", "frames_per_step", "train_frames", "skill_frames", "max_frames"), 1
-        ),
-        **SkillsConfig.LEAST,
-        "robust_mazes": 1,
-        "improve_expansions": 0,
-        "stall_steps": 0,
-    }
+    LEAST = {"curve_points": 0, "improve_expansions": 0, "stall_steps": 0}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -353,13 +338,7 @@ class WaterworldA3CConfig(RunConfig):
         *("seed", "toy", "gamma", "entropy_coeff", "critic_coeff", "hidden"),
         "max_episode_steps",
     )
-    LEAST = dict.fromkeys(
-        (
-            *("total_frames", "envs_per_learner", "segment_steps", "hidden", "max_episode_steps"),
-            *("test_mazes", "eval_interval", "eval_mazes"),
-        ),
-        1,
-    ) | dict.fromkeys(("num_learners", "entropy_coeff", "critic_coeff"), 0)
+    LEAST = {"num_learners": 0, "entropy_coeff": 0, "critic_coeff": 0}
     ABOVE_ZERO = ("learning_rate", "clip_norm")
 
     def __post_init__(self) -> None:
@@ -396,7 +375,6 @@ class WaterworldGoalsConfig(WaterworldA3CConfig):
     """Worker's reward when it strays beyond the threshold."""
 
     EXPERIMENT = "waterworld_goals"
-    LEAST = {**WaterworldA3CConfig.LEAST, "num_goals": 1}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -20,6 +20,10 @@ LOGGERS = ("csv", "tensorboard", "wandb")
 MAX_SEED = 2**32 - 1
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 BOOL_WORDS = (*_TRUE, *_FALSE)
+_NUMBERS: Mapping[str, tuple[type, type, str]] = {  # plain type, all that count, in words
+    "int": (int, numbers.Integral, "a whole number"),
+    "float": (float, numbers.Real, "a number"),
+}
 
 
 class ExperimentError(ValueError):
@@ -60,7 +64,7 @@ class RunConfig:
     KEPT: ClassVar[tuple[str, ...]] = ("seed", "toy")  # a run that is resumed keeps these
     PATHS: ClassVar[tuple[str, ...]] = ("out",)
     ALIASES: ClassVar[Mapping[str, str]] = {}  # other names of keys on the command line
-    LEAST: ClassVar[Mapping[str, int]] = {}  # least value of a number
+    LEAST: ClassVar[Mapping[str, int]] = {}  # least value of a number; of whole ones 1 if not here
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ()
     CHOICES: ClassVar[Mapping[str, Sequence[str]]] = {}
 
@@ -75,7 +79,8 @@ class RunConfig:
             raise ValueError("out is empty; name a folder, e.g. out=runs/mine.")
         if not 0 <= self.seed <= MAX_SEED:
             raise ValueError(f"seed must be 0 to {MAX_SEED}; got {self.seed}.")
-        for name, least in self.LEAST.items():
+        whole = dict.fromkeys((name for name, kind in kinds.items() if kind == "int"), 1)
+        for name, least in {**whole, "seed": 0, **self.LEAST}.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}.")
         for name in self.ABOVE_ZERO:
@@ -110,16 +115,13 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):
             raise TypeError(f"{name} is true or false; got {value!r}.")
         return bool(value)
-    if kind == "int":
-        if not isinstance(value, numbers.Integral) or isinstance(value, bool):
-            raise TypeError(f"{name} must be a whole number; got {value!r}.")
-        return int(value)
-    if kind == "float":
-        if not isinstance(value, numbers.Real) or isinstance(value, bool):
-            raise TypeError(f"{name} must be a number; got {value!r}.")
+    if kind in _NUMBERS:
+        plain, abstract, what = _NUMBERS[kind]
+        if not isinstance(value, abstract) or isinstance(value, bool):
+            raise TypeError(f"{name} must be {what}; got {value!r}.")
         if not math.isfinite(value):
             raise ValueError(f"{name} must be a finite number; got {value!r}.")
-        return float(value)
+        return plain(value)
     if kind == "dict":
         if not isinstance(value, Mapping):
             raise TypeError(f"{name} must be a dict of changes; got {value!r}.")
@@ -247,8 +249,7 @@ def read_value(key: str, value: str, kind: str) -> Any:
                 raise
             return int(number)
     except (ValueError, OverflowError):
-        what = "a whole number" if kind == "int" else "a number"
-        raise ValueError(f"{key} must be {what}; got {value!r}.") from None
+        raise ValueError(f"{key} must be {_NUMBERS[kind][2]}; got {value!r}.") from None
 
 
 def unknown_key(key: str, known: Sequence[str]) -> str:

@@ -100,13 +100,7 @@ class AtariConfig(RunConfig):
         "tree_policy": ("puct", "uct"),
         "guide": ("none", "prior", "prior_value"),
     }  # fmt: skip
-    LEAST = {
-        **dict.fromkeys(("frames", "max_episode_frames", "tune_trials", "num_skills"), 1),
-        **dict.fromkeys(("skill_base_steps", "leaves_per_wave", "waves_in_flight"), 1),
-        **dict.fromkeys(("trial_steps", "replant_every"), 1),
-        **dict.fromkeys(("option_steps", "rollout_options"), 0),
-        "num_processes": -1,
-    }
+    LEAST = {"option_steps": 0, "rollout_options": 0, "num_processes": -1}
     ABOVE_ZERO = ("ratio", "c", "trial_ratio")
     TOY = {
         "frames": 20_000,

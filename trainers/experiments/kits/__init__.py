@@ -31,7 +31,7 @@ from torchrl_hmcts.trainers.parts import build, merged
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import OptionTransform
 
-__all__: list[str] = []  # for those who write a kit; the recipe is reached by its name
+__all__: list[str] = []
 
 KITS = {"waterworld": "waterworld.WaterworldKit", "labmaze": "lab.LabMazeKit"}
 """Class of each kit by its name on the command line, in this package."""
