@@ -103,7 +103,7 @@ def measure(searcher: MCTSPlanner, real: EnvBase, starts: TensorDictBase) -> dic
 
 def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
     begin = time.process_time()
-    worker = greedy(demo_loss(seed, args.worker_weights))
+    worker = greedy(demo_loss(seed))
     worker_seconds = time.process_time() - begin
     test = maze_pool("test")
     simulator, real = (make_option_env(worker, test) for _ in range(2))
@@ -238,7 +238,6 @@ def main() -> None:
         iterations=4,
         searches=(400, "training mazes an iteration"),
         updates=(200, "updates an iteration"),
-        worker_weights=(None, "state dict of a worker's loss, with {seed}"),
     )
     runs = {str(seed): run(seed, args) for seed in args.seeds}
     text = table(runs)

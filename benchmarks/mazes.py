@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import torch
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.waterworld import (
     make_option_env,
     make_starts,
-    make_training_env,
 )
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.experiments.skills import learn
@@ -26,13 +23,9 @@ RADIUS = 0.7  # of the novelty test, tiles
 __all__ = ["RADIUS", "demo_loss", "greedy", "make_option_env", "make_starts", "planner", "solve"]
 
 
-def demo_loss(seed: int, weights: str | None = None) -> Any:
-    """Train the demo's worker; or read its weights from a file, only to try a script out."""
-    if weights is None:
-        return learn(make_kit(DemoConfig(seed=seed))).loss
-    loss = DIAYNTrainer.make_loss(make_training_env(), 4, seed=seed)
-    loss.load_state_dict(torch.load(weights.format(seed=seed), weights_only=True))
-    return loss
+def demo_loss(seed: int) -> Any:
+    """Train the demo's worker."""
+    return learn(make_kit(DemoConfig(seed=seed))).loss
 
 
 def greedy(loss: Any) -> SkillPolicy:

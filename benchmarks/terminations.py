@@ -81,9 +81,9 @@ def make_terminating_env(
 class Workers:
     """The worker of a seed, and terminations learned for it, each made when first asked for."""
 
-    def __init__(self, seed: int, termination: dict[str, Any], weights: str | None) -> None:
+    def __init__(self, seed: int, termination: dict[str, Any]) -> None:
         self.seed = seed
-        self.worker = greedy(demo_loss(seed, weights))
+        self.worker = greedy(demo_loss(seed))
         self._options = termination
         self._learned: dict[float, TerminationNetwork] = {}
         self._data: TensorDictBase | None = None
@@ -191,14 +191,13 @@ def main() -> None:
         mazes=(342, "test mazes"),
         tuning_mazes=(60, "training mazes to tune in"),
         expansions=(1_000, "of a search in a test maze"),
-        weights=(None, "workers' state dicts, with {seed} in the name"),
     )
     settings, termination = SETTINGS, {}
     if args.quick:
         settings = {variant: rows[2:4] for variant, rows in SETTINGS.items()}
         termination = {"base_steps": 6_400, "value_updates": 200, "termination_updates": 50}
     begin = time.perf_counter()
-    workers = {seed: Workers(seed, termination, args.weights) for seed in args.seeds}
+    workers = {seed: Workers(seed, termination) for seed in args.seeds}
     tuning = maze_pool("train")[-args.tuning_mazes :]
     chosen, tried = {}, {}
     for variant, rows in settings.items():
