@@ -24,10 +24,9 @@ OTHERS = {  # of other packages
 }
 # What is there today: names go, and none comes.
 KNOWN = {
-    *("_TensorClassMeta", "_alpha", "_alpha_loss"),
-    *("_clear_weakrefs", "_compute_target_v2"),
+    *("_TensorClassMeta", "_alpha_loss"),
     *("_decode_state_dict_value", "_encode_state_dict_value", "_foreach_lerp_", "_get_str"),
-    *("_get_time_dim", "_get_tuple", "_modules", "_new_unsafe", "_optim_count"),
+    *("_get_tuple", "_modules", "_new_unsafe", "_optim_count"),
     *("_reduce_loss", "_sources", "_targets", "_traj_pool", "_value_estimator"),
     *("_version", "_wrapped_policy"),
 }

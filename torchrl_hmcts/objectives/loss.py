@@ -44,10 +44,7 @@ class Reduction(_Base):
 
     def _output(self, tensordict: TensorDictBase, losses: Mapping[str, Tensor]) -> TensorDict:
         batch_size = tensordict.batch_size if self.reduction == "none" else torch.Size([])
-        out = TensorDict(dict(losses), batch_size=batch_size)
-        held = [name for name, _ in self.named_children() if name.endswith("_params")]
-        self._clear_weakrefs(tensordict, out, *held)  # for torch.compile
-        return out
+        return TensorDict(dict(losses), batch_size=batch_size)
 
 
 class Loss(Reduction, LossModule):
