@@ -18,8 +18,8 @@ from torchrl.objectives import A2CLoss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import TD1Estimator
 
-from torchrl_hmcts.checks import real_number
-from torchrl_hmcts.objectives.loss import DISTANCES, REDUCTIONS, one_of
+from torchrl_hmcts.checks import one_of, real_number
+from torchrl_hmcts.objectives.loss import DISTANCES, REDUCTIONS
 
 
 def n_step_returns(

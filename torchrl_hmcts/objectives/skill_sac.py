@@ -19,12 +19,11 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import DiscreteSACLoss, SACLoss
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
-from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts.checks import instance, one_of, real_number, whole_number
 from torchrl_hmcts.modules.skill_actor import SkillActor
 from torchrl_hmcts.objectives.loss import (
     DISTANCES,
     Reduction,
-    one_of,
     run_network,
     takes_weights,
     without_terminal_entries,
