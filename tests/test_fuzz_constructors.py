@@ -482,7 +482,14 @@ OUT_OF_RANGE: dict[str, dict[str, tuple[Any, ...]]] = {
         "gamma": (0.0, 1.1, NAN),
         "worker_memory": ("never",),
     },
-    "SkillActor": {"action_spec": (Unbounded((1,)),)},
+    "SkillActor": {
+        "action_spec": (
+            Unbounded((1,)),
+            Bounded(-1.0, math.inf, (1,)),
+            Bounded(-1.0, 1.0, ()),
+            Bounded(0, 5, (1,), dtype=torch.int64),
+        )
+    },
     "SkillCritic": {"in_keys": ([],)},
     "SkillDynamics": {"std": (1e-4,)},
     "SkillMLP": {"num_skills": (0,), "hidden": ((), (64, 0))},

@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
+from torchrl.envs import TransformedEnv
 
 from torchrl_hmcts.modules import (
     ConcatSkillMLP,
@@ -18,6 +19,8 @@ from torchrl_hmcts.modules import (
     SkillPolicy,
     SpectralLinear,
 )
+from torchrl_hmcts.testing import PointMassEnv
+from torchrl_hmcts.transforms import SkillTransform
 
 NETWORKS = [SkillMLP, ConcatSkillMLP]
 
@@ -191,3 +194,27 @@ def test_the_policy_samples_from_the_actors_distribution() -> None:
     assert torch.equal(action, again)
     frequency = action.bincount(minlength=4) / 20_000
     torch.testing.assert_close(frequency, actor.get_dist(td[0]).probs, atol=0.02, rtol=0)
+
+
+def test_a_batched_spec_has_the_bounds_of_one_action() -> None:
+    env = TransformedEnv(PointMassEnv([3], continuous=True), SkillTransform(4, 50))
+    actor = SkillActor(2, env.action_spec, 4, in_keys=["velocity"])
+    assert actor.spec["action"].shape == (2,)
+    data = env.rollout(2, SkillPolicy(actor))
+    assert env.action_spec.unsqueeze(1).expand(3, 2, 2).is_in(data["action"])
+
+
+def test_the_policy_samples_continuous_actions_from_the_actors_distribution() -> None:
+    actor = SkillActor(2, SPECS[2], 4, in_keys=["velocity"])
+    policy = SkillPolicy(actor, generator=torch.Generator().manual_seed(0))
+    td = TensorDict(
+        velocity=torch.ones(20_000, 2),
+        skill=torch.full((20_000,), 3),
+        batch_size=[20_000],
+    )
+    ours = policy(td.copy())["action"]
+    theirs = actor.get_dist(td).sample()
+    torch.testing.assert_close(ours.mean(0), theirs.mean(0), atol=0.03, rtol=0)
+    torch.testing.assert_close(ours.std(0), theirs.std(0), atol=0.03, rtol=0)
+    again = SkillPolicy(actor, generator=torch.Generator().manual_seed(0))(td)["action"]
+    assert torch.equal(ours, again)
