@@ -1,4 +1,7 @@
-"""DIAYNLoss and the discriminator's loss; test_contract_losses.py has what all losses share."""
+"""Soft actor-critic on skills, with discrete actions (DIAYNLoss) and continuous ones.
+
+test_contract_losses.py has what all losses share.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,18 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Categorical, OneHot
-from torchrl.objectives import DiscreteSACLoss
+from torchrl.data import Bounded, Categorical, OneHot
+from torchrl.objectives import DiscreteSACLoss, SACLoss
 
 from torchrl_hmcts.modules import (
     ConcatSkillMLP,
+    SkillActionCritic,
     SkillActor,
     SkillCritic,
     SkillDiscriminator,
     SkillMLP,
 )
-from torchrl_hmcts.objectives import DIAYNLoss, SkillDiscriminatorLoss
+from torchrl_hmcts.objectives import DIAYNLoss, SkillDiscriminatorLoss, SkillSACLoss
 from torchrl_hmcts.transforms import SkillReward
 
 
@@ -31,7 +35,17 @@ def make_loss(*, one_hot: bool = False, network: Any = SkillMLP, **kwargs: Any) 
     return DIAYNLoss(actor, critic, SkillDiscriminator(2, 3), action_space=spec, **kwargs)
 
 
-def make_data(n: int = 6, *, one_hot: bool = False) -> TensorDict:
+def make_continuous(*, network: Any = SkillMLP, **kwargs: Any) -> SkillSACLoss:
+    torch.manual_seed(0)
+    spec = Bounded(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0]), shape=(2,))
+    objective = SkillDiscriminatorLoss(SkillDiscriminator(2, 3))
+    sizes = {"hidden": (8, 8), "activation": torch.nn.Tanh, "network": network}
+    actor = SkillActor(2, spec, 3, in_keys=["velocity"], **sizes)
+    critic = SkillActionCritic(4, 2, 3, in_keys=["velocity", "displacement"], **sizes)
+    return SkillSACLoss(actor, critic, objective, **kwargs)
+
+
+def make_data(n: int = 6, *, one_hot: bool = False, continuous: bool = False) -> TensorDict:
     g = torch.Generator().manual_seed(0)
     skill = torch.randint(3, (n,), generator=g)
     action = torch.randint(4, (n,), generator=g)
@@ -43,6 +57,8 @@ def make_data(n: int = 6, *, one_hot: bool = False) -> TensorDict:
 
     root, after = state(), state()
     root["action"] = torch.nn.functional.one_hot(action, 4) if one_hot else action
+    if continuous:
+        root["action"] = torch.rand(n, 2, generator=g)
     after.update(
         reward=torch.randn(n, 1, generator=g), terminated=terminated, done=terminated.clone()
     )
@@ -99,13 +115,15 @@ def test_losses_written_with_plain_torch_agree() -> None:
 
 
 @pytest.mark.parametrize("network", [SkillMLP, ConcatSkillMLP])
-def test_stacked_critics_agree_with_torchrls_vmap_and_loop(network: type) -> None:
-    td = make_data()
-    outs = []
+@pytest.mark.parametrize("continuous", [False, True])
+def test_stacked_critics_agree_with_torchrls_vmap_and_loop(network: type, continuous: bool) -> None:
+    td, outs = make_data(continuous=continuous), []
+    make, parent = (make_continuous, SACLoss) if continuous else (make_loss, DiscreteSACLoss)
     for vmap in (None, False, True):
-        loss = make_loss(network=network, deactivate_vmap=vmap is False)
+        loss = make(network=network, deactivate_vmap=vmap is False)
         if vmap is not None:
-            DiscreteSACLoss._make_vmap(loss)
+            parent._make_vmap(loss)
+        torch.manual_seed(3)
         outs.append(loss(td.clone()))
     for out in outs[1:]:
         torch.testing.assert_close(outs[0].to_dict(), out.to_dict())
@@ -186,10 +204,50 @@ def test_a_state_dict_of_the_time_before_objectives_still_loads() -> None:
     assert (second.discriminator.network[0].weight == 1.0).all()
 
 
-def test_bad_arguments_are_refused_with_their_value() -> None:
-    with pytest.raises(ValueError, match=r"gamma.*1\.5"):
-        make_loss(gamma=1.5)
-    with pytest.raises(ValueError, match="alpha_init > 0"):
-        make_loss(alpha_init=0.0)
-    with pytest.raises(ValueError, match="median"):
-        make_loss(reduction="median")
+def test_losses_of_continuous_actions_written_with_plain_torch_agree() -> None:
+    loss, td = make_continuous(gamma=0.8, alpha_init=0.2), make_data(continuous=True)
+    torch.manual_seed(5)
+    out = loss(td.clone())
+    actor, skill, after = loss.actor_network, td["skill"], td["next"]
+
+    def critic(i: int, state: TensorDict, action: torch.Tensor) -> torch.Tensor:
+        params = [p[i] for p in loss.qvalue_network_params.parameters()]
+        x = torch.cat((state["velocity"], state["displacement"], action), -1)
+        return loss.qvalue_network.network.run(params, x, skill).squeeze(-1)
+
+    torch.manual_seed(5)  # the next action is drawn first
+    dist = actor.get_dist(after.copy())
+    next_action = dist.rsample()
+    next_q = torch.minimum(critic(0, after, next_action), critic(1, after, next_action))
+    value = next_q - 0.2 * dist.log_prob(next_action)
+    target = after["reward"][:, 0] + 0.8 * ~after["terminated"][:, 0] * value
+    errors = [(critic(i, td, td["action"]) - target.detach()) ** 2 for i in (0, 1)]
+    torch.testing.assert_close(out["qvalue_loss_0"], errors[0].mean())
+    torch.testing.assert_close(out["qvalue_loss_1"], errors[1].mean())
+    torch.testing.assert_close(out["loss_qvalue"], sum(errors).mean())
+    dist = actor.get_dist(td.copy())
+    action = dist.rsample()
+    q = torch.minimum(critic(0, td, action), critic(1, td, action))
+    log_prob = dist.log_prob(action)
+    torch.testing.assert_close(out["loss_actor"], (0.2 * log_prob - q).mean())
+    torch.testing.assert_close(out["entropy"], -log_prob.mean())
+
+
+def test_the_target_entropy_is_known_before_the_first_call() -> None:
+    loss = make_continuous()
+    assert {"_target_entropy", "_value_estimator.gamma"} <= set(loss.state_dict())
+    assert loss.target_entropy == -2.0
+    assert ("next", "action") not in loss.in_keys
+
+
+def test_of_continuous_actions_a_terminal_state_may_be_anything_and_a_truncated_one_not() -> None:
+    td = make_data(continuous=True)
+    td["next", "done"][:3] = True  # the first is terminated, the next two are truncated
+    td["next", "velocity"][0] = torch.nan
+    losses = []
+    for data in (td, make_data(continuous=True)):
+        loss = make_continuous()
+        torch.manual_seed(0)
+        losses.append(loss(data)["loss_qvalue"])
+    assert losses[0].isfinite()
+    torch.testing.assert_close(losses[0], losses[1])

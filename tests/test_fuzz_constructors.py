@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import Bounded, OneHot
+from torchrl.data import Bounded, OneHot, Unbounded
 from torchrl.modules import UCBScore
 from torchrl.trainers import Trainer
 
@@ -451,6 +451,87 @@ def test_what_makes_no_sense_is_refused_by_name(name: str) -> None:
             CASES[name] += 1
             assert not complaint(call, GOOD[name]()[1], {parameter: value})
     fuzz(name, 30 if name in COSTLY else 60)
+
+
+# What must not be accepted, of arguments whose range is a part of their meaning.
+OUT_OF_RANGE: dict[str, dict[str, tuple[Any, ...]]] = {
+    "A3CLoss": {
+        "gamma": (1.5,),
+        "entropy_coeff": (-1.0,),
+        "critic_coeff": (0.0,),
+        "reduction": ("median",),
+    },
+    "DIAYNLoss": {"gamma": (1.5,), "alpha_init": (0.0,), "reduction": ("median",)},
+    "FixedSkillPrior": {
+        "weights": ([1.0] * 3, [-1.0, 2.0, 0.0, 0.0], [0.0] * 4, [1.0, math.inf, 0.0, 0.0])
+    },
+    "GrowingSkillPrior": {"num_skills": (0,), "num_active": (0, 5)},
+    "IntraOptionQLoss": {"gamma": (1.5,)},
+    "LearnedSkillPrior": {"logits": ([0.0], [NAN] * 4)},
+    "LearnedTermination": {"every": (0,), "termination_logits_key": ("beta",)},
+    "METRAEncoderLoss": {"dual_init": (-1.0, 0.0), "slack": (-1.0,)},
+    "OptionMemory": {"radius": (-1.0,), "capacity": (0,)},
+    "OptionModel": {"num_models": (0,), "delta_keys": ({},)},
+    "OptionModelLoss": {"reward_coeff": (-1.0,), "reduction": ("median",)},
+    "OptionRecorder": {"keys": (["skill"],)},
+    "OptionTerminationLoss": {"deliberation_cost": (-0.1,), "reduction": ("max",)},
+    "OptionTransform": {
+        "worker": ("walk",),
+        "num_options": (0, -3),
+        "max_steps": (0, 2.5, True),
+        "gamma": (0.0, 1.1, NAN),
+        "worker_memory": ("never",),
+    },
+    "SkillActor": {
+        "action_spec": (
+            Unbounded((1,)),
+            Bounded(-1.0, math.inf, (1,)),
+            Bounded(-1.0, 1.0, ()),
+            Bounded(0, 5, (1,), dtype=torch.int64),
+        )
+    },
+    "SkillCritic": {"in_keys": ([],)},
+    "SkillDynamics": {"std": (1e-4,)},
+    "SkillMLP": {"num_skills": (0,), "hidden": ((), (64, 0))},
+    "SkillMaskTransform": {"prior": ([1.0, 0.0],)},
+    "SkillPolicy": {"actor": (nn.Linear(2, 2),)},
+    "SkillPriorLoss": {
+        "prior": (modules.GrowingSkillPrior(2),),
+        "entropy_coeff": (-1.0,),
+        "decay": (1.1,),
+        "reduction": ("max",),
+    },
+    "SkillReward": {"objective": (nn.Linear(2, 2),)},
+    "SkillTransform": {
+        "num_skills": (0,),
+        "max_skill_steps": (0,),
+        "prior": ([0.2, 0.8], [-1.0, 1.0, 1.0, 1.0]),
+    },
+    "StallTermination": {"num_steps": (0, 2.0, True)},
+    "StallTransform": {"tolerance": (-1,)},
+    "SubgoalTransform": {
+        "planner": (3,),
+        "goal_met_threshold": (0.0,),
+        "goal_divergence_threshold": (0.5, NAN),
+        "r_tick": (math.inf,),
+        "r_goal_met": (NAN,),
+        "r_goal_divergence": (1.0,),
+        "num_goals": (0,),
+        "max_goals": (0,),
+    },
+    "TerminationNetwork": {"initial_probability": (1.0,)},
+}
+
+
+@pytest.mark.parametrize("name", OUT_OF_RANGE)
+def test_a_value_out_of_its_range_is_refused_by_name(name: str) -> None:
+    for argument, values in OUT_OF_RANGE[name].items():
+        for value in values:
+            call, good = GOOD[name]()
+            with pytest.raises((TypeError, ValueError)) as raised:
+                call(**{**good, argument: value})
+            message = str(raised.value)
+            assert argument in message or shows(value, message), message
 
 
 @pytest.mark.slow

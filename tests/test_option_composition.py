@@ -308,8 +308,6 @@ class TestRecurrentWorker:
         base = TransformedEnv(GymEnv("Pendulum-v1"), InitTracker())
         with pytest.raises(ValueError, match=r"keep \['memory'\].*make_tensordict_primer"):
             base.append_transform(OptionTransform(worker, 1, 3, worker_memory="keep"))
-        with pytest.raises(ValueError, match="'reset'.*or 'keep'; got 'never'"):
-            OptionTransform(worker, 1, 3, worker_memory="never")
 
 
 class Counting(torch.nn.Module):

@@ -101,10 +101,3 @@ def test_the_oldest_outcome_makes_room_and_clear_forgets_all() -> None:
     assert places == [1.0, 4.0, 6.0]
     memory.clear()
     assert recalled(memory, state(5.0, option=0))["place"][0, 0].item() == 5.0
-
-
-def test_bad_arguments_are_refused_with_their_value() -> None:
-    with pytest.raises(ValueError, match=r"radius > 0.*-1"):
-        make_memory(-1.0)
-    with pytest.raises(ValueError, match="capacity"):
-        make_memory(capacity=0)

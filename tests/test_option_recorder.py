@@ -194,8 +194,3 @@ def test_an_env_that_hands_nothing_out_is_refused() -> None:
         env.observation_spec  # noqa: B018
     with pytest.raises(KeyError, match="trajectory_keys=recorder.trajectory_keys"):
         TransformedEnv(ChainEnv(), OptionRecorder(["state"])).observation_spec  # noqa: B018
-
-
-def test_nothing_to_record_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"\['skill'\], of which none"):
-        OptionRecorder(["skill"])

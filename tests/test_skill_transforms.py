@@ -25,7 +25,7 @@ from torchrl.data import (
 from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior, SkillDiscriminator
+from torchrl_hmcts.modules import GrowingSkillPrior, SkillDiscriminator
 from torchrl_hmcts.objectives import SkillDiscriminatorLoss
 from torchrl_hmcts.testing import ContractError, check_transform
 from torchrl_hmcts.transforms import (
@@ -88,26 +88,11 @@ def make_env(batch: Sequence[int] = (), ends: int = 1000, **kwargs: Any) -> Tran
     )
 
 
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-@pytest.mark.parametrize("max_skill_steps", [None, 3])
-def test_specs_are_exact(batch: tuple[int, ...], max_skill_steps: int | None) -> None:
-    check_env_specs(make_env(batch, max_skill_steps=max_skill_steps))
-
-
 def test_specs_are_exact_around_batched_envs() -> None:
     env = TransformedEnv(SerialEnv(2, Line), Compose(SkillTransform(4, 3), DisplacementTransform()))
     check_env_specs(env)
     data = env.rollout(4, break_when_any_done=False)
     assert data["skill_step"][0].flatten().tolist() == [0, 1, 2, 0]
-
-
-def test_inside_a_worker_the_transforms_are_refused() -> None:
-    for transform in (SkillTransform(4, 3), DisplacementTransform()):
-        with pytest.raises(RuntimeError, match="Put it outside"):
-            transform._check_batched_worker_compat()
-    SkillTransform(4)._check_batched_worker_compat()
-    with pytest.raises(RuntimeError, match="Put it outside"):
-        SkillTransform(4, prior=FixedSkillPrior(4))._check_batched_worker_compat()
 
 
 def test_a_mini_episode_keeps_its_skill_and_the_next_root_has_a_new_one() -> None:
@@ -201,21 +186,6 @@ def test_a_skill_that_is_switched_off_ends_its_mini_episode_at_the_next_step() -
         assert root["skill_step"].flatten().tolist() == [2] * 4 + [0] * 12
 
 
-def test_nested_keys() -> None:
-    skill, step, move = ("agent", "z"), ("agent", "k"), ("agent", "d")
-    env = TransformedEnv(
-        Line((2,)),
-        Compose(
-            SkillTransform(4, 2, skill_key=skill, skill_step_key=step),
-            DisplacementTransform(out_key=move, origin_key=("agent", "o"), skill_step_key=step),
-        ),
-    )
-    check_env_specs(env)
-    data = env.rollout(4)
-    assert data[step][0].flatten().tolist() == [0, 1, 0, 1]
-    assert data["next", "agent", "d"].shape == (2, 4, 1)
-
-
 def a_discriminator() -> SkillDiscriminator:
     net = SkillDiscriminator(1, 2)
     with torch.no_grad():
@@ -254,50 +224,9 @@ def test_the_reward_has_its_closed_form(kwargs: dict[str, Any], expected: list[f
     assert not out["next", "reward"].requires_grad
 
 
-def test_a_replay_buffer_scores_with_the_discriminator_of_today() -> None:
-    net = a_discriminator()
-    transform = discriminator_reward(net)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(2), transform=transform, batch_size=64)
-    buffer.extend(transitions())
-    assert buffer.sample()["next", "reward"].max() == pytest.approx(math.log(1.5))
-    with torch.no_grad():
-        net.network[0].weight.zero_()
-    assert not buffer.sample()["next", "reward"].any()
-    assert list(transform.parameters()) == []
-
-
-def test_an_env_scores_each_step() -> None:
-    env = make_env((3,), num_skills=2)
-    env.append_transform(discriminator_reward(a_discriminator()))
-    check_env_specs(env)
-    data = env.rollout(5)
-    logits = torch.cat((data["next", "displacement"], torch.zeros(3, 5, 1)), -1)
-    log_q = logits.log_softmax(-1).gather(-1, data["skill"].unsqueeze(-1))
-    torch.testing.assert_close(data["next", "reward"], log_q + math.log(2))
-
-
-def test_bad_arguments_are_refused_with_their_value() -> None:
-    with pytest.raises(ValueError, match="num_skills >= 1; got 0"):
-        SkillTransform(0)
-    with pytest.raises(ValueError, match="max_skill_steps >= 1; got 0"):
-        SkillTransform(2, 0)
-    with pytest.raises(ValueError, match=r"shape \(2,\)"):
-        SkillTransform(2, prior=[0.2, 0.3, 0.5])
-    with pytest.raises(ValueError, match="none negative"):
-        SkillTransform(2, prior=[-1.0, 1.0])
-    with pytest.raises(ValueError, match="SkillTransform has 2 skills.*over 4"):
-        SkillTransform(2, prior=FixedSkillPrior(4))
-    with pytest.raises(RuntimeError, match="replay buffer"):
-        SkillTransform(2)(transitions())
+def test_entries_that_are_missing_are_named() -> None:
     with pytest.raises(KeyError, match="after the SkillTransform"):
         _ = TransformedEnv(Line(), DisplacementTransform()).observation_spec
-    without = transitions()
-    del without["next", "reward"]
-    with pytest.raises(KeyError, match="extrinsic_coeff"):
-        discriminator_reward(a_discriminator(), extrinsic_coeff=1.0)(without)
-
-
-def test_stepping_without_a_skill_says_where_it_comes_from() -> None:
     env = make_env()
     with pytest.raises(KeyError, match=r"env\.reset"):
         env.step(env.reset().exclude("skill").set("action", torch.tensor(0)))

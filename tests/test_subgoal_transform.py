@@ -353,17 +353,6 @@ def test_specs_are_exact(batch: tuple[int, ...], relative: bool) -> None:
     check_env_specs(make_env(batch, relative=relative))
 
 
-def test_every_entry_can_be_nested() -> None:
-    names = (
-        "goals plan plan_length goal_index num_plans num_goals_met num_divergences task_reward"
-    ).split()
-    env = make_env((2,), **{f"{name}_key": ("worker", name) for name in names})
-    check_env_specs(env)
-    flat, nested = walk(make_env((2,)), [LEFT] * 6), walk(env, [LEFT] * 6)
-    for name in names:
-        assert (flat["next", name] == nested["next", "worker", name]).all()
-
-
 def test_a_state_that_holds_a_plan_goes_on_with_it() -> None:
     actions = [RIGHT] * 5 + [LEFT] * 9 + [RIGHT] * 4
     planner = Ahead()
@@ -504,32 +493,6 @@ def test_a_search_without_a_plan_says_from_where() -> None:
 
 
 # ----------------------------------------------------------------------------------------- errors
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"goal_met_threshold": 0.0}, "goal_met_threshold > 0.0.*; got 0.0"),
-        (
-            {"goal_met_threshold": 2.0},
-            "goal_divergence_threshold > goal_met_threshold > 2.0; got 2.0",
-        ),
-        ({"goal_divergence_threshold": math.nan}, "> 0.5; got nan"),
-        ({"r_tick": math.inf}, "r_tick finite; got inf"),
-        ({"r_goal_met": math.nan}, "r_goal_met finite; got nan"),
-        ({"r_goal_divergence": 1.0}, "r_goal_divergence <= 0.0; got 1.0"),
-        ({"num_goals": 0}, "num_goals >= 1; got 0"),
-        ({"max_goals": 0}, "max_goals >= 1; got 0"),
-    ],
-)
-def test_arguments_out_of_range_are_refused(kwargs: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SubgoalTransform(Ahead(), **kwargs)
-
-
-def test_what_is_no_planner_is_refused() -> None:
-    with pytest.raises(TypeError, match="plan_goals; got int"):
-        SubgoalTransform(3)  # type: ignore[arg-type]
 
 
 def test_missing_entries_are_named() -> None:

@@ -10,7 +10,6 @@ from learned_termination import HindsightTransitions, MazeView
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SoftUpdate
@@ -119,18 +118,10 @@ class TestStallTransform:
         assert "stalled_steps" not in env.state_spec.keys()
 
     def test_what_it_cannot_do_is_refused(self):
-        with pytest.raises(ValueError, match="tolerance >= 0.*got -1"):
-            StallTransform("state", -1)
         with pytest.raises(KeyError, match="'place', which the env before it does not write"):
             check_env_specs(TransformedEnv(ChainEnv(6), StallTransform("place")))
         with pytest.raises(KeyError, match="missing from the tensordict to step"):
             StallTransform("x")._step(TensorDict(), TensorDict(x=torch.zeros(1)))
-        buffer = ReplayBuffer(
-            storage=LazyTensorStorage(2), transform=StallTransform("state"), batch_size=1
-        )
-        buffer.extend(TensorDict(state=torch.zeros(2), batch_size=[2]))
-        with pytest.raises(RuntimeError, match="from step to step"):
-            buffer.sample()
 
 
 class TestStallTermination:
@@ -207,11 +198,6 @@ class TestStallTermination:
                 OptionTransform(skill_is_action(), 2, 9, termination=StallTermination(2)),
             )
 
-    @pytest.mark.parametrize("num_steps", [0, 2.0, True])
-    def test_a_number_of_steps_that_is_none_is_refused(self, num_steps):
-        with pytest.raises((ValueError, TypeError), match=f"num_steps.*got {num_steps}"):
-            StallTermination(num_steps)
-
 
 class TestAnyTermination:
     def test_it_ends_where_any_condition_does(self):
@@ -222,12 +208,6 @@ class TestAnyTermination:
     def test_it_reads_what_its_conditions_read(self):
         either = AnyTermination(StallTermination(2, "a", "k"), StallTermination(3, "b", "k"))
         assert either.in_keys == ["a", "k", "b"]
-
-    def test_nothing_to_ask_is_refused(self):
-        with pytest.raises(TypeError, match="one or more callables"):
-            AnyTermination()
-        with pytest.raises(TypeError, match="one or more callables"):
-            AnyTermination(StallTermination(1), None)
 
 
 class Logits(nn.Module):
@@ -342,13 +322,6 @@ class TestLearnedTermination:
         assert (probability > 0.8).all()
 
     def test_what_it_cannot_use_is_refused(self):
-        network = termination_module(1, 1)
-        with pytest.raises(ValueError, match="every >= 1; got 0"):
-            LearnedTermination(network, every=0)
-        with pytest.raises(ValueError, match="reads 'beta', which TensorDictModule does not"):
-            LearnedTermination(network, termination_logits_key="beta")
-        with pytest.raises(ValueError, match="initial_probability.*got 1.0"):
-            TerminationNetwork(2, 4, in_keys=["x"], initial_probability=1.0)
         with pytest.raises(ValueError, match="reads 'view'"):
             TransformedEnv(
                 ChainEnv(6),
@@ -445,10 +418,6 @@ class TestOptionTerminationLoss(ThreeStates):
         assert loss.advantage(self.arrival()).item() == pytest.approx(expected)
 
     def test_what_makes_no_sense_is_refused(self):
-        with pytest.raises(ValueError, match="deliberation_cost >= 0.*got -0.1"):
-            self.make(deliberation_cost=-0.1)
-        with pytest.raises(ValueError, match="reduction.*'max'"):
-            self.make(reduction="max")
         loss, *_ = self.make()
         td = self.arrival()
         td["skill"] = nn.functional.one_hot(td["skill"], 2)
@@ -503,10 +472,6 @@ class TestIntraOptionQLoss(ThreeStates):
         loss = IntraOptionQLoss(values, gamma=0.9, delay_value=False)
         expected = torch.tensor([0.9 * 1.0, 0.9 * 0.5, 1.0, 0.9 * 0.5])
         torch.testing.assert_close(loss.target(self.rows()), expected)
-
-    def test_a_discount_out_of_range_is_refused(self):
-        with pytest.raises(ValueError, match="gamma.*got 1.5"):
-            IntraOptionQLoss(value_module([[0.0]]), gamma=1.5)
 
 
 class TestLearningWhereToEnd:

@@ -112,7 +112,9 @@ def apart(env: EnvBase, *, recorders: bool = True) -> EnvBase:
         return env
     base, transforms = apart(env.base_env, recorders=recorders), flat_transforms(env)
     kept = [t for t in transforms if recorders or not isinstance(t, _RECORDERS)]
-    replaced = any(_is_replaced(t, env) for t in kept)
+    keep_state = (CatFrames,) if env.batch_locked else (CatFrames, InitTracker)
+    carry = (CarriedFrames, CarriedInit)
+    replaced = any(isinstance(t, keep_state) and not isinstance(t, carry) for t in kept)
     if base is env.base_env and len(kept) == len(transforms) and not replaced:
         return env
     if type(env) is not TransformedEnv:
@@ -192,13 +194,6 @@ def _layers(env: EnvBase) -> Iterator[TransformedEnv]:
     while isinstance(env, TransformedEnv):
         yield env
         env = env.base_env
-
-
-def _is_replaced(transform: Transform, env: EnvBase) -> bool:
-    if isinstance(transform, (CarriedFrames, CarriedInit)):
-        return False
-    tracks = isinstance(transform, InitTracker) and not env.batch_locked
-    return tracks or isinstance(transform, CatFrames)
 
 
 class ForeignStates:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,6 +74,15 @@ def instance(owner: str, name: str, value: Any, *kinds: type) -> None:
         raise TypeError(
             f"{owner} needs a {wanted} for {name}; got {value!r}, a {type(value).__name__}."
         )
+
+
+def one_of(owner: str, name: str, value: str, known: Iterable[str]) -> str:
+    """Return a value that is one of those known, or raise a ValueError."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(
+            f"{owner} needs {name} to be {' or '.join(map(repr, known))}; got {value!r}."
+        )
+    return value
 
 
 def nested_key(owner: str, name: str, value: Any) -> NestedKey:

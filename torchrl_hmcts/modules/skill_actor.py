@@ -98,7 +98,7 @@ class _Squashed:
         flat = ends.reshape(2, -1, spec.shape[-1])
         if not flat.isfinite().all() or not (flat == flat[:, :1]).all():
             raise ValueError(
-                "SkillActor needs finite bounds of the action that are the same for the whole "
+                "SkillActor needs an action_spec of finite bounds, the same for the whole "
                 f"batch; got {ends.tolist()}."
             )
         low, high = flat[:, 0].clone()

@@ -18,8 +18,8 @@ from torchrl.objectives import A2CLoss
 from torchrl.objectives.utils import ValueEstimators
 from torchrl.objectives.value import TD1Estimator
 
-from torchrl_hmcts.checks import real_number
-from torchrl_hmcts.objectives.loss import DISTANCES, REDUCTIONS, one_of
+from torchrl_hmcts.checks import one_of, real_number
+from torchrl_hmcts.objectives.loss import DISTANCES, REDUCTIONS
 
 
 def n_step_returns(
@@ -115,7 +115,8 @@ class NStepReturn(TD1Estimator):
                 "NStepReturn needs a segment, a tensordict whose last dimension is time; this one "
                 "has no dimension at all. Stack the steps: torch.stack(steps, -1)."
             )
-        time = self._get_time_dim(None, tensordict)
+        names = tensordict.names
+        time = names.index("time") if "time" in names else tensordict.ndim - 1
         after = tensordict.get("next")
         reward, done = after.get(keys.reward), after.get(keys.done)
         terminated = after.get(keys.terminated, done)

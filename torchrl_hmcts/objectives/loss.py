@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.checks import one_of
 from torchrl_hmcts.modules.skill_mlp import SkillNetwork, entries
 
 _Base: Any = LossModule if TYPE_CHECKING else object
@@ -44,10 +45,7 @@ class Reduction(_Base):
 
     def _output(self, tensordict: TensorDictBase, losses: Mapping[str, Tensor]) -> TensorDict:
         batch_size = tensordict.batch_size if self.reduction == "none" else torch.Size([])
-        out = TensorDict(dict(losses), batch_size=batch_size)
-        held = [name for name, _ in self.named_children() if name.endswith("_params")]
-        self._clear_weakrefs(tensordict, out, *held)  # for torch.compile
-        return out
+        return TensorDict(dict(losses), batch_size=batch_size)
 
 
 class Loss(Reduction, LossModule):
@@ -93,15 +91,6 @@ class Loss(Reduction, LossModule):
 
 REDUCTIONS = ("mean", "sum", "none")
 DISTANCES = ("l2", "l1", "smooth_l1")
-
-
-def one_of(owner: str, name: str, value: str, known: Iterable[str]) -> str:
-    """Returns a value that is one of those known; else raises ValueError."""
-    if not isinstance(value, str) or value not in known:
-        raise ValueError(
-            f"{owner} needs {name} to be {' or '.join(map(repr, known))}; got {value!r}."
-        )
-    return value
 
 
 def without_terminal_entries(

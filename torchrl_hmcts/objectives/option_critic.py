@@ -13,14 +13,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_hmcts.checks import real_number
-from torchrl_hmcts.objectives.loss import (
-    DISTANCES,
-    Loss,
-    one_of,
-    run_module,
-    without_terminal_entries,
-)
+from torchrl_hmcts.checks import one_of, real_number
+from torchrl_hmcts.objectives.loss import DISTANCES, Loss, run_module, without_terminal_entries
 
 OptionPolicy = Callable[[TensorDictBase], Tensor]
 

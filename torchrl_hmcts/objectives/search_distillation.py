@@ -13,8 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_hmcts.checks import real_number
-from torchrl_hmcts.objectives.loss import Loss, one_of, run_module
+from torchrl_hmcts.checks import one_of, real_number
+from torchrl_hmcts.objectives.loss import Loss, run_module
 
 _VALUE_LOSSES = ("l2", "smooth_l1", "log", "cross_entropy")
 _SMALLEST = 1e-30  # whose logarithm is still a number in float32

@@ -15,15 +15,15 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import TensorSpec
+from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import DiscreteSACLoss, SACLoss
 from torchrl.objectives.utils import ValueEstimators, distance_loss
 
-from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts.checks import instance, one_of, real_number, whole_number
 from torchrl_hmcts.modules.skill_actor import SkillActor
 from torchrl_hmcts.objectives.loss import (
     DISTANCES,
     Reduction,
-    one_of,
     run_network,
     takes_weights,
     without_terminal_entries,
@@ -155,6 +155,25 @@ class _TrainsObjective(Reduction):
         keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
         return without_terminal_entries(after, terminated, keys)
 
+    @property
+    def alpha(self) -> Tensor:
+        """The entropy coefficient, within its bounds, detached."""
+        if self.min_log_alpha is not None or self.max_log_alpha is not None:
+            self.log_alpha.data.clamp_(self.min_log_alpha, self.max_log_alpha)
+        return self.log_alpha.detach().exp()
+
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        """Returns V of the states ``[*B]`` that follow, ``[*B, 1]``."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def _compute_target(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns r + gamma (1 - d) V(s', z), ``[*B]``."""
+        after = self._what_follows(tensordict)
+        after.set(self.value_estimator.tensor_keys.value, self._next_value(after))
+        transitions = tensordict.copy().set("next", after)
+        return self.value_estimator.value_estimate(transitions).squeeze(-1)
+
     def _critic_losses(
         self, chosen: Tensor, target: Tensor, tensordict: TensorDictBase
     ) -> tuple[Tensor, Figures]:
@@ -181,7 +200,7 @@ class _TrainsObjective(Reduction):
             "loss_alpha": self._reduce(self.alpha_loss(log_prob), tensordict),
             **critics,
             **skills,
-            "alpha": self._alpha,
+            "alpha": self.alpha,
             "entropy": -log_prob.mean(),
         }
         return self._output(tensordict, {key: out[key] for key in self.out_keys})
@@ -338,17 +357,11 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
             logits = self.policy_prior(tensordict.copy()).get("logits")
         return log_prob - logits.log_softmax(-1).clamp_min(_LEAST_LOG_PROB)
 
-    def _compute_target(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns r + gamma (1 - d) V(s', z), ``[*B]``, without gradients."""
-        with torch.no_grad():
-            after = self._what_follows(tensordict)
-            log_prob = self._log_probs(after)
-            value = self._critics(after, self.target_qvalue_network_params).amin(0)
-            relative = self._relative(log_prob, after)
-            value = (log_prob.exp() * (value - self._alpha * relative)).sum(-1, keepdim=True)
-            after.set(self.value_estimator.tensor_keys.value, value)
-            transitions = tensordict.copy().set("next", after)
-            return self.value_estimator.value_estimate(transitions).squeeze(-1)
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        log_prob = self._log_probs(after)
+        value = self._critics(after, self.target_qvalue_network_params).amin(0)
+        relative = self._relative(log_prob, after)
+        return (log_prob.exp() * (value - self.alpha * relative)).sum(-1, keepdim=True)
 
     def _qvalue_loss(
         self, action_value: Tensor, tensordict: TensorDictBase
@@ -367,7 +380,7 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
         log_prob = self._log_probs(tensordict)
         prob = log_prob.exp()
         relative = self._relative(log_prob, tensordict)
-        loss = (prob * (self._alpha * relative - min_value)).sum(-1)
+        loss = (prob * (self.alpha * relative - min_value)).sum(-1)
         return self._reduce(loss, tensordict), {"log_prob": (prob * log_prob).sum(-1).detach()}
 
     def _sac_losses(self, tensordict: TensorDictBase) -> tuple[Tensor, Figures, Tensor, Figures]:
@@ -444,9 +457,16 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
         super().__init__(actor_network, qvalue_network, objective, action_spec=action_spec, **sac)
         _ = self.target_entropy  # TorchRL makes this buffer at the first use
 
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        actor, params = self.actor_network, self.actor_network_params
+        with params.to_module(actor, preserve_module_state=False):
+            action, log_prob = rsample_and_log_prob(actor.get_dist(after.copy()))
+        after = after.copy().set(self.tensor_keys.action, action)
+        value = self._critics(after, self.target_qvalue_network_params)  # [N, *B, 1]
+        return (value - self.alpha * log_prob.unsqueeze(-1)).amin(0)
+
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Figures]:
         """Returns the critics' summed loss, ``td_error`` and each critic's own loss."""
-        following = tensordict.copy().set("next", self._what_follows(tensordict))
-        target = self._compute_target_v2(following)  # [*B]
+        target = self._compute_target(tensordict)  # [*B]
         value = self._critics(tensordict, self.qvalue_network_params)  # [N, *B, 1]
         return self._critic_losses(value.squeeze(-1), target, tensordict)

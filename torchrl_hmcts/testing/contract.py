@@ -100,6 +100,17 @@ def require_read(part: str, reader: Any, td: TensorDictBase, what: str) -> None:
         )
 
 
+def asked(part: str, function: Callable[[Any], Any], td: Any, doing: str) -> Any:
+    """Return what a part says of a tensordict, seeded, if it leaves the tensordict as it was."""
+    given = td.clone()
+    with during(part, doing), torch.no_grad(), seeded(0):
+        out = function(given)
+    before, after = td.to_tensordict(), given.to_tensordict()
+    message = f"{part} changed <key> of its input. Compute on copies."
+    require_same(before, after, message, leaves(before) | leaves(after))
+    return out
+
+
 def require_alone(
     part: str,
     ask: Callable[[Any], Any],

@@ -62,7 +62,6 @@ def check_loss(
     gradients: Mapping[str, Sequence[str]] | None = None,
     targets: Sequence[str] = (),
     value_estimators: Sequence[Any] = (),
-    keys: Sequence[str] | None = None,
     tolerance: float = 1e-5,
     seed: int = 0,
     checks: Sequence[str] = LOSS_CHECKS,
@@ -99,7 +98,6 @@ def check_loss(
             ``["qvalue_network"]``. Default: none.
         value_estimators (sequence): arguments of ``make_value_estimator`` to try, e.g.
             ``ValueEstimators.TD0``. Default: none.
-        keys (sequence of str, optional): names of ``set_keys`` to rename. Default: all.
         tolerance (float): difference that is allowed, relative and absolute. Default 1e-5.
         seed (int): of first weights and sampled actions. Default 0.
         checks (sequence of str): which of the above. Default: all. Compiling takes longest.
@@ -125,7 +123,7 @@ def check_loss(
         >>> check_loss(make_loss, td, gradients=gradients, checks=["gradients", "nested_keys"])
     """
     refuse_unknown("check_loss", checks, LOSS_CHECKS)
-    it = _Loss(make_loss, tensordict, gradients, targets, value_estimators, keys, tolerance, seed)
+    it = _Loss(make_loss, tensordict, gradients, targets, value_estimators, tolerance, seed)
     for check in checks:
         getattr(it, f"check_{check}")()
 
@@ -139,7 +137,6 @@ class _Loss:
     gradients: Mapping[str, Sequence[str]] | None
     targets: Sequence[str]
     value_estimators: Sequence[Any]
-    keys: Sequence[str] | None
     tolerance: float
     seed: int
 
@@ -351,9 +348,8 @@ class _Loss:
 
     def renamed(self, check: str, name: Rename) -> None:
         loss = self.make(name)
-        accepted = list(loss._AcceptedKeys.__dataclass_fields__)
         new: dict[str, Any] = {}
-        for field in accepted if self.keys is None else self.keys:
+        for field in loss._AcceptedKeys.__dataclass_fields__:
             key = getattr(self.make().tensor_keys, field)
             new[field] = [name(k) for k in key] if isinstance(key, list) else name(key)
         with during(self.name, f"in set_keys(**{new}) ({check!r})"):

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from torchrl_hmcts.checks import instance, nested_key, real_number, whole_number
+from torchrl_hmcts.checks import instance, nested_key, one_of, real_number, whole_number
 from torchrl_hmcts.nesting import parts
 from torchrl_hmcts.transforms.env_transform import zero_count
 from torchrl_hmcts.transforms.option_checks import HasOptions, Termination
@@ -137,11 +137,6 @@ class OptionTransform(HasOptions):
                     f"OptionTransform needs a {name} that it can call on a tensordict; got "
                     f"{part!r}."
                 )
-        if not isinstance(worker_memory, str) or worker_memory not in ("reset", "keep"):
-            raise ValueError(
-                f"OptionTransform needs worker_memory to be 'reset', so that a recurrent worker "
-                f"begins each option with zeros, or 'keep'; got {worker_memory!r}."
-            )
         self.option_key = nested_key("OptionTransform", "option_key", option_key)
         self.skill_key = nested_key("OptionTransform", "skill_key", skill_key)
         self.duration_key = nested_key("OptionTransform", "duration_key", duration_key)
@@ -158,7 +153,9 @@ class OptionTransform(HasOptions):
         self.max_steps = whole_number("OptionTransform", "max_steps", max_steps, least=1)
         self.gamma = real_number("OptionTransform", "gamma", gamma, above=0.0, most=1.0)
         self.one_hot = one_hot
-        self.worker_memory = worker_memory
+        self.worker_memory = one_of(
+            "OptionTransform", "worker_memory", worker_memory, ("reset", "keep")
+        )
         self.trajectory = None
         if trajectory_keys is not None:
             instance("OptionTransform", "trajectory_keys", trajectory_keys, list, tuple)
