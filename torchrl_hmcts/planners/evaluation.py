@@ -44,13 +44,7 @@ Evaluator = Callable[[TensorDictBase], Any]
 
 
 class NodeEvaluator:
-    """Asks for the priors and values of new nodes, and checks the answers.
-
-    Args:
-        leaf_evaluator: returns values, or an :class:`Evaluation`.
-        option_prior: returns priors, which count before those of ``leaf_evaluator``.
-        num_options: A.
-    """
+    """Asks for the priors and values of new nodes; priors of ``option_prior`` count first."""
 
     def __init__(
         self, leaf_evaluator: Evaluator | None, option_prior: Evaluator | None, num_options: int
@@ -71,20 +65,9 @@ class NodeEvaluator:
     def __call__(
         self, td: TensorDictBase, terminated: np.ndarray, seeds: Callable[[], np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate nodes.
+        """Return priors ``[m, A]``, or ``[0, A]`` if all are equal, and values ``[m]``, float32.
 
-        Args:
-            td: state and observation of the nodes, ``[m]``; it is not changed.
-            terminated: which are terminal, bool ``[m]``: their value is 0.
-            seeds: called for the seeds of the nodes, int64 ``[m]``, if a part draws numbers.
-
-        Returns:
-            priors, float32 ``[m, A]``, or ``[0, A]`` if all are equal, which the search scales to
-            sum to 1 over the options that may be taken; and values, float32 ``[m]``.
-
-        Raises:
-            TypeError: if a part returns no tensor.
-            ValueError: if a part returns another shape, or numbers that no search can use.
+        ``td`` is not changed; ``seeds`` is called if a part draws random numbers.
         """
         m, num_options = td.batch_size[0], self.num_options
         priors, values = np.zeros((0, num_options), np.float32), np.zeros(m, np.float32)

@@ -340,21 +340,19 @@ class WidthNovelty(_Counted):
 
         self._kernels = novelty_kernels
         num_roots, num_features = len(self._limits), features.shape[1]
-        first = self._used is None
-        if first:
+        if self._used is None:
             self._used = np.zeros(num_roots, np.int64)  # values in the table
             self._slots = np.zeros(num_features, np.int64)
+            self._values = np.zeros((num_roots, 0), np.int64)
             self._owners = np.zeros((num_roots, 0), np.int32)
+            self._counts = np.zeros((num_roots, 0), np.uint8)
         size = 64
         while size < 4 * num_features or size <= self._owners.shape[1]:
             size *= 2
         values = np.zeros((num_roots, size), np.int64)
         owners = np.full((num_roots, size), -1, np.int32)
         counts = np.zeros((num_roots, size), np.uint8)
-        if not first:
-            self._kernels.move_values(
-                self._values, self._owners, self._counts, values, owners, counts
-            )
+        self._kernels.move_values(self._values, self._owners, self._counts, values, owners, counts)
         self._values, self._owners, self._counts = values, owners, counts
 
     def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:

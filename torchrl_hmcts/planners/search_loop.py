@@ -70,15 +70,7 @@ class SearchLoop:
 
     @torch.no_grad()
     def run(self, begin: float, rows: np.ndarray) -> Search:
-        """Grow trees and return the search.
-
-        Args:
-            begin: when the call began, in seconds of ``time.perf_counter()``.
-            rows: the roots whose trees grow, int64.
-
-        Raises:
-            RuntimeError: if an earlier run was interrupted while it inserted outcomes.
-        """
+        """Grow the trees of the roots ``rows``; ``begin`` is when the call began, in seconds."""
         search = self.search
         search.limit(self.budget.simulations)
         search.growing = search.num_roots > 0

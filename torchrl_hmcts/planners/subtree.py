@@ -192,9 +192,6 @@ def check_successor(old: SearchSettings, new: SearchSettings) -> None:
     """Refuse settings with which a search that was planted with others cannot continue.
 
     Constants of the tree policy, the waves and the rollouts may differ.
-
-    Raises:
-        ValueError: if another part differs, since what the tree holds would not fit it.
     """
     for name in (part.name for part in fields(old)):
         one, other = getattr(old, name), getattr(new, name)

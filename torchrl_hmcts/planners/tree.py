@@ -146,13 +146,7 @@ class KeepsDocstring(_TensorClassMeta):
 
 
 class TreeArrays:
-    """The trees of ``B`` roots in preallocated arrays that grow by doubling.
-
-    Args:
-        num_roots: B.
-        num_options: A.
-        capacity: nodes per root to make room for at first.
-    """
+    """The arrays of a :class:`SearchTree`, without its views."""
 
     def __init__(self, num_roots: int, num_options: int, capacity: int = 64) -> None:
         self.num_roots = whole_number("A search", "num_roots", num_roots)

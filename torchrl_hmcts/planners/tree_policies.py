@@ -254,11 +254,7 @@ class Gumbel(CompiledPolicy):
     def check_simulations(
         num_simulations: int | None, expand: str, leaves_per_wave: int, waves_in_flight: int
     ) -> None:
-        """Refuse simulations whose schedule cannot be planned.
-
-        Raises:
-            ValueError: if their number is unknown or very large, or several come at a time.
-        """
+        """Refuse simulations of unknown or very large number, or several at a time."""
         if num_simulations is None or expand != "one" or leaves_per_wave * waves_in_flight != 1:
             raise ValueError(
                 f"Gumbel halves a known number of simulations of one option each; got "
