@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_hmcts.trainers.experiments.registry import DEMO, find_experiment
-from torchrl_hmcts.trainers.runs.config import parse_overrides
+from torchrl_hmcts.trainers.command_line.words import parse_config, split_words
+from torchrl_hmcts.trainers.experiments.registry import DEMO, KITS, find_experiment
 
 DOCS = Path(__file__).parents[1] / "docs"
 GENERATED = {"auto_tutorials", "auto_reference", "auto_results", "_build"}
@@ -154,10 +154,13 @@ def test_every_command_of_the_pages_is_understood(page: str, command: str) -> No
     assert verb in {"demo", "train", "evaluate", "sweep", "report", "list"}
     if verb not in {"demo", "train"} or not words:  # the bare verb is a name, no command
         return
-    name = next((word[11:] for word in words if word.startswith("experiment=")), "demo")
-    experiment = DEMO if verb == "demo" else find_experiment(name)
-    keys = [word for word in words if not word.startswith("experiment=")]
-    parse_overrides(experiment.config_class, keys, others=["log_level"])  # raises
+    own, keys = split_words(words, ["experiment", "kit"])
+    experiment = DEMO
+    if "kit" in own:
+        experiment = find_experiment(own["kit"], KITS)
+    elif verb == "train":
+        experiment = find_experiment(own["experiment"])
+    parse_config(experiment, keys)  # raises
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.endswith(".md")])
