@@ -15,7 +15,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import AttributeSnapshot, ReplaySnapshot, SettableGymEnv, SnapshotError
 from torchrl_hmcts.envs.gym.families import snapshot_of
-from torchrl_hmcts.envs.gym.settable import PrivateRandom
+from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ContractError, check_settable
 
@@ -254,3 +254,28 @@ def test_a_row_that_somebody_else_wrote_executes_nothing(tmp_path: Path) -> None
     with pytest.raises(SnapshotError, match="mkdir, which is no class of this env"):
         snapshot.restore(row)
     assert not (tmp_path / "made").exists()
+
+
+def test_a_mujoco_row_follows_every_change_of_an_attribute():
+    pytest.importorskip("gymnasium_robotics")
+    env = make_gym("PointMaze_Large-v3")
+    snapshot = snapshot_of(env)
+    env.reset(seed=0)
+    inner = env.unwrapped
+    goal = inner.goal
+    changes = [
+        ("weight", 0.0), ("weight", -0.0), ("weight", False), ("weight", 0),
+        ("goal", goal.astype(np.float32)), ("goal", np.stack([goal])), ("reset_pos", goal),
+    ]  # fmt: skip
+    for name, value in changes:
+        row = snapshot.read()
+        before = vars(inner).get(name)
+        setattr(inner, name, value)
+        snapshot.note_step(None)
+        changed = snapshot.read()
+        assert (changed != row).any(), (name, value)
+        snapshot.restore(row)
+        assert repr(vars(inner).get(name)) == repr(before)
+        snapshot.note_step(None)
+        snapshot.restore(changed)
+        assert repr(vars(inner)[name]) == repr(value)
