@@ -13,6 +13,7 @@ from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
     check_settings,
@@ -91,6 +92,7 @@ class ResumableTrainer(Trainer):
         overwrite: bool = False,
         **trainer_kwargs: Any,
     ) -> None:
+        whole_number(type(self).__name__, "keep_last", keep_last, least=1)
         self.run_settings: dict[str, Any] = {"trainer": type(self).__name__}
         for part in ("loss_module", "optimizer"):
             if trainer_kwargs.get(part) is not None:
