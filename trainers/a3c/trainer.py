@@ -449,7 +449,7 @@ class A3CTrainer:
 
 def _check(given: Mapping[str, Any]) -> None:
     """Refuses arguments of the constructor that make no sense."""
-    for name in ("total_frames", "segment_steps", "log_interval"):
+    for name in ("total_frames", "segment_steps", "log_interval", "keep_last"):
         whole_number(_OWNER, name, given[name], least=1)
     for name in ("eval_interval", "save_interval"):
         if given[name] is not None:
