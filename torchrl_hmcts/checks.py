@@ -67,7 +67,7 @@ def real_number(
     return number
 
 
-def instance(owner: str, name: str, value: Any, *kinds: type) -> None:
+def instance(owner: str, name: str, value: Any, *kinds: Any) -> None:
     """Raise a TypeError if a value is of none of the classes."""
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)

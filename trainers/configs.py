@@ -208,7 +208,7 @@ def _public_path(component: type) -> str:
 
 def _hints(component: type) -> dict[str, Any]:
     """The annotations that Hydra can check: plain types and None; others are left to the class."""
-    checked = {}
+    checked: dict[str, Any] = {}
     for init in constructors(component):
         try:
             hints = typing.get_type_hints(init)

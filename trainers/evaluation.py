@@ -77,6 +77,7 @@ def execute_plans(
     out = Execution(
         np.zeros(count, np.bool_), np.zeros(count, np.int64), np.zeros(count, np.float32)
     )
+    path: list[tuple[list[TensorDictBase], list[int]]]
     path = [([row.select(*keys)], []) for row in state.clone().split(1)] if keys else []
     running = np.ones(count, np.bool_)
     for i in range(taken.shape[1]):

@@ -36,7 +36,10 @@ class RepeatActions:
     def __init__(self, actions: int | Sequence[int]) -> None:
         if isinstance(actions, numbers.Real):
             actions = range(whole_number("RepeatActions", "actions", actions, least=1))
-        instance("RepeatActions", "actions", actions, Sequence)
+        if not isinstance(actions, Sequence):
+            raise TypeError(
+                f"RepeatActions needs a number or a sequence for actions; got {actions!r}."
+            )
         self.actions = tuple(actions)
         if not self.actions:
             raise ValueError("RepeatActions needs at least one action; got actions=().")

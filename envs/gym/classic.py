@@ -62,7 +62,7 @@ class ClassicSnapshot(Snapshot):
         return np.frombuffer(row, np.uint8)
 
     def restore(self, row: np.ndarray) -> None:
-        *numbers, kind, length, steps, beyond = _ROW.unpack(row)
+        *numbers, kind, length, steps, beyond = _ROW.unpack(row.tobytes())
         values = tuple(numbers[:length])
         self._own.state = values if kind == 0 else np.array(values, _TYPES[kind])
         if self._counts:

@@ -76,7 +76,7 @@ class OptionRun(ABC):
     def __init__(self, worker: OptionWorker, max_steps: int, gamma: float) -> None:
         self.worker, self.max_steps, self.gamma = worker, max_steps, gamma
         self.ends: Callable[..., bool] | None = getattr(worker, "ends", None)
-        self.work: Any = memoryview(np.zeros(1, np.int64))
+        self.work: Any = np.zeros(1, np.int64).data
         self.arguments: tuple[Any, ...] = ()
 
     def __reduce__(self) -> Any:

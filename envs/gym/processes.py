@@ -65,7 +65,7 @@ def serve(rank: int, kind: type[OptionRun], arguments: tuple[Any, ...], channel:
     jobs, results = channel.jobs.fileno(), channel.results.fileno()
     try:
         run = kind(*arguments)
-        run.work = memoryview(channel.work.numpy()[rank : rank + 1])
+        run.work = channel.work.numpy()[rank : rank + 1].data
         slots = fields_of(channel.slots.numpy().view(run.slot_type()))
         while message := os.read(jobs, _MESSAGE.size):
             for index in _MESSAGE.unpack(message):

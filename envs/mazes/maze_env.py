@@ -222,8 +222,8 @@ class TileMazeEnv(MazeEnv):
         maze, player, target = draw(self.num_mazes), draw(num_free), draw(num_free - 1)
         target += target >= player  # uniform over the free tiles other than the player's
         steps = torch.zeros((*shape, 1), dtype=torch.int64, device=self.device)
-        tiles = (self._free_tiles.take(maze * num_free + tile) for tile in (player, target))
-        return maze, *tiles, steps
+        first, second = (self._free_tiles.take(maze * num_free + t) for t in (player, target))
+        return maze, first, second, steps
 
     def _observe(self, entries: dict[str, Tensor], position: Tensor, target: Tensor) -> None:
         """Add ``"observation"``, of the positions and the walls, if it is wanted."""

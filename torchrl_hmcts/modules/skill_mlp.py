@@ -7,6 +7,7 @@ weights may be those of N copies, stacked, as losses hold those of twin critics.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -109,7 +110,7 @@ class SkillMLP(nn.Module):
     def _weights(self) -> list[Tensor]:
         """Returns the network's own weights and biases, in the order of ``parameters()``."""
         *_, last = self.children()
-        linear = [layer for layer in self.trunk if type(layer) is nn.Linear]
+        linear: list[Any] = [layer for layer in self.trunk if type(layer) is nn.Linear]
         return [tensor for layer in (*linear, last) for tensor in (layer.weight, layer.bias)]
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -176,7 +177,7 @@ def _known_num_skills(
     owner: str, num_skills: int | None, network: TensorDictModuleBase | None = None
 ) -> int:
     """Returns the number of skills that a network distinguishes, or the given one."""
-    known = getattr(network, "num_skills", None)
+    known: Any = getattr(network, "num_skills", None)
     if known is None and num_skills is None:
         raise ValueError(
             f"{owner} cannot tell how many skills {type(network).__name__} distinguishes, since it "
@@ -187,4 +188,4 @@ def _known_num_skills(
             f"{owner} was told of num_skills={num_skills}, but its {type(network).__name__} "
             f"distinguishes {known}. Give both the same."
         )
-    return known if num_skills is None else num_skills
+    return int(known) if num_skills is None else num_skills

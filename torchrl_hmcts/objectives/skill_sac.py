@@ -125,7 +125,7 @@ class _TrainsObjective(Reduction):
         # The parent forgets what the critics read of the next state, and nests tuples in tuples.
         action = unravel_key(self.tensor_keys.action)
         critic = [("next", k) for k in self.qvalue_network.in_keys if unravel_key(k) != action]
-        keys = [*self._in_keys, *critic, *self.objective.in_keys]
+        keys = [*self.in_keys, *critic, *self.objective.in_keys]
         self._in_keys = sorted({unravel_key(key) for key in keys}, key=str)
 
     def _make_vmap(self) -> None:

@@ -158,3 +158,7 @@ class SearchSettings:
         for name, number in numbers.items():
             record[name] = number
         return record
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return one of the numbers that the kernels read, ``[1]``, e.g. ``settings["c"]``."""
+        return self.record()[name]

@@ -230,7 +230,8 @@ def _name(env: EnvBase) -> str:
         isinstance(env, EnvBase),
         f"{type(env).__name__} is no torchrl.envs.EnvBase. Wrap it, e.g. with GymWrapper.",
     )
-    name, transforms = env_name(env), []
+    name = env_name(env)
+    transforms: list[str] = []
     while isinstance(env, TransformedEnv):
         transforms[:0] = [type(part).__name__ for part in flat_transforms(env)]
         env = env.base_env

@@ -6,6 +6,7 @@ Letters: m states, F features.
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -68,7 +69,7 @@ def check_novelty(novelty: NoveltyTest, states: TensorDictBase) -> None:
     )
     _check_accept(name, novelty, features)
     _check_relax(name, novelty)
-    statistics = getattr(novelty, "statistics", dict)()
+    statistics: Any = getattr(novelty, "statistics", dict)()
     good = isinstance(statistics, dict) and all(
         isinstance(count, (int, float)) for count in statistics.values()
     )

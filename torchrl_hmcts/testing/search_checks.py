@@ -6,6 +6,7 @@ Letters: d nodes, A options, m states.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -56,7 +57,8 @@ def check_tree_policy(tree_policy: TreePolicy) -> None:
             "policy(nodes) -> scores [d, A].",
         )
         _check_scores(name, tree_policy)
-    for expand in ("one",) if gumbel else ("one", "all"):
+    ways: tuple[Literal["one", "all"], ...] = ("one",) if gumbel else ("one", "all")
+    for expand in ways:
         budget = SearchBudget(simulations=200, until_plan=not gumbel)
         env = ChainEnv(length=5)
         with during(name, f"leading a search with expand={expand!r}"):
@@ -71,7 +73,7 @@ def check_tree_policy(tree_policy: TreePolicy) -> None:
         )
 
 
-def _check_scores(name: str, tree_policy: Callable[[NodeStatistics], Tensor]) -> None:
+def _check_scores(name: str, tree_policy: Any) -> None:
     d, num_options = 6, 3
     g = torch.Generator().manual_seed(0)
     visits = torch.randint(0, 4, (d, num_options), generator=g).float()

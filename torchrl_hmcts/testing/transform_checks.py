@@ -331,8 +331,9 @@ def _unequal_state(one: dict, two: dict) -> str | None:
         below = _unequal_state(a, b) if isinstance(a, dict) and isinstance(b, dict) else None
         if below is not None:
             return f"{key}.{below}"
-        tensors = isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor)
-        if (key in one) != (key in two) or (tensors and not torch.equal(a, b)):
+        if (key in one) != (key in two):
+            return str(key)
+        if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor) and not torch.equal(a, b):
             return str(key)
     return None
 

@@ -408,8 +408,7 @@ def _numbers(tensordict: TensorDictBase, key: NestedKey, m: int) -> np.ndarray:
 
 def _any(value: Tensor, m: int) -> np.ndarray:
     """Return in which elements an entry is true anywhere, bool ``[m]``."""
-    found: np.ndarray = value.numpy(force=True).reshape(m, -1).any(-1)
-    return found
+    return np.asarray(value.numpy(force=True).reshape(m, -1).any(-1))
 
 
 def _within(index: np.ndarray, length: np.ndarray) -> np.ndarray:

@@ -230,6 +230,7 @@ class A3CTrainer:
             optimizer = partial(_OPTIMIZERS[_known("optimizer", optimizer, _OPTIMIZERS)], lr=lr)
         if not isinstance(optimizer, Optimizer):
             optimizer = made_by(optimizer, _OWNER, "optimizer", Optimizer, parameters)
+        assert isinstance(optimizer, Optimizer)
         self.optimizer = share_over(optimizer, parameters)
         columns = board_columns(loss_module)
         board = torch.zeros(max(1, num_learners), len(columns), dtype=torch.float64)

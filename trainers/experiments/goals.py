@@ -311,4 +311,5 @@ def _draw_episode(
         manager = make_tile_planner(env.base_env)
         goals, lengths = manager.plan_goals(start[None])
         search = manager.planner.last_search
+        assert search is not None
         plot_tile_search(env.base_env, start, search, goals[0, : int(lengths[0])], path)

@@ -76,7 +76,7 @@ class SkillsConfig(RunConfig):
     Ray cluster (with algorithm=diayn; such a run does not continue exactly)."""
 
     KIT: ClassVar[str] = ""  # name of the kit
-    KEPT = (
+    KEPT: ClassVar[tuple[str, ...]] = (
         *("seed", "toy", "options", "algorithm", "objective", "loss", "trainer", "planner"),
         "num_skills",
     )
@@ -136,9 +136,9 @@ class DemoConfig(SkillsConfig):
     runs/demo (runs/demo_toy with toy=true), or the next of runs/demo_2, ... that holds no run."""
     mazes: int = 100
     """Test mazes to solve, at most the 342 of the test split."""
-    option_steps: int = 25
+    option_steps: int = 25  # type: ignore[misc]
     """Base steps of an option (the dissertation's N_worker_samples)."""
-    skill_steps: int = 50
+    skill_steps: int = 50  # type: ignore[misc]
     """Base steps of a mini-episode in training: long enough for the skills to part."""
     train_base_steps: int = 40_000
     """Base steps of worker training in the training mazes."""
@@ -193,7 +193,7 @@ class LabMazeConfig(SkillsConfig):
     stall_steps: int = 2
     """Base steps at a standstill, e.g. at a wall, that end an option in a test maze; 0: none ends
     early, as in the dissertation. A search that finds no plan so is made again without."""
-    frames_per_step: int = 4
+    frames_per_step: int = 4  # type: ignore[misc]
     """Frames that an action of the worker lasts."""
     train_frames: int = 40_000
     """Frames of worker training at most, simulated ones included, in 256 mazes of 9 x 9."""
@@ -201,7 +201,7 @@ class LabMazeConfig(SkillsConfig):
     """Updates of the networks per base step."""
     skill_frames: int = 200
     """Frames of a mini-episode in DIAYN's training."""
-    max_frames: int = 10_800
+    max_frames: int = 10_800  # type: ignore[misc]
     """Frames after which an episode ends, three minutes as in the level."""
     expansions: int = 3_000
     """Nodes that a search in a test maze may expand before it gives up."""

@@ -119,9 +119,10 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         plain, abstract, what = _NUMBERS[kind]
         if not isinstance(value, abstract) or isinstance(value, bool):
             raise TypeError(f"{name} must be {what}; got {value!r}.")
-        if not math.isfinite(value):
+        number: Any = value
+        if not math.isfinite(number):
             raise ValueError(f"{name} must be a finite number; got {value!r}.")
-        return plain(value)
+        return plain(number)
     if kind == "dict":
         if not isinstance(value, Mapping):
             raise TypeError(f"{name} must be a dict of changes; got {value!r}.")

@@ -77,7 +77,9 @@ def parse_space(config_class: type, words: Sequence[str]) -> tuple[Space, list[s
             items = [item.strip() for item in value[1:-1].split(",") if item.strip()]
             if len(items) < 2:
                 raise ValueError(f"{word} leaves nothing to choose; give two values or more.")
-            configs = [parse_overrides(config_class, [f"{key}={item}"]) for item in items]
+            configs: list[Any] = [
+                parse_overrides(config_class, [f"{key}={item}"]) for item in items
+            ]
             space[key] = CategoricalDistribution([getattr(config, key) for config in configs])
         elif ".." in value and types.get(key) in ("int", "float"):
             space[key] = _range(key, value, types[key])

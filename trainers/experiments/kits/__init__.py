@@ -40,7 +40,7 @@ KITS = {"waterworld": "waterworld.WaterworldKit", "labmaze": "lab.LabMazeKit"}
 OBJECTIVE = {"_component_": "torchrl_hmcts.objectives.SkillDiscriminatorLoss"}
 """DIAYN's objective, the default of every kit."""
 
-Curve = tuple[Sequence[float], Sequence[float]]  # steps and values
+Curve = tuple[Any, Sequence[float]]  # steps and values
 
 
 @dataclass
