@@ -37,7 +37,7 @@ SAFE_ONLY_WITH = {  # the argument that makes a call safe, and its value
     "load_memmap": ("allow_pickle", False),
 }
 NEVER = re.compile(
-    r"(c?[Pp]ickle\.(load|loads|Unpickler)|cloudpickle\.(load|loads)|dill\.\w+|joblib\.load|marshal\.\w+"
+    r"(c?[Pp]ickle\.(load|loads|Unpickler)|cloudpickle\.(load|loads)|dill\.\w+|joblib\.load|marshal\.loads?"
     r"|shelve\.\w+|yaml\.(load|unsafe_load|full_load)|eval|exec|os\.system|os\.popen|pd\.read_pickle"
     r"|tensordict\.load|TensorDict\.load|.*\.from_consolidated)"
 )

@@ -22,6 +22,7 @@ class RepeatActions:
             actions below it.
 
     Raises:
+        TypeError: if it is neither a number nor a sequence.
         ValueError: if there is no action.
 
     Reference:
