@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_hmcts.modules.skill_prior import SkillPrior
 from torchrl_hmcts.objectives.discovery import SkillDiscriminatorLoss
-from torchrl_hmcts.objectives.skill_sac import DiscreteSkillSACLoss
+from torchrl_hmcts.objectives.skill_sac import DiscreteSkillSACLoss, SkillSACLoss
 
 
 class DIAYNLoss(DiscreteSkillSACLoss):
@@ -87,6 +87,23 @@ class DIAYNLoss(DiscreteSkillSACLoss):
     def discriminator(self) -> TensorDictModuleBase:
         """The discriminator module; its live parameters are those this loss trains."""
         return self.objective.discriminator
+
+
+def _continuous_diayn(
+    actor_network: ProbabilisticTensorDictSequential,
+    qvalue_network: TensorDictModuleBase,
+    discriminator: TensorDictModuleBase,
+    *,
+    num_skills: int | None = None,
+    prior: SkillPrior | Sequence[float] | Tensor | None = None,
+    reduction: str = "mean",
+    **sac: Any,
+) -> SkillSACLoss:
+    """Return a SkillSACLoss with a discriminator, by the arguments of an older class."""
+    objective = SkillDiscriminatorLoss(
+        discriminator, num_skills=num_skills, prior=prior, reduction=reduction
+    )
+    return SkillSACLoss(actor_network, qvalue_network, objective, **sac)
 
 
 def _rename_discriminator_objective(
