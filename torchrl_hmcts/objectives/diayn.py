@@ -93,17 +93,12 @@ def _continuous_diayn(
     actor_network: ProbabilisticTensorDictSequential,
     qvalue_network: TensorDictModuleBase,
     discriminator: TensorDictModuleBase,
-    *,
-    num_skills: int | None = None,
-    prior: SkillPrior | Sequence[float] | Tensor | None = None,
-    reduction: str = "mean",
-    **sac: Any,
+    **given: Any,
 ) -> SkillSACLoss:
     """Return a SkillSACLoss with a discriminator, by the arguments of an older class."""
-    objective = SkillDiscriminatorLoss(
-        discriminator, num_skills=num_skills, prior=prior, reduction=reduction
-    )
-    return SkillSACLoss(actor_network, qvalue_network, objective, **sac)
+    own = {key: given.pop(key) for key in ("num_skills", "prior", "reduction") if key in given}
+    objective = SkillDiscriminatorLoss(discriminator, **own)
+    return SkillSACLoss(actor_network, qvalue_network, objective, **given)
 
 
 def _rename_discriminator_objective(
