@@ -1,8 +1,8 @@
 """The Arcade Learning Environment's emulator with a state that can be set exactly.
 
 ALE 0.12 leaves two things out of a state, and both are put right here. (1) Whether the emulator
-gave the last frame up before the program had ended it: the next frame then goes on instead of
-beginning anew. Qbert does so in a few per cent of its frames. The processor's status tells it; the
+gave the last frame up before the program had ended it: the next frame then continues instead of
+beginning again. Qbert does so in a few per cent of its frames. The processor's status tells it; the
 emulator is made to give up, or to end, one frame of its own before the state is restored. (2) The
 action that is held where actions are sticky: it is sent, in a frame of its own, until it is held.
 """
@@ -218,7 +218,7 @@ class AtariEmulator:
         Args:
             row: as :meth:`state` returned it, of this or another emulator of the game.
             seed: of ALE's generator from here on. Default: what is in the row, or else the
-                generator goes on where it stands.
+                generator continues where it stands.
         """
         rng = self.states.rng(row)
         if self.sticky and seed is not None:

@@ -55,7 +55,7 @@ class ByteGoal:
 
 
 class FollowGoals:
-    """Options that are goals, carried out by rule.
+    """Options that are goals, executed by rule.
 
     Args:
         goals (sequence of ByteGoal): one for each option.

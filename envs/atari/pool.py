@@ -151,7 +151,7 @@ class AtariOptionPool(ProcessPool):
     An outcome is a function of state, option, the worker's weights and the pool's seed, whichever
     process finds it: the worker's random choices and sticky actions are drawn from these. So a
     search can be repeated, and in the deterministic protocol what was planned is what happens. With
-    ``determinised=False`` every call draws anew, for a planner that samples options more than once
+    ``determinised=False`` every call draws again, for a planner that samples options more than once
     (``chance=ProgressiveWidening()``).
 
     Processes that die or hang, copies, threads and tickets are as in :class:`OptionPool`.

@@ -32,7 +32,7 @@ class AtariRAMEnv(EnvBase):
     ``repeat_action_probability``, the console sees the action held before instead (sticky actions).
     With the defaults and the same seed, the trajectory is that of Gymnasium's ``ALE/<game>-v5``
     with ``obs_type="ram"``, from ``set_seed(seed)`` and ``reset()`` to the episode's end. Later
-    episodes load the game anew with seeds of their own, so that an episode does not depend on the
+    episodes load the game again with seeds of their own, so that an episode does not depend on the
     one before.
 
     ``reset(td, set_state=True)`` goes on from the state in ``td``, also of another env of the same

@@ -59,7 +59,7 @@ class OptionWorker(Protocol):
 class OptionRun(ABC):
     """Runs options in one env.
 
-    A subclass is built from ``arguments``, in each process anew, so that what it opens is never
+    A subclass is built from ``arguments``, again in each process, so that what it opens is never
     sent.
 
     Attributes:

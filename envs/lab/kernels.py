@@ -26,7 +26,7 @@ SPAWN_HEADING = 0  # heading at the spawn, 65,536 to a full turn
 APPLES = 1  # bit k is set while apple k lies there
 GOAL_MET = 2  # 1 in the frame in which the goal was picked up
 FRAME = 3  # of the episode
-LOTTERY = 4  # state of the generator that places the player anew
+LOTTERY = 4  # state of the generator that places the player again
 CLOCK, LEAD = 5, 6  # phase of the engine's clock, milliseconds
 LEVEL_SIZE = 7
 

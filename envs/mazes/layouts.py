@@ -145,7 +145,7 @@ def maze_pool(split: Literal["train", "test", "all"] = "all") -> Tensor:
 
     The pool is generated once, in a few seconds, and kept in a user cache folder:
     ``TORCHRL_HMCTS_CACHE`` if set, else ``torchrl_hmcts`` in ``XDG_CACHE_HOME`` or ``~/.cache``. A
-    missing or damaged file is made anew; a folder that cannot be written costs only the repeated
+    missing or damaged file is made again; a folder that cannot be written costs only the repeated
     generation.
 
     Args:

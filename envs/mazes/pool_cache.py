@@ -35,7 +35,7 @@ def read_pool(path: Path, shape: tuple[int, ...], sha256: str) -> np.ndarray | N
         array = np.load(path, allow_pickle=False)
         if array.dtype == np.bool_ and array.shape == shape and pool_digest(array) == sha256:
             return array
-    except Exception:  # whatever a damaged file makes numpy raise, the pool can be made anew
+    except Exception:  # whatever a damaged file makes numpy raise, the pool can be made again
         pass
     return None
 
