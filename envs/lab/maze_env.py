@@ -286,8 +286,7 @@ class LabMazeEnv(MazeEnv):
             tensors["terminated"], tensors["truncated"], tensors["done"] = flags
         if self.device is not None and self.device.type != "cpu":
             tensors = {key: tensor.to(self.device) for key, tensor in tensors.items()}
-        # The checks of TensorDict's constructor would cost as much as the simulation.
-        return TensorDict._new_unsafe(tensors, shape, device=self.device)
+        return self._pack(tensors, shape)
 
     def _write_state(self, state: Sequence[np.ndarray], shape: torch.Size) -> TensorDict:
         """The tensordict of a state ``[n, ...]``, in the order of ``STATE``."""

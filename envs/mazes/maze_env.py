@@ -84,6 +84,10 @@ class MazeEnv(EnvBase):
     def _begin(self, shape: torch.Size) -> TensorDict:
         """Draw the first states of episodes."""
 
+    def _pack(self, entries: dict[str, Tensor], shape: torch.Size) -> TensorDict:
+        """Make a tensordict without the checks of its constructor, which cost as much as a step."""
+        return TensorDict._new_unsafe(entries, shape, device=self.device)
+
     @abstractmethod
     def _reset_to_state(self, tensordict: TensorDictBase | None) -> TensorDict:
         """Write the state in a tensordict, after checking it."""
@@ -225,8 +229,10 @@ class TileMazeEnv(MazeEnv):
         first, second = (self._free_tiles.take(maze * num_free + t) for t in (player, target))
         return maze, first, second, steps
 
-    def _observe(self, entries: dict[str, Tensor], position: Tensor, target: Tensor) -> None:
-        """Add ``"observation"``, of the positions and the walls, if it is wanted."""
+    def _observed(self, entries: dict[str, Tensor], shape: torch.Size) -> TensorDict:
+        """Pack entries, with ``"observation"``, of the positions and the walls, if it is wanted."""
         if self._writes_observation:
             walls = torch.embedding(self._wall_centers, entries["maze_index"])
-            entries["observation"] = torch.cat((position, target, walls), -1)
+            places = (entries["position"], entries["target"], walls)
+            entries["observation"] = torch.cat(places, -1)
+        return self._pack(entries, shape)

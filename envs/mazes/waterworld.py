@@ -184,9 +184,7 @@ class WaterworldMazeEnv(TileMazeEnv):
             maze_index=maze,
             step_count=step_count,
         )
-        self._observe(entries, position, target)
-        # The checks of TensorDict's constructor would cost as much as the arithmetic.
-        return TensorDict._new_unsafe(entries, batch_size, device=self.device)
+        return self._observed(entries, batch_size)
 
     def _begin(self, shape: torch.Size) -> TensorDict:
         maze, player, target, steps = self._draw_tiles(shape)
