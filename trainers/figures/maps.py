@@ -73,9 +73,10 @@ class WaterworldMap:
         self.milliseconds = 500.0 * self.env.TIME_STEP  # twice real time
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
-        """Draw walls and target."""
+        """Draw walls, and the target if the state has one."""
         draw_walls(axes, self.env.mazes[int(state["maze_index"])])
-        axes.plot(*state["target"].tolist(), "o", color=_GOAL, markersize=11)
+        if "target" in state.keys():
+            axes.plot(*state["target"].tolist(), "o", color=_GOAL, markersize=11)
 
     def points(self, states: TensorDictBase) -> Tensor:
         """Return the positions."""
@@ -240,7 +241,7 @@ def plot_skill_fan(
     figure = Figure(figsize=(9.6, 5.2), layout="constrained")
     panels = figure.subplots(1, len(rooms), squeeze=False)[0]
     for axes, (title, (drawing, td)) in zip(panels, rooms.items(), strict=True):
-        drawing.background(axes, td[0])
+        drawing.background(axes, td[0].exclude("target"))  # skills know none
         skills = torch.arange(num_skills).repeat_interleave(len(td) // num_skills)
         points = [drawing.points(td)]
         for _ in range(steps):
