@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 from collections.abc import Iterator
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # before anything imports matplotlib
@@ -17,6 +18,9 @@ import torch
 # a red test is red again for whoever looks into it.
 hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("tests")
+
+# A shell starts what it runs in the background with Ctrl-C ignored; tests send that signal.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Batches are small; the second thread of a two-core machine only makes them wait.
 torch.set_num_threads(1)
