@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import time
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, Transform, TransformedEnv
@@ -26,8 +28,9 @@ from torchrl_hmcts.modules import (
 )
 from torchrl_hmcts.nesting import given
 from torchrl_hmcts.objectives import LSDEncoderLoss, SkillSACLoss
+from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget, extract_plans
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.transforms import SkillReward, SkillTransform
+from torchrl_hmcts.transforms import OptionTransform, SkillReward, SkillTransform
 from torchrl_hmcts.transforms.env_transform import EnvTransform
 
 BODY, JOINTS, ACTIONS = 32, 8, 8
@@ -115,7 +118,7 @@ def quarter_turns() -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 class SkillFrame(EnvTransform):
-    """Writes the body and its displacement as seen from where and how it stood when a skill began."""
+    """Writes the body and its displacement, seen from where and how it was when a skill began."""
 
     def __init__(self) -> None:
         super().__init__(in_keys=["physics"], out_keys=["body", "displacement", "frame", "origin"])
@@ -168,9 +171,9 @@ class SkillFrame(EnvTransform):
 class Imagine(Transform):
     """Replays transitions under other skills, and with the ant's legs renamed by quarter turns."""
 
-    def __init__(self, num_skills: int, *, turns: bool = True, skills: bool = True) -> None:
+    def __init__(self, num_skills: int, share: float) -> None:
         super().__init__(in_keys=[], out_keys=[])
-        self.num_skills, self.turns, self.skills = num_skills, turns, skills
+        self.num_skills, self.share = num_skills, share
         self.tables = quarter_turns()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -178,19 +181,17 @@ class Imagine(Transform):
         after = td.get("next").copy()
         td.set("next", after)
         shape = td.batch_size
-        if self.skills:
-            skill = torch.randint(self.num_skills, shape)
-            other = torch.where(torch.rand(shape) < 0.5, skill, td.get("skill"))
-            td.set("skill", other)
-            after.set("skill", other)
-        if self.turns:
-            quarter = torch.randint(4, shape)
-            index, sign, action_index, action_sign = (table[quarter] for table in self.tables)
-            frame = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])[quarter]
-            for part in (td, after):
-                part.set("body", part.get("body").gather(-1, index) * sign)
-                part.set("displacement", turned_back(part.get("displacement"), frame))
-            td.set("action", td.get("action").gather(-1, action_index) * action_sign)
+        changed = torch.rand(shape) < self.share
+        skill = torch.where(changed, torch.randint(self.num_skills, shape), td.get("skill"))
+        quarter = torch.randint(4, shape) * changed
+        td.set("skill", skill)
+        after.set("skill", skill)
+        index, sign, action_index, action_sign = (table[quarter] for table in self.tables)
+        frame = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])[quarter]
+        for part in (td, after):
+            part.set("body", part.get("body").gather(-1, index) * sign)
+            part.set("displacement", turned_back(part.get("displacement"), frame))
+        td.set("action", td.get("action").gather(-1, action_index) * action_sign)
         return td
 
 
@@ -223,8 +224,9 @@ def walking(least_up: float) -> Any:
     return task
 
 
-def activation() -> nn.Module:
-    return nn.Sequential(nn.LayerNorm(256, elementwise_affine=False), nn.ReLU())
+def normalized(width: int) -> Any:
+    """Builds the activation of a critic that is updated often."""
+    return lambda: nn.Sequential(nn.LayerNorm(width, elementwise_affine=False), nn.ReLU())
 
 
 def learn(
@@ -246,6 +248,8 @@ def learn(
     target_entropy: float = -8.0,
     tau: float = 0.01,
     batch_size: int = 256,
+    imagined: float = 0.5,
+    width: int = 256,
     report: Any = None,
     progress: Any = None,
     **keywords: Any,
@@ -260,13 +264,13 @@ def learn(
     env = TransformedEnv(
         base, Compose(SkillTransform(num_skills, max_skill_steps=skill_steps), SkillFrame())
     )
-    sizes = {"hidden": (256, 256), "in_keys": ["body"]}
+    sizes = {"hidden": (width, width), "in_keys": ["body"]}
     encoder = SkillEncoder(
         2, num_skills, in_keys=["displacement"], hidden=(), linear=SpectralLinear
     )
     loss = SkillSACLoss(
         SkillActor(BODY, base.action_spec_unbatched, num_skills, **sizes),
-        SkillActionCritic(BODY, ACTIONS, num_skills, activation=activation, **sizes),
+        SkillActionCritic(BODY, ACTIONS, num_skills, activation=normalized(width), **sizes),
         LSDEncoderLoss(encoder),
         gamma=gamma,
         alpha_init=alpha,
@@ -286,13 +290,143 @@ def learn(
         objective_lr=objective_lr,
         alpha_lr=lr,
         target_tau=tau,
-        reward=Compose(Imagine(num_skills), SkillReward(loss.objective, intrinsic_coeff=scale)),
+        reward=Compose(
+            Imagine(num_skills, imagined), SkillReward(loss.objective, intrinsic_coeff=scale)
+        ),
         seed=seed,
     )
     if report is not None:
         trainer.register_op("post_steps_log", report(trainer, loss))
     trainer.train()
     return loss
+
+
+class Walker(TensorDictModuleBase):
+    """Walks by a skill and a quarter turn: option ``4 z + q``, from the heading where it began.
+
+    The network runs in double precision and its mean action is rounded to single, so that it does
+    not depend on how many states are walked at once.
+    """
+
+    def __init__(self, actor: SkillActor) -> None:
+        super().__init__()
+        self.network = copy.deepcopy(actor.network).double().requires_grad_(False)
+        self.num_options = 4 * actor.num_skills
+        self.in_keys = ["physics", "skill", "frame"]
+        self.out_keys = ["action", ("next", "frame")]
+        self.tables = quarter_turns()
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        physics, option = tensordict.get("physics"), tensordict.get("skill")
+        kept = tensordict.get("frame", None)
+        body, frame = body_of(physics, None)
+        if kept is not None and kept.any():
+            frame = torch.where(kept.any(-1, keepdim=True), kept, frame)
+            body, _ = body_of(physics, frame)
+        skill, quarter = option // 4, option % 4
+        index, sign, _, _ = (table[quarter] for table in self.tables)
+        _, _, action_index, action_sign = (table[(4 - quarter) % 4] for table in self.tables)
+        outputs = self.network(body.gather(-1, index) * sign, skill)
+        action = outputs[..., :ACTIONS].tanh().float()
+        tensordict.set("action", action.gather(-1, action_index) * action_sign)
+        return tensordict.set(("next", "frame"), frame)
+
+
+class Fallen:
+    """Ends an option where the ant lies on its back."""
+
+    def __call__(self, td: TensorDictBase) -> Tensor:
+        x, y = td.get("physics")[..., 5:6], td.get("physics")[..., 6:7]
+        return 1 - 2 * (x * x + y * y) < 0.0
+
+
+def make_planner(batch: MujocoBatch, worker: Walker, option_steps: int, radius: float, **kw: Any):
+    options = OptionTransform(worker, worker.num_options, option_steps, termination=Fallen())
+    env = TransformedEnv(batch, options)
+    settings: dict[str, Any] = {
+        "tree_policy": UCT(c=1.0),
+        "novelty": RadiusNovelty("position", radius),
+        "budget": SearchBudget(expansions=3000),
+        "leaves_per_wave": 4,
+    }
+    return MCTSPlanner(env, **(settings | kw))
+
+
+def act(env: Any, batch: MujocoBatch, worker: Walker, option: int, steps: int) -> tuple[Any, ...]:
+    """Execute an option in a Gymnasium env; its reward, end, base steps and path."""
+    td = batch.read(env).select("physics").set("skill", torch.tensor(option))
+    path, earned = [td["physics"][1:3].tolist()], 0.0
+    for i in range(steps):  # noqa: B007
+        worker(td)
+        _, reward, terminated, truncated, _ = env.step(td["action"].numpy())
+        td.set("frame", td["next", "frame"]).set("physics", batch.read(env)["physics"])
+        path.append(td["physics"][1:3].tolist())
+        earned += float(reward)
+        if terminated or truncated or bool(Fallen()(td)):
+            break
+    return earned, terminated, truncated, i + 1, path
+
+
+def solve(
+    name: str,
+    actor: SkillActor,
+    starts: Any,
+    *,
+    option_steps: int,
+    radius: float,
+    max_plans: int = 5,
+    **kw: Any,
+) -> list[dict[str, Any]]:
+    worker = Walker(actor)
+    keywords = {} if name[0] == "a" else {"continuing_task": False}
+    batch = MujocoBatch(name, seed=0, **keywords)
+    real = make_gym(name, **keywords)
+    planner = make_planner(batch, worker, option_steps, radius, **kw)
+    rows = []
+    for seed, options in starts:
+        real.reset(seed=seed, options=dict(options) if options else None)
+        start = batch.read(real)
+        row: dict[str, Any] = {"seed": seed, "plans": 0, "plan_cpu": [], "steps": 0, "simulated": 0}
+        row["task"] = options
+        row["start"], row["goal"] = start["position"].tolist(), start["goal"].tolist()
+        solved = ended = False
+        path = []
+        while not ended and row["plans"] < max_plans:
+            begin = time.process_time()
+            state = batch.read(real)
+            search = planner.search(state)
+            plan = extract_plans(search)[0]
+            row["plan_cpu"].append(round(time.process_time() - begin, 2))
+            row["simulated"] += int(search.num_base_steps[0])
+            row["nodes"] = (
+                int(search.tree.num_nodes[0]) if hasattr(search.tree, "num_nodes") else None
+            )
+            row["plans"] += 1
+            if not bool(plan.found):
+                break
+            options_taken = plan.options[: int(plan.lengths)].tolist()
+            row["options"] = len(options_taken)
+            for i, option in enumerate(options_taken):
+                earned, terminated, truncated, steps, new = act(
+                    real, batch, worker, option, option_steps
+                )
+                path += new
+                row["steps"] += steps
+                ended = terminated or truncated
+                solved = solved or earned > 0
+                if ended or solved:
+                    ended = True
+                    break
+                expected = plan.states.get("physics")[i + 1]
+                if not torch.equal(expected, batch.read(real)["physics"]):
+                    row["differs"] = row.get("differs", 0) + 1
+                    break
+        row["solved"] = solved
+        row["path"] = path
+        rows.append(row)
+        print({k: v for k, v in row.items() if k != "path"}, flush=True)
+    return rows
 
 
 def main() -> None:
@@ -319,12 +453,21 @@ def main() -> None:
             state["moved"].append((float(step.mean()), float(w.mean())))
             if state["n"] % 6400 < batch.numel():
                 last = {k: v[-1] for k, v in trainer.history.items() if len(v)}
-                keys = ("actor_loss", "critic_loss", "alpha", "entropy", "encoder_loss", "grad_norm")
+                keys = (
+                    "actor_loss",
+                    "critic_loss",
+                    "alpha",
+                    "entropy",
+                    "encoder_loss",
+                    "grad_norm",
+                )
                 m = np.mean(state["moved"][-100:], 0)
                 print(
-                    state["n"], f"cpu {time.process_time() - state['t']:.0f} step {m[0]:.4f} "
+                    state["n"],
+                    f"cpu {time.process_time() - state['t']:.0f} step {m[0]:.4f} "
                     f"along {m[1]:.4f} fell {np.mean(state['fell'][-100:]):.4f}",
-                    {k: round(last[k], 3) for k in keys if k in last}, flush=True,
+                    {k: round(last[k], 3) for k in keys if k in last},
+                    flush=True,
                 )
                 if args.out and state["n"] % 51200 < batch.numel():
                     torch.save(loss.state_dict(), args.out)

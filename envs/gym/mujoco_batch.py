@@ -43,8 +43,8 @@ class MujocoBatch(EnvBase):
 
     Args:
         env (str, gymnasium.Env or callable): as of
-            :func:`~torchrl_hmcts.envs.gym.settable.make_gym`. Starts are drawn by it, so it must not
-            be used elsewhere.
+            :func:`~torchrl_hmcts.envs.gym.settable.make_gym`. It draws the starts, so do not
+            use it elsewhere.
         task (callable, optional): ``task(env)`` returns a
             :class:`~torchrl_hmcts.envs.MujocoTask`. Default: that of the maze.
         num_threads (int): threads that step a batch; its rows do not depend on it. Default 1.
@@ -52,6 +52,7 @@ class MujocoBatch(EnvBase):
             ``torch.float64`` they are Gymnasium's to the bit.
         batch_size (sequence of int): copies that ``reset()`` makes. Default none.
         seed (int, optional): of the starts. Default: drawn from torch's global generator.
+        device (optional): of the tensors; the physics runs on the CPU.
         **keywords: of ``gymnasium.make``.
 
     Raises:
@@ -59,8 +60,8 @@ class MujocoBatch(EnvBase):
             of range; when set to a state: if an entry is missing or of another form.
 
     Reference:
-        Todorov, Erez and Tassa, "MuJoCo: A physics engine for model-based control", 2012; the mazes:
-        Fu et al., "D4RL", 2020, arXiv 2004.07219; Park et al., "OGBench", 2024, arXiv 2410.20092.
+        Todorov, Erez and Tassa, "MuJoCo: A physics engine for model-based control", 2012. Mazes: Fu
+        et al., "D4RL", 2020, arXiv 2004.07219; Park et al., "OGBench", 2024, arXiv 2410.20092.
 
     Example:
         >>> from torchrl_hmcts.envs import MujocoBatch
@@ -223,9 +224,13 @@ class MujocoBatch(EnvBase):
             for key, value in shown.items()
         }
         self.observation_spec = Composite(specs, device=device).expand(size)
-        self.state_spec = Composite({k: specs[k].clone() for k in _STATE}, device=device).expand(size)
+        self.state_spec = Composite({k: specs[k].clone() for k in _STATE}, device=device).expand(
+            size
+        )
         space: Any = self.gym.action_space
-        low, high = (torch.as_tensor(end, device=device).to(dtype) for end in (space.low, space.high))
+        low, high = (
+            torch.as_tensor(end, device=device).to(dtype) for end in (space.low, space.high)
+        )
         action = Bounded(low, high, shape=low.shape, dtype=dtype, device=device)
         self.action_spec = action.expand(*size, *low.shape)
         self.reward_spec = Unbounded((*size, 1), dtype=dtype, device=device)

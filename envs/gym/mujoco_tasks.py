@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.snapshots import SnapshotError, env_layers
+from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
 
 class MujocoTask:
@@ -28,6 +28,9 @@ class MujocoTask:
         radius (float): distance from the goal that counts as reached, in metres.
         derived (tuple of str): fields of ``MjData`` that an observation holds beside positions and
             velocities.
+
+    Reference:
+        This project's.
 
     Example:
         >>> from torchrl_hmcts.envs import MujocoBatch, MujocoTask
@@ -184,16 +187,14 @@ def task_of(env: gymnasium.Env) -> MujocoTask:
     Raises:
         SnapshotError: if it is none of the mazes, with what to pass.
     """
-    robot = env_layers(env)[-1]
     bases = {f"{c.__module__.split('.')[0]}.{c.__name__}" for c in type(env.unwrapped).__mro__}
-    bases.add(f"robot.{type(robot).__name__}")
-    kinds: dict[frozenset[str], type[MujocoTask]] = {
-        frozenset({"gymnasium_robotics.PointMazeEnv"}): RoboticsPointMaze,
-        frozenset({"gymnasium_robotics.AntMazeEnv"}): RoboticsAntMaze,
-        frozenset({"ogbench.MazeEnv", "ogbench.PointEnv"}): OGBenchPointMaze,
-        frozenset({"ogbench.MazeEnv", "ogbench.AntEnv"}): OGBenchMaze,
+    kinds: dict[type[MujocoTask], set[str]] = {
+        RoboticsPointMaze: {"gymnasium_robotics.PointMazeEnv"},
+        RoboticsAntMaze: {"gymnasium_robotics.AntMazeEnv"},
+        OGBenchPointMaze: {"ogbench.MazeEnv", "ogbench.PointEnv"},
+        OGBenchMaze: {"ogbench.MazeEnv", "ogbench.AntEnv"},
     }
-    for names, kind in kinds.items():
+    for kind, names in kinds.items():
         if names <= bases:
             return kind(env)
     raise SnapshotError(
