@@ -1,483 +1,301 @@
-"""AntMaze: an ant learns to walk without a reward, and a planner takes its skills to goals."""
+"""AntMaze: an ant learns to walk without a reward, and a planner takes it to goals.
+
+    python benchmarks/antmaze.py learn antmaze-large-v0 AntMaze_Large-v5 --seeds 0
+    python benchmarks/antmaze.py solve antmaze-medium-v0 antmaze-large-v0 antmaze-giant-v0 \\
+        AntMaze_Medium-v5 AntMaze_Large-v5 --seeds 0
+    python benchmarks/antmaze.py draw
+
+**Learning** is LSD on the (x, y) displacement, by soft actor-critic on TorchRL's Trainer, in the
+ant's maze with walls that touch nothing. There is no reward of the env, no goal, and no term for
+staying up: an episode ends where the ant falls. One worker of each ant serves all mazes.
+
+**Planning** is tree search over options of 2.5 s in :class:`MujocoBatch`; plans are executed in a
+separate Gymnasium env with its time limit of 1,000 steps, and made again where an option ends in
+another state than planned or the plan has ended. Starts of OGBench's mazes are its 5 tasks, 10
+times each with its noise; those of gymnasium-robotics are 50 draws of its own.
+
+Each part adds to ``docs/results/antmaze/results.json``, so that it can run in pieces.
+"""
 
 from __future__ import annotations
 
 import argparse
-import copy
+import json
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from ant_walker import (
+    ACTIONS,
+    BODY,
+    Gait,
+    Imagine,
+    SkillFrame,
+    Walker,
+    act,
+    fallen,
+    normalized,
+    open_arena,
+)
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import Compose, Transform, TransformedEnv
+from torchrl.data import Bounded
+from torchrl.envs import Compose, TransformedEnv
 
 from torchrl_hmcts.envs import MujocoBatch
-from torchrl_hmcts.envs.gym.mujoco import find_physics
-from torchrl_hmcts.envs.gym.mujoco_tasks import task_of
 from torchrl_hmcts.envs.gym.settable import make_gym
-from torchrl_hmcts.modules import (
-    SkillActionCritic,
-    SkillActor,
-    SkillEncoder,
-    SpectralLinear,
-)
-from torchrl_hmcts.nesting import given
+from torchrl_hmcts.modules import SkillActionCritic, SkillActor, SkillEncoder, SpectralLinear
 from torchrl_hmcts.objectives import LSDEncoderLoss, SkillSACLoss
 from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget, extract_plans
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.evaluation import spread
 from torchrl_hmcts.transforms import OptionTransform, SkillReward, SkillTransform
-from torchrl_hmcts.transforms.env_transform import EnvTransform
 
-BODY, JOINTS, ACTIONS = 32, 8, 8
-# What leg i is called when the body is said to be turned by a quarter: leg i + 1, ankles of every
-# other leg bend the other way.
-_LEG = [2, 3, 4, 5, 6, 7, 0, 1]
-_BEND = [1, -1, 1, 1, 1, -1, 1, 1]
+OUT, WORKERS = Path("docs/results/antmaze"), Path("runs/antmaze")
+NUM_SKILLS, HIDDEN = 3, (128, 128)
+OPTION_STEPS = 25  # actions, of 0.1 s
 
 
-def heading(rotation: Tensor) -> Tensor:
-    """Cosine and sine of the turn about the vertical, ``[*B, 2]``, of rotations ``[*B, 3, 3]``."""
-    flat = torch.stack(
-        (
-            rotation[..., 0, 0] + rotation[..., 1, 1],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ),
-        -1,
-    )
-    return torch.nn.functional.normalize(flat, dim=-1)
-
-
-def rotation_of(quaternion: Tensor) -> Tensor:
-    """Rotation matrices ``[*B, 3, 3]`` of quaternions ``[*B, 4]``."""
-    w, x, y, z = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
-
-
-def turned_back(vector: Tensor, frame: Tensor) -> Tensor:
-    """Vectors ``[*B, 2]`` as seen from a frame (cosine, sine) ``[*B, 2]``."""
-    c, s = frame[..., :1], frame[..., 1:]
-    x, y = vector[..., :1], vector[..., 1:]
-    return torch.cat((c * x + s * y, c * y - s * x), -1)
-
-
-def body_of(physics: Tensor, frame: Tensor | None) -> tuple[Tensor, Tensor]:
-    """What the worker sees, ``[*B, 32]``, from a frame ``[*B, 2]``; its own heading if None."""
-    qpos, qvel = physics[..., 1:16], physics[..., 16:30]
-    rotation = rotation_of(qpos[..., 3:7])
-    if frame is None:
-        frame = heading(rotation)
-    seen = torch.stack([turned_back(rotation[..., :2, i], frame) for i in range(3)], -1)
-    rows = torch.cat((seen, rotation[..., 2:, :]), -2)  # [*B, 3, 3]
-    velocity = turned_back(qvel[..., :2], frame)
-    parts = (
-        qpos[..., 2:3],
-        rows.flatten(-2),
-        qpos[..., 7:],
-        0.5 * velocity,
-        0.5 * qvel[..., 2:3],
-        0.25 * qvel[..., 3:6],
-        0.1 * qvel[..., 6:],
-    )
-    return torch.cat(parts, -1), frame
-
-
-def quarter_turns() -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The index and sign of each number of a body, and of an action, after 0 to 3 quarter turns."""
-
-    def matrix_of(size: int, pairs: list[tuple[int, int, float]]) -> Tensor:
-        matrix = torch.zeros(size, size, dtype=torch.float64)
-        for out, source, sign in pairs:
-            matrix[out, source] = sign
-        return matrix
-
-    turn = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    legs = matrix_of(8, [(i, _LEG[i], _BEND[i]) for i in range(8)])
-    one = torch.ones(1, 1, dtype=torch.float64)
-    body = torch.block_diag(one, torch.kron(turn, turn), legs, turn, turn, legs)
-    # Actuators are those of legs 4, 1, 2, 3.
-    order = torch.tensor([6, 7, 0, 1, 2, 3, 4, 5])
-    shuffle = torch.zeros(8, 8, dtype=torch.float64)
-    shuffle[torch.arange(8), order] = 1.0
-    action = shuffle @ legs @ shuffle.T
-    out = []
-    for matrix in (body, action):
-        powers = torch.stack([torch.linalg.matrix_power(matrix, q) for q in range(4)])
-        index = powers.abs().argmax(-1)
-        out += [index, powers.gather(-1, index.unsqueeze(-1)).squeeze(-1).float()]
-    return tuple(out)  # type: ignore[return-value]
-
-
-class SkillFrame(EnvTransform):
-    """Writes the body and its displacement, seen from where and how it was when a skill began."""
-
-    def __init__(self) -> None:
-        super().__init__(in_keys=["physics"], out_keys=["body", "displacement", "frame", "origin"])
-
-    def _write(self, td: TensorDictBase, frame: Tensor | None, origin: Tensor | None) -> None:
-        physics = td.get("physics")
-        body, frame = body_of(physics, frame)
-        place = physics[..., 1:3]
-        origin = place.clone() if origin is None else origin
-        td.set("body", body.float()).set("frame", frame).set("origin", origin)
-        td.set("displacement", turned_back(place - origin, frame).float())
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        frame = given(tensordict, "frame")
-        origin = None if frame is None else tensordict.get("origin")
-        self._write(tensordict_reset, frame, origin)
-        return tensordict_reset
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._write(next_tensordict, tensordict.get("frame"), tensordict.get("origin"))
-        return next_tensordict
-
-    def _post_step_mdp_hooks(
-        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
-    ) -> tuple[TensorDictBase, TensorDictBase]:
-        began = tensordict_.get("skill_step") == 0
-        if began.any():
-            fresh = tensordict_.select("physics")
-            self._write(fresh, None, None)
-            for key in self.out_keys:
-                tensordict_.set(key, torch.where(began, fresh.get(key), tensordict_.get(key)))
-        return tensordict, tensordict_
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        shape = observation_spec.shape
-        for key, width in (("body", BODY), ("displacement", 2)):
-            observation_spec[key] = Unbounded((*shape, width))
-        for key in ("frame", "origin"):
-            observation_spec[key] = Unbounded((*shape, 2), dtype=torch.float64)
-        return observation_spec
-
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        for key in ("frame", "origin"):
-            state_spec[key] = Unbounded((*state_spec.shape, 2), dtype=torch.float64)
-        return state_spec
-
-
-class Imagine(Transform):
-    """Replays transitions under other skills, and with the ant's legs renamed by quarter turns."""
-
-    def __init__(self, num_skills: int, share: float) -> None:
-        super().__init__(in_keys=[], out_keys=[])
-        self.num_skills, self.share = num_skills, share
-        self.tables = quarter_turns()
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        td = tensordict.copy()
-        after = td.get("next").copy()
-        td.set("next", after)
-        shape = td.batch_size
-        changed = torch.rand(shape) < self.share
-        skill = torch.where(changed, torch.randint(self.num_skills, shape), td.get("skill"))
-        quarter = torch.randint(4, shape) * changed
-        td.set("skill", skill)
-        after.set("skill", skill)
-        index, sign, action_index, action_sign = (table[quarter] for table in self.tables)
-        frame = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])[quarter]
-        for part in (td, after):
-            part.set("body", part.get("body").gather(-1, index) * sign)
-            part.set("displacement", turned_back(part.get("displacement"), frame))
-        td.set("action", td.get("action").gather(-1, action_index) * action_sign)
-        return td
-
-
-def open_arena(name: str, **keywords: Any) -> Any:
-    """Make an ant maze whose walls touch nothing."""
-    env = make_gym(name, **keywords)
-    model, _ = find_physics(env)
-    for i in range(model.ngeom):
-        if model.geom_bodyid[i] == 0 and model.geom(i).name != "floor":
-            model.geom_contype[i] = model.geom_conaffinity[i] = 0
-    return env
-
-
-def walking(least_up: float) -> Any:
-    """A task without a reward, which ends where the ant lies on its back or side."""
-
-    def task(env: Any) -> Any:
-        made = task_of(env)
-        made.derived = ()
-        made.observe = lambda qpos, qvel, derived, goal: {}
-
-        def judge(qpos: np.ndarray, qvel: np.ndarray, goal: np.ndarray) -> Any:
-            x, y = qpos[:, 4], qpos[:, 5]
-            upright = 1 - 2 * (x * x + y * y)
-            return np.zeros(len(qpos)), upright < least_up
-
-        made.judge = judge
-        return made
-
-    return task
-
-
-def normalized(width: int) -> Any:
-    """Builds the activation of a critic that is updated often."""
-    return lambda: nn.Sequential(nn.LayerNorm(width, elementwise_affine=False), nn.ReLU())
+def make_actor() -> SkillActor:
+    spec = Bounded(-1.0, 1.0, shape=(ACTIONS,))
+    return SkillActor(BODY, spec, NUM_SKILLS, hidden=HIDDEN, in_keys=["body"])
 
 
 def learn(
     name: str,
     *,
     seed: int = 0,
-    total_frames: int = 400_000,
-    num_skills: int = 3,
-    skill_steps: int = 100,
+    total_frames: int = 75_000,
     copies: int = 16,
-    frames_per_batch: int = 64,
+    skill_steps: int = 100,
     updates_per_batch: int = 16,
-    lr: float = 5e-4,
-    objective_lr: float = 1e-3,
-    gamma: float = 0.98,
-    scale: float = 10.0,
-    alpha: float = 0.1,
-    tuned: bool = True,
-    target_entropy: float = -8.0,
-    tau: float = 0.01,
-    batch_size: int = 256,
     imagined: float = 0.5,
-    width: int = 256,
-    report: Any = None,
-    progress: Any = None,
-    **keywords: Any,
-) -> SkillSACLoss:
+    scale: float = 10.0,
+    lr: float = 5e-4,
+) -> tuple[SkillActor, dict[str, Any]]:
+    """Learn three skills of an ant without a reward.
+
+    Args:
+        name: of an env with the ant.
+        seed: of the run.
+        total_frames: actions; of gymnasium-robotics' ant each is two env steps.
+        copies: ants side by side.
+        skill_steps: actions of a mini-episode.
+        updates_per_batch: for each 64 actions.
+        imagined: share of replayed transitions that :class:`Imagine` changes.
+        scale: of LSD's reward, in which a metre is about 1.
+        lr: of actor, critics and alpha; the encoder's is twice as high.
+
+    Returns:
+        The actor, and what it cost and how fast it became.
+    """
     torch.manual_seed(seed)
-    base = MujocoBatch(
-        lambda: open_arena(name, **keywords),
-        task=walking(0.2),
-        batch_size=[copies],
-        seed=seed,
-    )
-    env = TransformedEnv(
-        base, Compose(SkillTransform(num_skills, max_skill_steps=skill_steps), SkillFrame())
-    )
-    sizes = {"hidden": (width, width), "in_keys": ["body"]}
+    gait = Gait.of(name)
+    begin = time.process_time()
+    base = MujocoBatch(lambda: open_arena(name), task=gait.arena, batch_size=[copies], seed=seed)
+    frames = Compose(SkillTransform(NUM_SKILLS, max_skill_steps=skill_steps), SkillFrame())
     encoder = SkillEncoder(
-        2, num_skills, in_keys=["displacement"], hidden=(), linear=SpectralLinear
+        2, NUM_SKILLS, in_keys=["displacement"], hidden=(), linear=SpectralLinear
     )
+    actor = make_actor()
     loss = SkillSACLoss(
-        SkillActor(BODY, base.action_spec_unbatched, num_skills, **sizes),
-        SkillActionCritic(BODY, ACTIONS, num_skills, activation=normalized(width), **sizes),
+        actor,
+        SkillActionCritic(
+            BODY,
+            ACTIONS,
+            NUM_SKILLS,
+            hidden=HIDDEN,
+            in_keys=["body"],
+            activation=normalized(HIDDEN[0]),
+        ),
         LSDEncoderLoss(encoder),
-        gamma=gamma,
-        alpha_init=alpha,
-        fixed_alpha=not tuned,
-        target_entropy=target_entropy,
+        gamma=0.98,
+        alpha_init=0.1,
+        fixed_alpha=False,
+        target_entropy=-float(ACTIONS),
     )
+    reward = SkillReward(loss.objective, intrinsic_coeff=scale)
     trainer = DIAYNTrainer(
-        env,
+        TransformedEnv(base, frames),
         loss,
         total_frames=total_frames,
-        frames_per_batch=frames_per_batch,
         updates_per_batch=updates_per_batch,
-        batch_size=batch_size,
         buffer_size=total_frames,
         actor_lr=lr,
         critic_lr=lr,
-        objective_lr=objective_lr,
+        objective_lr=2 * lr,
         alpha_lr=lr,
-        target_tau=tau,
-        reward=Compose(
-            Imagine(num_skills, imagined), SkillReward(loss.objective, intrinsic_coeff=scale)
-        ),
+        target_tau=0.01,
+        reward=Compose(Imagine(NUM_SKILLS, imagined), reward),
         seed=seed,
     )
-    if report is not None:
-        trainer.register_op("post_steps_log", report(trainer, loss))
+    curve = Curve(loss, total_frames)
+    trainer.register_op("post_steps_log", curve)
     trainer.train()
-    return loss
+    actor.load_state_dict(_weights(loss, actor))
+    cost = {"actions": total_frames, "env_steps": total_frames * gait.repeat}
+    cost |= {"updates": len(trainer.history["alpha"]) * updates_per_batch}
+    return actor, cost | {"cpu_seconds": round(time.process_time() - begin), "curve": curve.rows}
 
 
-class Walker(TensorDictModuleBase):
-    """Walks by a skill and a quarter turn: option ``4 z + q``, from the heading where it began.
-
-    The network runs in double precision and its mean action is rounded to single, so that it does
-    not depend on how many states are walked at once.
-    """
-
-    def __init__(self, actor: SkillActor) -> None:
-        super().__init__()
-        self.network = copy.deepcopy(actor.network).double().requires_grad_(False)
-        self.num_options = 4 * actor.num_skills
-        self.in_keys = ["physics", "skill", "frame"]
-        self.out_keys = ["action", ("next", "frame")]
-        self.tables = quarter_turns()
-
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        physics, option = tensordict.get("physics"), tensordict.get("skill")
-        kept = tensordict.get("frame", None)
-        body, frame = body_of(physics, None)
-        if kept is not None and kept.any():
-            frame = torch.where(kept.any(-1, keepdim=True), kept, frame)
-            body, _ = body_of(physics, frame)
-        skill, quarter = option // 4, option % 4
-        index, sign, _, _ = (table[quarter] for table in self.tables)
-        _, _, action_index, action_sign = (table[(4 - quarter) % 4] for table in self.tables)
-        outputs = self.network(body.gather(-1, index) * sign, skill)
-        action = outputs[..., :ACTIONS].tanh().float()
-        tensordict.set("action", action.gather(-1, action_index) * action_sign)
-        return tensordict.set(("next", "frame"), frame)
+def _weights(loss: SkillSACLoss, actor: SkillActor) -> dict[str, Any]:
+    """The trained weights of an actor, which a loss holds apart from it."""
+    with loss.actor_network_params.to_module(loss.actor_network, preserve_module_state=False):
+        return {k: v.detach().clone() for k, v in loss.actor_network.state_dict().items()}
 
 
-class Fallen:
-    """Ends an option where the ant lies on its back."""
+class Curve:
+    """Notes metres an action in the direction of the skill, and falls, as the worker learns."""
 
-    def __call__(self, td: TensorDictBase) -> Tensor:
-        x, y = td.get("physics")[..., 5:6], td.get("physics")[..., 6:7]
-        return 1 - 2 * (x * x + y * y) < 0.0
+    def __init__(self, loss: SkillSACLoss, total: int, points: int = 20) -> None:
+        self.rows: list[list[float]] = []
+        self._loss, self._frames, self._every = loss, 0, total // points
+        self._sums = np.zeros(3)
 
-
-def make_planner(batch: MujocoBatch, worker: Walker, option_steps: int, radius: float, **kw: Any):
-    options = OptionTransform(worker, worker.num_options, option_steps, termination=Fallen())
-    env = TransformedEnv(batch, options)
-    settings: dict[str, Any] = {
-        "tree_policy": UCT(c=1.0),
-        "novelty": RadiusNovelty("position", radius),
-        "budget": SearchBudget(expansions=3000),
-        "leaves_per_wave": 4,
-    }
-    return MCTSPlanner(env, **(settings | kw))
-
-
-def act(env: Any, batch: MujocoBatch, worker: Walker, option: int, steps: int) -> tuple[Any, ...]:
-    """Execute an option in a Gymnasium env; its reward, end, base steps and path."""
-    td = batch.read(env).select("physics").set("skill", torch.tensor(option))
-    path, earned = [td["physics"][1:3].tolist()], 0.0
-    for i in range(steps):  # noqa: B007
-        worker(td)
-        _, reward, terminated, truncated, _ = env.step(td["action"].numpy())
-        td.set("frame", td["next", "frame"]).set("physics", batch.read(env)["physics"])
-        path.append(td["physics"][1:3].tolist())
-        earned += float(reward)
-        if terminated or truncated or bool(Fallen()(td)):
-            break
-    return earned, terminated, truncated, i + 1, path
+    def __call__(self, batch: TensorDictBase) -> dict[str, float]:
+        # A metre is worth sqrt(1.5), the length of a skill's vector among three.
+        metres = self._loss.objective.finite_reward(batch) / 1.5**0.5
+        falls = batch["next", "terminated"].sum()
+        self._sums += (len(batch), float(metres.sum()), float(falls))
+        self._frames += len(batch)
+        if self._frames >= self._every * (len(self.rows) + 1):
+            count, total, falls = self._sums
+            self.rows.append([self._frames, round(total / count, 4), falls])
+            self._sums[:] = 0
+            print(self.rows[-1], f"{time.process_time():.0f} CPU-s", flush=True)
+        return {}
 
 
-def solve(
-    name: str,
-    actor: SkillActor,
-    starts: Any,
-    *,
-    option_steps: int,
-    radius: float,
-    max_plans: int = 5,
-    **kw: Any,
-) -> list[dict[str, Any]]:
-    worker = Walker(actor)
-    keywords = {} if name[0] == "a" else {"continuing_task": False}
-    batch = MujocoBatch(name, seed=0, **keywords)
-    real = make_gym(name, **keywords)
-    planner = make_planner(batch, worker, option_steps, radius, **kw)
-    rows = []
-    for seed, options in starts:
-        real.reset(seed=seed, options=dict(options) if options else None)
-        start = batch.read(real)
-        row: dict[str, Any] = {"seed": seed, "plans": 0, "plan_cpu": [], "steps": 0, "simulated": 0}
-        row["task"] = options
-        row["start"], row["goal"] = start["position"].tolist(), start["goal"].tolist()
-        solved = ended = False
-        path = []
+# ---------------------------------------------------------------- planning
+
+
+def starts_of(name: str, per_task: int) -> list[tuple[int, dict[str, Any] | None]]:
+    """Seeds and options of ``env.reset``."""
+    if name.startswith("antmaze"):
+        return [(10 * t + i, {"task_id": t}) for t in range(1, 6) for i in range(per_task)]
+    return [(seed, None) for seed in range(5 * per_task)]
+
+
+class Agent:
+    """Plans over a worker's options, and executes in an env of its own."""
+
+    def __init__(self, name: str, actor: SkillActor, radius: float, budget: int) -> None:
+        keywords = {} if name.startswith("antmaze") else {"continuing_task": False}
+        self.worker = Walker(actor)
+        self.batch = MujocoBatch(name, task=Gait.of(name).task, seed=0, **keywords)
+        options = OptionTransform(
+            self.worker, self.worker.num_options, OPTION_STEPS, termination=fallen
+        )
+        self.planner = MCTSPlanner(
+            TransformedEnv(self.batch, options),
+            tree_policy=UCT(c=1.0),
+            novelty=RadiusNovelty("position", radius),
+            budget=SearchBudget(base_steps=budget),
+            leaves_per_wave=4,
+        )
+        self.env = make_gym(name, **keywords)
+
+    def solve(self, seed: int, options: dict[str, Any] | None, max_plans: int) -> dict[str, Any]:
+        """One episode of the env; what it cost, and the places on the way."""
+        self.env.reset(seed=seed, options=options and dict(options))
+        start = self.batch.read(self.env)
+        row: dict[str, Any] = {"seed": seed, **(options or {}), "solved": False, "steps": 0}
+        row |= {"plans": 0, "planned_options": 0, "differs": 0, "simulated": 0, "plan_cpu": 0.0}
+        path, ended = [start["position"].tolist()], False
         while not ended and row["plans"] < max_plans:
             begin = time.process_time()
-            state = batch.read(real)
-            search = planner.search(state)
+            search = self.planner.search(self.batch.read(self.env))
             plan = extract_plans(search)[0]
-            row["plan_cpu"].append(round(time.process_time() - begin, 2))
+            row["plan_cpu"] += time.process_time() - begin
             row["simulated"] += int(search.num_base_steps[0])
-            row["nodes"] = (
-                int(search.tree.num_nodes[0]) if hasattr(search.tree, "num_nodes") else None
-            )
             row["plans"] += 1
             if not bool(plan.found):
                 break
-            options_taken = plan.options[: int(plan.lengths)].tolist()
-            row["options"] = len(options_taken)
-            for i, option in enumerate(options_taken):
-                earned, terminated, truncated, steps, new = act(
-                    real, batch, worker, option, option_steps
+            row["planned_options"] = row["planned_options"] or int(plan.lengths)
+            for i, option in enumerate(plan.options[: int(plan.lengths)].tolist()):
+                earned, ended, steps, places = act(
+                    self.env, self.batch, self.worker, option, OPTION_STEPS
                 )
-                path += new
+                path += places[1:]
                 row["steps"] += steps
-                ended = terminated or truncated
-                solved = solved or earned > 0
-                if ended or solved:
-                    ended = True
+                row["solved"] |= earned > 0
+                if ended:
                     break
-                expected = plan.states.get("physics")[i + 1]
-                if not torch.equal(expected, batch.read(real)["physics"]):
-                    row["differs"] = row.get("differs", 0) + 1
+                reached = self.batch.read(self.env)["physics"]
+                if not torch.equal(plan.states.get("physics")[i + 1], reached):
+                    row["differs"] += 1
                     break
-        row["solved"] = solved
-        row["path"] = path
-        rows.append(row)
-        print({k: v for k, v in row.items() if k != "path"}, flush=True)
-    return rows
+        row["plan_cpu"] = round(row["plan_cpu"], 2)
+        self.search, self.path, self.start = search, path, start
+        return row
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Counts, and what a start cost."""
+    solved = [row for row in rows if row["solved"]]
+    out: dict[str, Any] = {"starts": len(rows), "solved": len(solved)}
+    tasks = sorted({row["task_id"] for row in rows if "task_id" in row})
+    if tasks:
+        out["solved_by_task"] = [sum(r["solved"] for r in rows if r["task_id"] == t) for t in tasks]
+    for name in ("plan_cpu", "simulated", "plans"):
+        out[name] = spread([row[name] for row in rows])
+    out["steps_of_solved"] = spread([row["steps"] for row in solved])
+    return out
+
+
+# ---------------------------------------------------------------- command line
+
+
+def kind_of(name: str) -> str:
+    return "ogbench" if name.startswith("antmaze") else "robotics"
+
+
+def note(part: str, key: str, entry: Any, out: Path) -> None:
+    """Write an entry of the results beside those that are there."""
+    path = out / "results.json"
+    results = json.loads(path.read_text()) if path.exists() else {"learning": {}, "solving": {}}
+    results[part][key] = entry
+    out.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+
+
+def load_actor(name: str, seed: int) -> SkillActor:
+    actor = make_actor()
+    path = WORKERS / f"{kind_of(name)}-{seed}.pt"
+    actor.load_state_dict(torch.load(path, weights_only=True))
+    return actor
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("name")
-    parser.add_argument("--frames", type=int, default=400_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--set", nargs="*", default=[])
+    parser.add_argument("part", choices=("learn", "solve", "draw"))
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--frames", type=int, default=75_000, help="actions of learning")
+    parser.add_argument("--starts", type=int, default=10, help="of each of 5 tasks")
+    parser.add_argument("--radius", type=float, default=2.0, help="metres that are a new place")
+    parser.add_argument("--budget", type=int, default=300_000, help="actions that a plan simulates")
+    parser.add_argument("--untrained", action="store_true", help="the worker before it learns")
+    parser.add_argument("--out", type=Path, default=OUT)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    extra = {k: float(v) if "." in v else int(v) for k, v in (x.split("=") for x in args.set)}
-
-    def report(trainer: Any, loss: Any) -> Any:
-        state = {"n": 0, "moved": [], "fell": [], "t": time.process_time()}
-
-        def hook(batch: TensorDictBase) -> dict[str, float]:
-            state["n"] += batch.numel()
-            ends = batch["next", "terminated"].float().mean()
-            state["fell"].append(float(ends))
-            step = (batch["next", "displacement"] - batch["displacement"]).norm(dim=-1)
-            with torch.no_grad():
-                w = loss.objective.reward(batch).squeeze(-1)
-            state["moved"].append((float(step.mean()), float(w.mean())))
-            if state["n"] % 6400 < batch.numel():
-                last = {k: v[-1] for k, v in trainer.history.items() if len(v)}
-                keys = (
-                    "actor_loss",
-                    "critic_loss",
-                    "alpha",
-                    "entropy",
-                    "encoder_loss",
-                    "grad_norm",
-                )
-                m = np.mean(state["moved"][-100:], 0)
-                print(
-                    state["n"],
-                    f"cpu {time.process_time() - state['t']:.0f} step {m[0]:.4f} "
-                    f"along {m[1]:.4f} fell {np.mean(state['fell'][-100:]):.4f}",
-                    {k: round(last[k], 3) for k in keys if k in last},
-                    flush=True,
-                )
-                if args.out and state["n"] % 51200 < batch.numel():
-                    torch.save(loss.state_dict(), args.out)
-            return {}
-
-        return hook
-
-    loss = learn(args.name, seed=args.seed, total_frames=args.frames, report=report, **extra)
-    if args.out:
-        torch.save(loss.state_dict(), args.out)
+    WORKERS.mkdir(parents=True, exist_ok=True)
+    for name in args.names:
+        for seed in args.seeds:
+            if args.part == "learn":
+                actor, cost = learn(name, seed=seed, total_frames=args.frames)
+                torch.save(actor.state_dict(), WORKERS / f"{kind_of(name)}-{seed}.pt")
+                note("learning", f"{kind_of(name)} seed {seed}", cost, args.out)
+            elif args.part == "solve":
+                torch.manual_seed(seed)
+                actor = make_actor() if args.untrained else load_actor(name, seed)
+                agent, rows = Agent(name, actor, args.radius, args.budget), []
+                for start in starts_of(name, args.starts):
+                    rows.append(agent.solve(*start, max_plans=5))
+                    print(rows[-1], flush=True)
+                key = f"{name} seed {seed}" + " untrained" * args.untrained
+                note("solving", key, {**summary(rows), "rows": rows}, args.out)
 
 
 if __name__ == "__main__":
