@@ -2,7 +2,7 @@
 
 Two symmetries are given to the worker, and no reward: the plane has no north, so that a skill sees
 the world from where and how the ant stood when the skill began; and a quarter turn of the body
-renames its legs, so that one skill is four options.
+renames its legs, so that what one skill learns can be taken in four directions.
 
 Letters: *B batch, S numbers of a state, z a skill, q a number of quarter turns.
 """
@@ -240,16 +240,18 @@ def normalized(width: int) -> Any:
 
 
 class Walker(TensorDictModuleBase):
-    """Walks by a skill z and q quarter turns, option ``4 z + q``, from the heading it began with.
+    """Walks by a skill and quarter turns of the body, from the heading that an option began with.
 
-    The network runs in double precision and its mean action is rounded to single, so that it does
-    not depend on how many states are walked at once, and a plan is executed to the bit.
+    Of the quarter turns only half turns are taken, option ``2 z + h``: three skills are six
+    directions. The network runs in double precision and its mean action is rounded to single, so
+    that it does not depend on how many states are walked at once, and a plan is executed to the
+    bit.
     """
 
     def __init__(self, actor: SkillActor) -> None:
         super().__init__()
         self.network = copy.deepcopy(actor.network).double().requires_grad_(False)
-        self.num_options = 4 * actor.num_skills
+        self.num_options = 2 * actor.num_skills
         self.in_keys = ["physics", "skill", "frame"]
         self.out_keys = ["action", ("next", "frame")]
         self.body, self.action, _ = turns()
@@ -262,8 +264,8 @@ class Walker(TensorDictModuleBase):
         if kept is not None and kept.any():
             frame = torch.where(kept.any(-1, keepdim=True), kept, frame)
             body, _ = body_of(physics, frame)
-        quarters = option % 4
-        outputs = self.network(self.body(body, quarters), option // 4)
+        quarters = 2 * (option % 2)
+        outputs = self.network(self.body(body, quarters), option // 2)
         action = outputs[..., :ACTIONS].tanh().float()
         tensordict.set("action", self.action(action, (4 - quarters) % 4))
         return tensordict.set(("next", "frame"), frame)

@@ -39,6 +39,8 @@ from ant_walker import (
     normalized,
     open_arena,
 )
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import Compose, TransformedEnv
@@ -48,8 +50,10 @@ from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.modules import SkillActionCritic, SkillActor, SkillEncoder, SpectralLinear
 from torchrl_hmcts.objectives import LSDEncoderLoss, SkillSACLoss
 from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget, extract_plans
+from torchrl_hmcts.planners.drawing import option_color
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import spread
+from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.transforms import OptionTransform, SkillReward, SkillTransform
 
 OUT, WORKERS = Path("docs/results/antmaze"), Path("runs/antmaze")
@@ -244,6 +248,52 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return out
 
 
+# ---------------------------------------------------------------- pictures
+
+
+def draw_skills(actors: dict[str, SkillActor], path: Path) -> None:
+    """Draw where the options lead from one standing start, of each ant in the open."""
+    figure = Figure(figsize=(8.4, 4.4), layout="constrained")
+    panels = figure.subplots(1, len(actors), sharex=True, sharey=True)
+    for axes, (name, actor) in zip(panels, actors.items(), strict=True):
+        env = open_arena(name)
+        batch, worker = MujocoBatch(name, task=Gait.of(name).task), Walker(actor)
+        for option in range(worker.num_options):
+            env.reset(seed=0)
+            _, _, _, places = act(env, batch, worker, option, OPTION_STEPS)
+            x, y = (np.array(places) - places[0]).T
+            axes.plot(x, y, color=option_color(option // 2), label=f"skill {option // 2}")
+        axes.set_title(name, fontsize=10, loc="left")
+        axes.set_aspect("equal")
+        axes.set_xlabel("metres in 2.5 s")
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles[::2], names[::2], loc="outside lower center", ncols=NUM_SKILLS)
+    save_figure(figure, path)
+
+
+def draw_plan(agent: Agent, path: Path) -> None:
+    """Draw where the agent's last search was, and the way that the ant then went."""
+    figure = Figure(figsize=(8.4, 6.4), layout="constrained")
+    axes = figure.subplots()
+    model, tree = agent.batch.model, agent.search.tree
+    for i in range(model.ngeom):
+        geom = model.geom(i)
+        if geom.bodyid[0] == 0 and geom.name.startswith("block"):
+            corner, size = geom.pos[:2] - geom.size[:2], 2 * geom.size[:2]
+            axes.add_patch(Rectangle(tuple(corner), *size, color="0.2"))
+    assert tree.states is not None
+    places = tree.states["position"][0, : int(tree.num_nodes[0])]
+    axes.plot(*places.T.numpy(), ".", color="0.6", markersize=4, label="states the search held")
+    axes.plot(*np.array(agent.path).T, color=option_color(0), label="executed", linewidth=2)
+    goal = agent.start["goal"].tolist()
+    axes.plot(*goal, "*", color=option_color(1), markersize=16, label="goal")
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    save_figure(figure, path)
+
+
 # ---------------------------------------------------------------- command line
 
 
@@ -296,6 +346,14 @@ def main() -> None:
                     print(rows[-1], flush=True)
                 key = f"{name} seed {seed}" + " untrained" * args.untrained
                 note("solving", key, {**summary(rows), "rows": rows}, args.out)
+    if args.part == "draw":
+        seed = args.seeds[0]
+        actors = {n: load_actor(n, seed) for n in ("antmaze-giant-v0", "AntMaze_Large-v5")}
+        draw_skills(actors, args.out / "skills.png")
+        name = "antmaze-giant-v0"
+        agent = Agent(name, actors[name], args.radius, args.budget)
+        agent.solve(10, {"task_id": 1}, max_plans=1)
+        draw_plan(agent, args.out / "plan.png")
 
 
 if __name__ == "__main__":
