@@ -14,12 +14,14 @@ separate Gymnasium env with its time limit of 1,000 steps, and made again where 
 another state than planned or the plan has ended. Starts of OGBench's mazes are its 5 tasks, 10
 times each with its noise; those of gymnasium-robotics are 50 draws of its own.
 
-Each part adds to ``docs/results/antmaze/results.json``, so that it can run in pieces.
+Each part adds to ``results.json`` and ``episodes.csv`` in ``docs/results/antmaze``, so that it can
+run in pieces.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import time
 from pathlib import Path
@@ -310,6 +312,19 @@ def note(part: str, key: str, entry: Any, out: Path) -> None:
     path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
+def note_episodes(key: str, rows: list[dict[str, Any]], out: Path) -> None:
+    """Write a row for each episode beside those that are there."""
+    path, others = out / "episodes.csv", []
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            others = [row for row in csv.DictReader(file) if row["of"] != key]
+    every = others + [{"of": key, "task_id": "", **row} for row in rows]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(every[-1]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(every)
+
+
 def load_actor(name: str, seed: int) -> SkillActor:
     actor = make_actor()
     path = WORKERS / f"{kind_of(name)}-{seed}.pt"
@@ -345,7 +360,8 @@ def main() -> None:
                     rows.append(agent.solve(*start, max_plans=5))
                     print(rows[-1], flush=True)
                 key = f"{name} seed {seed}" + " untrained" * args.untrained
-                note("solving", key, {**summary(rows), "rows": rows}, args.out)
+                note("solving", key, summary(rows), args.out)
+                note_episodes(key, rows, args.out)
     if args.part == "draw":
         seed = args.seeds[0]
         actors = {n: load_actor(n, seed) for n in ("antmaze-giant-v0", "AntMaze_Large-v5")}
