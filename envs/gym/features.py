@@ -1,0 +1,54 @@
+"""Features: a few numbers of a state that say where it is, for novelty, skills and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from torchrl_hmcts.envs.gym.mujoco import find_physics
+from torchrl_hmcts.envs.gym.snapshots import SnapshotError
+
+FEATURES_KEY = "features"
+"""Entry of a tensordict that holds the features of a state."""
+Features = Callable[[gymnasium.Env, Any], np.ndarray]
+"""Gives the features ``[F]`` of an env's state, from the env and its observation."""
+
+
+def achieved_goal(env: gymnasium.Env, observation: Any) -> np.ndarray:
+    """Return what a goal is compared with, float32 ``[F]``."""
+    return np.asarray(observation["achieved_goal"], np.float32)
+
+
+def root_place(env: gymnasium.Env, observation: Any) -> np.ndarray:
+    """Return MuJoCo's first two coordinates, the place of a robot, float32 ``[2]``."""
+    inner: Any = env.unwrapped
+    return inner.data.qpos[:2].astype(np.float32)
+
+
+def whole_observation(env: gymnasium.Env, observation: Any, *, scale: Any = 1.0) -> np.ndarray:
+    """Return the observation, each number times its scale, float32 ``[F]``."""
+    return np.asarray(observation, np.float32).reshape(-1) * np.float32(scale)
+
+
+def features_of(env: gymnasium.Env) -> Features:
+    """Return the features that suit an env.
+
+    They are the achieved goal of an env with goals; the place of the robot in MuJoCo; and else the
+    observation.
+
+    Args:
+        env: with its wrappers.
+    """
+    space = env.observation_space
+    if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
+        return achieved_goal
+    try:
+        model, _ = find_physics(env)
+    except SnapshotError:
+        return whole_observation
+    free = int(model.jnt_type[0]) == 0 or list(model.jnt_type[:2]) == [2, 2]
+    return root_place if free and hasattr(env.unwrapped, "data") else whole_observation
