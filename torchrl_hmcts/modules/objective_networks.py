@@ -23,7 +23,7 @@ from torchrl_hmcts.modules.skill_mlp import (
     key_list,
     skill_network,
 )
-from torchrl_hmcts.modules.skill_spec import Skills, as_skill_spec, number_of
+from torchrl_hmcts.modules.skill_spec import Skills, as_skill_spec, needs_number, number_of
 
 
 class SkillDiscriminator(SkillNetwork):
@@ -37,7 +37,7 @@ class SkillDiscriminator(SkillNetwork):
 
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
-        num_skills (int): number of skills ``Z``.
+        num_skills (int or TensorSpec): number of skills ``Z``.
         in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
             ``["displacement"]``.
         skill_logits_key (NestedKey): entry written, ``[*B, Z]``. Default ``"skill_logits"``.
@@ -61,14 +61,15 @@ class SkillDiscriminator(SkillNetwork):
     def __init__(
         self,
         in_features: int,
-        num_skills: int,
+        num_skills: Skills,
         *,
         in_keys: Sequence[NestedKey] = ("displacement",),
         skill_logits_key: NestedKey = "skill_logits",
         hidden: Sequence[int] = (),
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
-        check_sizes("SkillDiscriminator", in_features=in_features, num_skills=num_skills)
+        check_sizes("SkillDiscriminator", in_features=in_features)
+        num_skills = needs_number("SkillDiscriminator", num_skills)
         sizes = [in_features, *hidden, num_skills]
         network = FeatureMLP("SkillDiscriminator", sizes, activation)
         super().__init__(network, in_keys, skill_logits_key)

@@ -106,6 +106,18 @@ def number_of(spec: TensorSpec) -> int | None:
     return int(spec.space.n) if isinstance(spec, Categorical) else None
 
 
+def needs_number(owner: str, skills: Skills) -> int:
+    """Returns the number of skills; refuses vectors, which nobody can tell apart by a list."""
+    spec = as_skill_spec(owner, skills)
+    number = number_of(spec)
+    if number is None:
+        raise ValueError(
+            f"{owner} tells a number of skills apart; these are {described(spec)}. Take "
+            f"METRAEncoderLoss, LSDEncoderLoss or SkillDynamicsLoss for them."
+        )
+    return number
+
+
 def same_skills(one: TensorSpec, other: TensorSpec) -> bool:
     """Returns whether two specs of one skill are of as many skills, or of vectors as long."""
     return number_of(one) == number_of(other) and one.shape == other.shape

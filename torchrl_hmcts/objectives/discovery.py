@@ -16,7 +16,7 @@ from torch.nn.utils.parametrize import is_parametrized
 
 from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.modules.objective_networks import SpectralLinear
-from torchrl_hmcts.modules.skill_spec import described, draw_vectors
+from torchrl_hmcts.modules.skill_spec import draw_vectors, needs_number
 from torchrl_hmcts.objectives.loss import output_of, run_module
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
 
@@ -66,12 +66,7 @@ class SkillDiscriminatorLoss(SkillObjective):
 
     def __init__(self, discriminator: TensorDictModuleBase, **settings: Any) -> None:
         super().__init__(discriminator=discriminator, **settings)
-        if self.num_skills is None:
-            raise ValueError(
-                f"SkillDiscriminatorLoss tells a number of skills apart; these are "
-                f"{described(self.skill_spec)}. Take METRAEncoderLoss, LSDEncoderLoss or "
-                f"SkillDynamicsLoss for them."
-            )
+        needs_number("SkillDiscriminatorLoss", self.skill_spec)
 
     @property
     def next_features(self) -> list[NestedKey]:  # type: ignore[override]
