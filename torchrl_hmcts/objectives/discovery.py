@@ -77,7 +77,7 @@ class SkillDiscriminatorLoss(SkillObjective):
         """Returns the logits ``[*B, Z]`` of q(z | s') for transitions ``[*B]``."""
         module, params = self.discriminator, self.discriminator_params
         logits = output_of(module, params, tensordict.get("next"), self.tensor_keys.skill_logits)
-        off = self.inactive()
+        off = self.inactive(logits.device)
         return logits if off is None else logits.masked_fill(off, -torch.inf)
 
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:

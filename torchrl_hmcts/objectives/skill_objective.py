@@ -131,9 +131,9 @@ class SkillObjective(Loss):
         """Returns log p(z) as it is now, ``[Z]``, detached, of the type and device of ``like``."""
         return self.prior.log_probs().detach().to(like)
 
-    def inactive(self) -> Tensor | None:
+    def inactive(self, device: torch.device | None = None) -> Tensor | None:
         """Returns which skills are switched off, bool ``[Z]``; None if all are on for good."""
-        return None if self._always_all_active else ~self.prior.active()
+        return None if self._always_all_active else ~self.prior.active().to(device)
 
     @abstractmethod
     def reward(self, tensordict: TensorDictBase) -> Tensor:
@@ -171,7 +171,7 @@ class SkillObjective(Loss):
 
     def _of_active(self, value: Tensor, skill: Tensor) -> Tensor:
         """Returns values, and 0 where the skill, of the same shape, is switched off."""
-        off = self.inactive()
+        off = self.inactive(skill.device)
         return value if off is None else value.masked_fill(off[skill], 0.0)
 
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
@@ -184,6 +184,11 @@ class SkillObjective(Loss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.num_skills is None:  # called with tensors, all may be of one shape
+            batch_size = self.skill(tensordict).shape[:-1]
+            if tensordict.batch_size != batch_size:
+                tensordict = tensordict.copy()
+                tensordict.batch_size = batch_size
         losses = self.losses(self.without_empty_states(tensordict))
         return self._output(tensordict, losses)
 

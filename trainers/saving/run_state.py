@@ -153,12 +153,18 @@ class GeneratorStates:
 
     def __init__(self, **owners: Any) -> None:
         self.owners = owners
+        self._known: dict[str, Generator] = {}
+        self.generators()
 
     def generators(self) -> dict[str, Generator]:
-        """Return the generators by their path, e.g. ``"env._generator"``."""
+        """Return the generators by their path, e.g. ``"env._generator"``.
+
+        Those of an env that was closed since, as a ``SerialEnv`` is when a collector ends, too.
+        """
         seen: set[int] = set()
-        owners = self.owners.items()
-        return dict(found for name, owner in owners for found in _find(name, owner, seen, True))
+        for name, owner in self.owners.items():
+            self._known.update(_find(name, owner, seen, True))
+        return dict(self._known)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of every generator, by the path to it."""
