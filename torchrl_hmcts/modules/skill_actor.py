@@ -295,6 +295,7 @@ class SkillPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         instance("SkillPolicy", "actor", actor, SkillActor)
+        self.__dict__["actor"] = actor  # no sub-module: its parameters are the network's
         self.network = actor.network
         self.num_skills, self.skill_spec = actor.num_skills, actor.skill_spec
         self.in_keys = list(actor.module[0].in_keys)
