@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
@@ -16,6 +17,7 @@ from tqdm import tqdm
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
+from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import skills
 from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, make_kit
 from torchrl_hmcts.trainers.experiments.kits.gym import GymKit
@@ -170,18 +172,30 @@ class HMCTS:
         Args:
             seed: of the start.
         """
+        return _solution(self.kit.act(self.planner, self.real_env, self._start(seed)))
+
+    def play(
+        self, seed: int = 0, *, render: bool = True, out: str | Path | None = None
+    ) -> Solution:
+        """Act in one episode that is shown.
+
+        Args:
+            seed: of the start.
+            render: show a window, as Gymnasium's ``render_mode="human"`` does.
+            out: GIF to write instead, with a video (``.mp4``) beside it: the env's own pictures
+                where it draws any, else its features.
+        """
+        start = self._start(seed)
+        if out is None:
+            mode = "human" if render else ""
+            return _solution(self.kit.film(self.worker, self.planner, start, render=mode))
+        episode = self.kit.film(self.worker, self.planner, start, render="rgb_array")
+        self.kit.write_film(episode, Path(out).with_suffix(".gif"))
+        return _solution(episode)
+
+    def _start(self, seed: int) -> TensorDictBase:
         self.kit.config = dataclasses.replace(self.config, seed=seed)
-        start = self.kit.starts("test", 1)
-        results = self.kit.act(self.planner, self.real_env, start)
-        return Solution(
-            bool(results.solved[0]),
-            float(results.rewards[0]),
-            int(results.episode_steps[0]),
-            int(results.plan_options[0]),
-            int(results.simulated_steps[0]),
-            float(results.plan_seconds[0]),
-            results.plans[0] if results.plans else None,
-        )
+        return self.kit.starts("test", 1)
 
     # ------------------------------------------------------------ files
 
@@ -235,6 +249,18 @@ class HMCTS:
         return (
             f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
         )
+
+
+def _solution(results: Results) -> Solution:
+    return Solution(
+        bool(results.solved[0]),
+        float(results.rewards[0]),
+        int(results.episode_steps[0]),
+        int(results.plan_options[0]),
+        int(results.simulated_steps[0]),
+        float(results.plan_seconds[0]),
+        results.plans[0] if results.plans else None,
+    )
 
 
 def _load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:

@@ -22,9 +22,8 @@ from torchrl_hmcts.envs import (
     RepeatActions,
     SettableGymEnv,
     SkillWorker,
-    StatelessSimulator,
 )
-from torchrl_hmcts.envs.gym.features import WithFeatures
+from torchrl_hmcts.envs.gym.features import WithFeatures, achieved_goal, root_place
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
 from torchrl_hmcts.modules import SkillPolicy
@@ -51,6 +50,20 @@ def make_task(name: Any, look: Look, real: bool, keywords: Mapping[str, Any]) ->
     task = look.task(make_gym(name, **keywords))
     task.is_real = real
     return task
+
+
+class _Rows:
+    """Steps the states of a batch one after the other, for pictures of skills."""
+
+    def __init__(self, env: EnvBase) -> None:
+        self.env, self.reset = env, env.reset
+
+    def step(self, td: TensorDictBase) -> TensorDictBase:
+        rows = []
+        for row in td.unbind(0):
+            self.env.reset(row, set_state=True)
+            rows.append(self.env.step(row))
+        return torch.stack(rows)
 
 
 class GymKit(Kit):
@@ -149,7 +162,12 @@ class GymKit(Kit):
         return self.make_pool(worker)
 
     def make_pool(
-        self, worker: TensorDictModuleBase, *, real: bool = False, film: Film | None = None
+        self,
+        worker: TensorDictModuleBase,
+        *,
+        real: bool = False,
+        film: Film | None = None,
+        render: str = "",
     ) -> OptionPool:
         """Return a pool of options.
 
@@ -157,10 +175,11 @@ class GymKit(Kit):
             worker: executes them.
             real: to act in, rather than to plan in: rewards are the env's own, not discounted.
             film: records what happens.
+            render: mode in which the env draws itself.
         """
         config, keywords = self.config, dict(self.config.make)
-        if film is not None and film.render:
-            keywords["render_mode"] = "rgb_array"
+        if render:
+            keywords["render_mode"] = render
         make: Any = partial(make_task, self._env, self.look, real, keywords)
         acts: Any = self._fixed
         if isinstance(worker, SkillPolicy):
@@ -279,7 +298,22 @@ class GymKit(Kit):
             return None
         from torchrl_hmcts.trainers.figures.maps import FeatureMap
 
-        return FeatureMap(StatelessSimulator(env), key="features")
+        is_place = self.look.features in (achieved_goal, root_place)
+        names = ("x", "y") if is_place else ("feature 0", "feature 1")
+        return FeatureMap(_Rows(env), "features", names=names, is_place=is_place)  # type: ignore[arg-type]
+
+    @cached_property
+    def _draws_itself(self) -> bool:
+        """Whether the env can draw here; what hinders it is printed."""
+        try:
+            env = make_gym(self._env, **{**self.config.make, "render_mode": "rgb_array"})
+            env.reset(seed=0)
+            picture = env.render()
+            env.close()
+        except Exception as error:
+            print(f"{self.gym_env} cannot draw itself here ({error}): its features are drawn.")
+            return False
+        return isinstance(picture, np.ndarray)
 
     def film(
         self,
@@ -287,31 +321,21 @@ class GymKit(Kit):
         planner: MCTSPlanner,
         start: TensorDictBase,
         *,
-        render: bool = False,
-    ) -> tuple[Results, Film]:
-        """Act in one episode and keep its base steps.
-
-        Args:
-            worker: executes the options.
-            planner: over the worker's options.
-            start: state ``[1]``.
-            render: whether pictures are kept.
-        """
-        film = Film(self.look.features, render)
-        real = self.make_pool(worker, real=True, film=film)
+        render: str = "",
+    ) -> Results:
+        if render == "rgb_array" and not self._draws_itself:
+            render = ""
+        film = Film(self.look.features, render == "rgb_array")
+        real = self.make_pool(worker, real=True, film=film, render=render)
         film.clear()
         film.points.append(start["features"][0].numpy())
         episode = self.act(planner, real, start)
+        real.close()
         points = torch.from_numpy(np.array(film.points))
         episode.states = [TensorDict({"features": points}, [len(points)])]
         episode.options = [torch.tensor(film.options, dtype=torch.int64)]
-        return episode, film
-
-    def replay(self, worker: TensorDictModuleBase, trial: Trial) -> tuple[int, Results, Any]:
-        solved = np.flatnonzero(trial.results.solved)
-        shown = int(solved[0]) if len(solved) else 0
-        episode, _ = self.film(worker, trial.planner, trial.starts[shown : shown + 1])
-        return shown, episode, trial.planner.last_search
+        episode.frames = film.frames
+        return episode
 
     def figures(self, trial: Trial) -> dict[str, Any]:
         results = trial.results
