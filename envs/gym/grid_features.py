@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import os
 import gymnasium
+V = os.environ.get('V', '')
 import numpy as np
 from gymnasium import spaces
 
@@ -12,6 +14,7 @@ from torchrl_hmcts.envs.gym.minigrid import _UNMOVED
 
 _DOORS, _KINDS = 12, 18  # columns; the kinds are key, ball and box in six colours
 _PLACES = 3 + _DOORS + _KINDS
+_MEMORY = 1_000  # grids whose things are known
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # by direction
 
 
@@ -60,28 +63,23 @@ class GridFeatures:
     width = _PLACES + _KINDS
     stages = (_PLACES - 1, _PLACES)
 
-    def __init__(self) -> None:
-        self._cells: list[Any] = []
-        self._doors: list[Any] = []
-        self._objects: list[tuple[int, Any]] = []
+    def __init__(self, directed: bool = True) -> None:
+        self.directed = directed
+        self._known: dict[tuple[Any, ...], tuple[list[Any], list[tuple[int, Any]]]] = {}
 
     def __reduce__(self) -> Any:
-        return type(self), ()
+        return type(self), (self.directed,)
 
     def __call__(self, env: gymnasium.Env, observation: Any) -> np.ndarray:
         """Return the features of the present state, int64 ``[51]``."""
         inner: Any = env.unwrapped
         grid, cells = inner.grid, inner.grid.grid
-        if cells != self._cells:  # by identity: two microseconds
-            self._cells = cells.copy()
-            things = [(i, c) for i, c in enumerate(cells) if c and c.type not in _UNMOVED]
-            self._doors = [thing for _, thing in things if thing.type == "door"]
-            self._objects = [(i, thing) for i, thing in things if thing.type != "door"]
+        doors_there, objects = self._things(cells, grid.width)
         carried, doors, kinds = 0, [0] * _DOORS, [0] * _KINDS
-        for i, door in enumerate(self._doors):
-            doors[i % _DOORS] = 4 * doors[i % _DOORS] + 1 + door.encode()[2]
+        for i, (door, blocked) in enumerate(doors_there):
+            doors[i % _DOORS] = 8 * doors[i % _DOORS] + 1 + door.encode()[2] + 3 * blocked
         places: list[list[int]] = [[] for _ in kinds]
-        for cell, thing in self._objects:
+        for cell, thing in objects:
             kind = _kind(thing)
             places[kind].append(cell)
             kinds[kind] += 64 if _is_moved(thing) else 1
@@ -92,17 +90,44 @@ class GridFeatures:
             if inner.carrying.contains:
                 kinds[_kind(inner.carrying.contains)] += 4096
         done = _parts_done(getattr(inner, "instrs", None))
-        left = len(self._doors) + len(self._objects) + 256 * done
+        left = len(doors_there) + len(objects) + 256 * done
         x, y = inner.agent_pos
-        pose = 1 + 4 * (int(x) + grid.width * int(y)) + int(inner.agent_dir)
-        poses = 1 + 4 * len(cells)
+        cell, direction = int(x) + grid.width * int(y), int(inner.agent_dir)
+        full = pose = 1 + 5 * cell + 1 + direction
+        if not self.directed:
+            dx, dy = _STEPS[direction]
+            front = cells[cell + dx + grid.width * dy]
+            if front is None or front.type in _UNMOVED:
+                pose = 1 + 5 * cell
+        poses = 1 + 5 * len(cells)
         row = [pose + poses * carried]
         row += [pose + poses * value if value else 0 for value in doors]
         row += [pose + poses * value if value else 0 for value in kinds]
         row.append(pose + poses * left)
-        row.append(hash((pose, carried, left, *doors, *kinds)))
-        row += [hash((pose, *place)) if place else 0 for place in places]
+        joint = (full if "f" in V or ("c" in V and carried) else pose, carried, left, *doors, *kinds)
+        if "e" in V:
+            joint += tuple(map(tuple, places))
+        row.append(hash(joint))
+        q = pose if 'p' in V else full
+        row += [hash((q, *place)) if place else 0 for place in places]
         return np.array(row, np.int64)
+
+    def _things(self, cells: list[Any], width: int) -> tuple[list[Any], list[tuple[int, Any]]]:
+        """The doors, and the objects with their cells, of a grid that may have been seen before."""
+        known = tuple(cells)  # compared by identity, which takes a few microseconds
+        if known not in self._known:
+            if len(self._known) == _MEMORY:
+                self._known.clear()
+            things = [(i, c) for i, c in enumerate(cells) if c and c.type not in _UNMOVED]
+            objects = [(i, c) for i, c in things if c.type != "door"]
+            full = {i for i, _ in objects}
+            doors = [
+                (c, not full.isdisjoint((i - 1, i + 1, i - width, i + width)))
+                for i, c in things
+                if c.type == "door"
+            ]
+            self._known[known] = doors, objects
+        return self._known[known]
 
 
 class GridView(gymnasium.Wrapper):
@@ -128,19 +153,22 @@ class GridView(gymnasium.Wrapper):
         array([ True,  True,  True, False, False, False, False])
     """
 
-    def __init__(self, env: gymnasium.Env) -> None:
+    def __init__(self, env: gymnasium.Env, moves: bool = True) -> None:
         super().__init__(env)
         inner: Any = env.unwrapped
         space = inner.observation_space
         blank = {"image": np.zeros(space["image"].shape, np.uint8), "direction": 0, "mission": ""}
         inner.gen_obs = lambda: blank
-        self._features = GridFeatures()
+        self._features = GridFeatures(directed=not moves).__call__  # a method: snapshots take an object for state
+        self._moves = moves
         self._num_actions = int(inner.action_space.n)
         limits = np.iinfo(np.int64)
         self.observation_space = spaces.Dict(
             {
                 "features": spaces.Box(limits.min, limits.max, (GridFeatures.width,), np.int64),
-                "action_mask": spaces.MultiBinary(self._num_actions),
+                "action_mask": spaces.MultiBinary(self._num_actions + moves),
+                "direction": spaces.Discrete(4),
+                "front": spaces.Box(0, 255, (3,), np.uint8),
             }
         )
 
@@ -158,22 +186,53 @@ class GridView(gymnasium.Wrapper):
 
     def _observation(self) -> dict[str, np.ndarray]:
         inner: Any = self.env.unwrapped
-        (x, y), (dx, dy) = inner.agent_pos, _STEPS[inner.agent_dir]
-        front, carrying = inner.grid.get(int(x) + dx, int(y) + dy), inner.carrying
-        thing = front is not None and front.type not in _UNMOVED
-        mask = (
-            True,
-            True,
-            front is None or front.can_overlap(),
+        x, y = inner.agent_pos
+        around = [inner.grid.get(int(x) + dx, int(y) + dy) for dx, dy in _STEPS]
+        free = [c is None or c.can_overlap() for c in around]
+        things = [c is not None and c.type not in _UNMOVED for c in around]
+        way, carrying = inner.agent_dir, inner.carrying
+        front, thing = around[way], things[way]
+        if self._moves:
+            mask = [f or (t and d != way) for d, (f, t) in enumerate(zip(free, things))]
+        else:
+            mask = [True, True, free[way]]
+        mask += [
             thing and carrying is None and front.can_pickup(),
             front is None and carrying is not None,
             thing,
             thing,
-        )
+        ]
         return {
             "features": self._features(self.env, None),
-            "action_mask": np.array(mask[: self._num_actions], np.bool_),
+            "action_mask": np.array(mask[: self._num_actions + self._moves], np.bool_),
+            "direction": int(way),
+            "front": np.array((1, 0, 0) if front is None else front.encode(), np.uint8),
         }
+
+
+class GridMoves:
+    def __init__(self, num_actions: int = 7) -> None:
+        self.num_options = num_actions + 1
+        self._last = 0
+
+    def act(self, observation: Any, option: int, generator: np.random.Generator) -> int:
+        if option >= 4:
+            self._last = option - 1
+        else:
+            turns = (option - int(observation["direction"])) % 4
+            self._last = (2, 1, 1, 0)[turns]
+        return self._last
+
+    def ends(self, observation: Any, option: int, steps: int) -> bool:
+        if self._last >= 2:
+            return True
+        if int(observation["direction"]) != option:
+            return False
+        front = observation.get("front")
+        if front is None:
+            image = observation["image"]
+            front = image[image.shape[0] // 2, image.shape[1] - 2]
+        return not (front[0] in (1, 3, 8, 9) or (front[0] == 4 and front[2] == 0))
 
 
 def _kind(thing: Any) -> int:
