@@ -31,7 +31,9 @@ def root_place(env: gymnasium.Env, observation: Any) -> np.ndarray:
 
 def whole_observation(env: gymnasium.Env, observation: Any, *, scale: Any = 1.0) -> np.ndarray:
     """Return the observation, each number times its scale, float32 ``[F]``."""
-    return np.asarray(observation, np.float32).reshape(-1) * np.float32(scale)
+    parts = observation.values() if isinstance(observation, dict) else [observation]
+    flat = [np.asarray(part, np.float32).reshape(-1) for part in parts]
+    return np.concatenate(flat) * np.float32(scale)
 
 
 def features_of(env: gymnasium.Env) -> Features:
@@ -52,3 +54,29 @@ def features_of(env: gymnasium.Env) -> Features:
         return whole_observation
     free = int(model.jnt_type[0]) == 0 or list(model.jnt_type[:2]) == [2, 2]
     return root_place if free and hasattr(env.unwrapped, "data") else whole_observation
+
+
+class WithFeatures(gymnasium.ObservationWrapper):
+    """Shows the features beside the observation, e.g. to a vector env of Gymnasium.
+
+    Args:
+        env (gymnasium.Env): any env.
+        features (callable): as of :class:`OptionPool`.
+    """
+
+    is_stateless = True
+
+    def __init__(self, env: gymnasium.Env, features: Features) -> None:
+        super().__init__(env)
+        self.features = features
+        first = features(env, env.reset(seed=0)[0])
+        own = env.observation_space
+        parts = dict(own.spaces) if isinstance(own, spaces.Dict) else {"observation": own}
+        low, high = (-np.inf, np.inf) if first.dtype.kind == "f" else (-(2**62), 2**62)
+        parts[FEATURES_KEY] = spaces.Box(low, high, first.shape, first.dtype.type)
+        self.observation_space = spaces.Dict(parts)
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """Return the entries of an observation, and the features."""
+        shown = observation if isinstance(observation, dict) else {"observation": observation}
+        return {**shown, FEATURES_KEY: self.features(self.env, observation)}

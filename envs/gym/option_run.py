@@ -18,8 +18,8 @@ from torchrl.data.utils import CloudpickleWrapper
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
-from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
-from torchrl_hmcts.envs.gym.snapshots import SNAPSHOT_KEY, Snapshot, env_layers
+from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.envs.gym.snapshots import SNAPSHOT_KEY, Snapshot, env_layers, redraw
 
 Shape = tuple[tuple[int, ...], Any]
 """Shape and dtype of an entry."""
@@ -254,7 +254,7 @@ class GymRun(OptionRun):
             mark += b"%d " % (clock["_elapsed_steps"] or 0)
         seed = self.seed_of(slots, index, mark)
         if self._redrawing:
-            self._redraw(seed)
+            redraw(self._layers, seed)
         self._bits.state = {
             "bit_generator": "PCG64",
             "state": {"state": seed << 64 | seed, "inc": seed << 1 | 1},
@@ -268,13 +268,6 @@ class GymRun(OptionRun):
         if not self._notes_actions:  # one note is enough
             self.snapshot.note_step(None)
         return (values[0] if self._single else _nested(self._paths, values)), self._draws
-
-    def _redraw(self, seed: int) -> None:
-        for number, layer in enumerate(self._layers):
-            if vars(layer).get("_np_random") is not None:
-                layer._np_random = np.random.default_rng((seed, number))
-            if isinstance(layer, PrivateRandom):
-                layer.seed(seed)
 
     def _noted_step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         self.snapshot.note_step(action)

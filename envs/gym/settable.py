@@ -44,9 +44,9 @@ class PrivateRandom(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
-        self.seed(0)
+        self.seed_globals(0)
 
-    def seed(self, seed: int) -> None:
+    def seed_globals(self, seed: int) -> None:
         """Seed its own states of the global generators."""
         state = np.random.RandomState(seed % 2**32).get_state()
         self._states: tuple[Any, Any] = state, random.Random(seed).getstate()
@@ -56,7 +56,7 @@ class PrivateRandom(gymnasium.Wrapper):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the env; a seed also seeds its own states of the global generators."""
         if seed is not None:
-            self.seed(seed)
+            self.seed_globals(seed)
         return self._inside(lambda: self.env.reset(seed=seed, options=options))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -283,6 +283,7 @@ class SkillPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         instance("SkillPolicy", "actor", actor, SkillActor)
+        self.__dict__["actor"] = actor  # no sub-module: its parameters are the network's
         self.network = actor.network
         self.num_skills = actor.num_skills
         self.in_keys = list(actor.module[0].in_keys)

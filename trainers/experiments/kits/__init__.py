@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import LossModule
@@ -28,12 +28,13 @@ from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.parts import build, merged
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import OptionTransform
 
 __all__: list[str] = []
 
-KITS = {"waterworld": "waterworld.WaterworldKit", "labmaze": "lab.LabMazeKit"}
+KITS = {"waterworld": "waterworld.WaterworldKit", "labmaze": "lab.LabMazeKit", "gym": "gym.GymKit"}
 """Class of each kit by its name on the command line, in this package."""
 
 
@@ -183,6 +184,27 @@ class Kit:
         )
         return TransformedEnv(env, options)
 
+    def given_worker(self) -> TensorDictModuleBase | None:
+        """Return the worker of options that need no learning; None where they are learned.
+
+        With ``options="actions"`` an option repeats one action.
+
+        Raises:
+            ExperimentError: if the actions cannot be counted.
+        """
+        if self.config.options == "learned":
+            return None
+        space = self.make_env("test").action_spec.space
+        if not hasattr(space, "n"):
+            raise ExperimentError(
+                "options=actions needs discrete actions; these are within bounds."
+            )
+        self.config = replace(self.config, num_skills=int(space.n))
+        return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+
+    def prepare(self, worker: TensorDictModuleBase) -> None:
+        """Take note of a worker before it is planned with, e.g. of how far its options reach."""
+
     def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
         """Return the macro env to plan in.
 
@@ -258,6 +280,23 @@ class Kit:
     def second_try(self) -> Kit | None:
         """Return the kit with which starts are searched again that have no plan; None for none."""
         return None
+
+    def act(
+        self,
+        planner: MCTSPlanner,
+        real: EnvBase,
+        starts: TensorDictBase,
+        keys: Sequence[NestedKey] = (),
+    ) -> Results:
+        """Plan from each start and execute the plan.
+
+        Args:
+            planner: over the worker's options.
+            real: the macro env to act in.
+            starts: states ``[M]``.
+            keys: entries of the states to return.
+        """
+        return plan_and_execute(planner, real, starts, group=self.group, keys=keys)
 
     # ------------------------------------------------------- figures and pages
 
@@ -345,7 +384,7 @@ class Kit:
         shown = int(by_length[int(0.85 * (len(by_length) - 1))])
         real = self.make_options(self.make_env("test"), worker, list(self.state_keys))
         start = trial.starts[shown : shown + 1]
-        episode = plan_and_execute(trial.planner, real, start, keys=list(self.state_keys))
+        episode = self.act(trial.planner, real, start, list(self.state_keys))
         return shown, episode, trial.planner.last_search
 
     def table(self, metrics: Mapping[str, Any]) -> str:

@@ -1,0 +1,271 @@
+"""The kit of any Gymnasium env: learn skills in it, plan over options of it, act in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv, SkillWorker
+from torchrl_hmcts.envs.gym.features import WithFeatures
+from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner
+from torchrl_hmcts.trainers.evaluation import Results, spread
+from torchrl_hmcts.trainers.experiments.kits import Kit, Trial
+from torchrl_hmcts.trainers.experiments.settings import GymConfig
+from torchrl_hmcts.transforms import DisplacementTransform, OptionTransform, SkillTransform
+
+_PLAYED = 1_000_003  # added to the seed of envs to act in
+_WORKER_KEYS = ("achieved_goal", "desired_goal", "features", "snapshot")
+
+
+def make_task(name: Any, look: Look, real: bool, keywords: Mapping[str, Any]) -> gymnasium.Env:
+    """Make an env as the task that a look found, in any process.
+
+    Args:
+        name: id, or a function that makes the env.
+        look: of :func:`look_at`.
+        real: pay what the env itself pays, and call only a success terminal.
+        keywords: of ``gymnasium.make``.
+    """
+    task = look.task(make_gym(name, **keywords))
+    task.is_real = real
+    return task
+
+
+class GymKit(Kit):
+    """Any Gymnasium env whose state can be set: tasks with a goal, and rewards to collect.
+
+    Option length, features, novelty radius and the kind of task are found by a short look at the
+    env, printed, and changed by the keys of :class:`GymConfig`.
+
+    Args:
+        config: keys of the experiment.
+        env: makes the env instead of the id of ``config``.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.experiments.settings import GymConfig
+        >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
+        >>> kit.look.kind, kit.config.option_steps
+        ('goal', 14)
+    """
+
+    place_key = "features"
+    state_keys = ("features",)
+    title = "Planning over options of a Gymnasium env"
+    group = 1  # each search is timed on its own
+    config: GymConfig
+
+    def __init__(self, config: GymConfig, env: Any = None) -> None:
+        super().__init__(config)
+        self._env = config.id if env is None else env
+        look = look_at(self._env, gamma=config.gamma, **config.make)
+        if config.task != "auto":
+            look = dataclasses.replace(look, kind=config.task)
+        self.look = look
+        steps = config.option_steps or look.option_steps
+        self.config = dataclasses.replace(
+            config,
+            option_steps=steps,
+            skill_steps=config.skill_steps or 2 * steps,
+            novelty_radius=config.novelty_radius or look.novelty_radius,
+        )
+        self._fixed: RepeatActions | None = None
+        self._radius = config.novelty_radius  # 0: half of how far the options reach
+
+    @cached_property
+    def gym_env(self) -> gymnasium.Env:
+        """Return the env as Gymnasium makes it, for what it says of itself."""
+        made: gymnasium.Env = make_gym(self._env, **self.config.make)
+        return made
+
+    # ------------------------------------------------------- envs
+
+    def make_env(self, split: str) -> SettableGymEnv:
+        make = partial(make_task, self._env, self.look, split == "test", self.config.make)
+        seed = self.config.seed + (_PLAYED if split == "test" else 0)
+        return SettableGymEnv(make, features=self.look.features, seed=seed)
+
+    @cached_property
+    def worker_keys(self) -> Sequence[Any]:  # type: ignore[override]
+        """Entries of the observation but those of goals."""
+        keys = self.make_env("train").observation_spec.keys(True, True)
+        return [key for key in keys if key not in _WORKER_KEYS]
+
+    def make_training_env(self, num_envs: int = 16) -> EnvBase:
+        config = self.config
+
+        def make() -> gymnasium.Env:
+            return WithFeatures(make_gym(self._env, **config.make), self.look.features)
+
+        envs = SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+        return TransformedEnv(
+            GymWrapper(envs, categorical_action_encoding=True),
+            Compose(
+                StepCounter(max_steps=10 * config.skill_steps),
+                DoubleToFloat(),
+                SkillTransform(config.num_skills, max_skill_steps=config.skill_steps),
+                DisplacementTransform("features"),
+            ),
+        )
+
+    def starts(self, split: str, num_starts: int) -> TensorDictBase:
+        env = self.make_env(split)
+        tasks = getattr(self.gym_env.unwrapped, "num_tasks", 0)
+        found = []
+        for number in range(num_starts):
+            options = {"options": {"task_id": number % tasks + 1}} if tasks else {}
+            found.append(env.reset(**options))
+        return torch.stack(found).exclude("done", "terminated", "truncated")
+
+    def make_options(
+        self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
+    ) -> EnvBase:
+        if trajectory_keys is None:
+            return self.make_pool(worker, real=True)
+        steps = self.config.option_steps
+        number = self.config.num_skills
+        options = OptionTransform(worker, number, steps, 1.0, trajectory_keys=trajectory_keys)
+        return TransformedEnv(env, Compose(DoubleToFloat(), options))
+
+    def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
+        return self.make_pool(worker)
+
+    def make_pool(self, worker: TensorDictModuleBase, *, real: bool = False) -> OptionPool:
+        """Return a pool of options.
+
+        Args:
+            worker: executes them.
+            real: to act in, rather than to plan in: rewards are the env's own, not discounted.
+        """
+        config, make = self.config, partial(make_task, self._env, self.look, real, self.config.make)
+        acts: Any = self._fixed
+        if isinstance(worker, SkillPolicy):
+            acts = SkillWorker(worker.actor, deterministic=worker.deterministic)
+        return OptionPool(
+            make,
+            acts,
+            max_steps=config.option_steps,
+            num_processes=0 if real else config.processes,
+            gamma=1.0 if real else config.gamma,
+            determinised=not self.look.stochastic,
+            features=self.look.features,
+            seed=config.seed + (_PLAYED if real else 0),
+        )
+
+    def given_worker(self) -> TensorDictModuleBase | None:
+        if self.config.options == "learned":
+            return None
+        actions = fixed_actions(self.gym_env.action_space)
+        self._fixed = RepeatActions(actions)
+        self.config = dataclasses.replace(self.config, num_skills=len(actions))
+        table = torch.from_numpy(np.array(actions))
+        return TensorDictModule(lambda skill: table[skill], ["skill"], ["action"])
+
+    def prepare(self, worker: TensorDictModuleBase) -> None:
+        """Set the novelty radius to half of how far learned options move the features."""
+        if self._radius or self.config.options != "learned":
+            return
+        starts = self.starts("train", 8)
+        pool = self.make_pool(worker)
+        options = torch.arange(pool.num_options).repeat_interleave(len(starts))
+        before = starts.repeat(pool.num_options)
+        after = pool.step(before.set("option", options))["next"]
+        moved = (after["features"] - before["features"]).float().norm(dim=-1)
+        radius = float(moved.quantile(0.75)) / 2
+        if radius > 0.0:
+            self.config = dataclasses.replace(self.config, novelty_radius=radius)
+
+    # ------------------------------------------------------- the planner
+
+    def planner_part(self) -> dict[str, Any]:
+        config, part = self.config, super().planner_part()
+        if self.look.stochastic:
+            part |= {
+                "chance": {"_component_": "torchrl_hmcts.planners.ProgressiveWidening"},
+                "novelty": None,
+                "leaves_per_wave": 1,
+                "expand": "one",
+            }
+        if self.look.kind == "return" or self.look.stochastic:
+            part["budget"] |= {
+                "expansions": None,
+                "base_steps": config.search_steps,
+                "until_plan": False,
+            }
+        if self.look.kind == "return":
+            part |= {"novelty": None}
+            if not self.look.stochastic:
+                part |= {
+                    "backup": "max",
+                    "final_choice": {"_component_": "torchrl_hmcts.planners.HighestValue"},
+                }
+        return part
+
+    @property
+    def replans(self) -> bool:
+        """Whether it plans again after every option, rather than execute one plan."""
+        return self.look.stochastic or self.look.kind == "return"
+
+    def act(
+        self,
+        planner: MCTSPlanner,
+        real: EnvBase,
+        starts: TensorDictBase,
+        keys: Sequence[Any] = (),
+    ) -> Results:
+        if not self.replans:
+            return super().act(planner, real, starts, keys)
+        return Results.concatenate([self._play(planner, real, one, keys) for one in starts])
+
+    def _play(
+        self, planner: MCTSPlanner, real: EnvBase, start: TensorDictBase, keys: Sequence[Any]
+    ) -> Results:
+        """Act in one episode, with a search before every option."""
+        policy = HierarchicalPolicy(planner, replan_every=1, reuse=not self.look.stochastic)
+        pool: Any = planner.simulator.given_env
+        before, begin = pool.num_steps, time.perf_counter()
+        limit = getattr(self.gym_env.spec, "max_episode_steps", None) or 10_000
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            episode = real.rollout(limit, policy, auto_reset=False, tensordict=start.clone())
+        last = episode[-1]["next"]
+        return Results(
+            found=np.array([True]),
+            solved=last["terminated"].numpy().reshape(1),
+            simulated_steps=np.array([pool.num_steps - before]),
+            expansions=np.array([0]),
+            simulations=np.array([0]),
+            plan_options=np.array([len(episode)]),
+            episode_steps=np.array([int(episode["next", "duration"].sum())]),
+            rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
+            plan_seconds=np.array([time.perf_counter() - begin]),
+        )
+
+    # ------------------------------------------------------- figures
+
+    def figures(self, trial: Trial) -> dict[str, Any]:
+        results = trial.results
+        found = results.summary() | {"reward": spread(results.rewards)}
+        threshold = self.threshold
+        if threshold is not None:
+            found["reward_threshold"] = threshold
+        return found | {"plan_seconds": spread(results.plan_seconds)}
+
+    @cached_property
+    def threshold(self) -> float | None:
+        """Return at which the env counts as solved; None where it names none."""
+        spec = self.gym_env.spec
+        return None if spec is None else spec.reward_threshold
