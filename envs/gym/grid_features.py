@@ -1,248 +1,178 @@
-"""MiniGrid without pictures: what of a state is compared, and which actions change something."""
+"""What of a MiniGrid state is compared: pairs of the agent's pose with all else that changes."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import os
 import gymnasium
-V = os.environ.get('V', '')
 import numpy as np
-from gymnasium import spaces
 
-from torchrl_hmcts.envs.gym.minigrid import _UNMOVED
+from torchrl_hmcts.envs.gym.minigrid import _UNMOVED, MiniGridSnapshot
+from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
+STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+"""Columns and rows by which the cell in front lies off, by direction."""
 _DOORS, _KINDS = 12, 18  # columns; the kinds are key, ball and box in six colours
-_PLACES = 3 + _DOORS + _KINDS
+_SINGLE = 2 + _DOORS + _KINDS
 _MEMORY = 1_000  # grids whose things are known
-_STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # by direction
 
 
 class GridFeatures:
     r"""Returns the pairs of the agent's pose with all else that changes in a MiniGrid env.
 
-    With the pose :math:`p`, which is cell and direction, and another variable :math:`v_f`,
+    With :math:`C` cells, the pose :math:`p < P = 5 C + 1`, which is cell and direction, and another
+    variable :math:`v_f`,
 
     .. math:: \phi_f = p + P\,v_f, \qquad f < F = 51
 
     and 0 where there is nothing of the kind. Width-1 novelty over them keeps "here with the key"
-    apart from "here without it". The columns are the same in all states of all MiniGrid envs:
+    apart from "here without it". All MiniGrid and BabyAI envs have the same columns, so that the
+    vector fits whatever an episode brings:
 
     ======== =======================================================================================
     columns  variable
     ======== =======================================================================================
-    0        what is carried
-    1-12     the state of each door, by row and column; the 13th shares the first column, and so on
+    0        what is carried: kind and colour
+    1-12     of each door, row by row: open, closed or locked, and how many objects lie beside it;
+             the 13th shares the first column, and so on
     13-30    of keys, balls and boxes of each colour: how many lie where they were at first, how
-             many elsewhere, how many are hidden
+             many elsewhere, how many are hidden in boxes
     31       how many doors and objects are there, and which parts of a BabyAI mission are done
-    32       all of these together
-    33-50    of keys, balls and boxes of each colour: the cells where they lie
+    32       all of these together (a hash of 64 bits)
+    33-50    of keys, balls and boxes of each colour: the cells where they lie (a hash, too)
     ======== =======================================================================================
 
-    ``stages`` are the columns that a :class:`~torchrl_hmcts.planners.WidthNovelty` compares first,
-    and after each relaxation: single variables, then all together, then all places.
+    The features that tell many states apart come last. ``stages`` are those of
+    :class:`~torchrl_hmcts.planners.WidthNovelty`: single variables are compared first, then all
+    together, and then the places.
 
     Args:
-        None.
+        directed (bool): the pose has the direction always. False: in the columns 0 to 32 only where
+            something lies in front that can be used, for options that turn by themselves, as those
+            of :class:`GridMoves` do. Default True.
 
     Reference:
-        This project's; pairs with what most actions change are a part of the width-2 search of
-        Lipovetzky and Geffner, "Width and serialization of classical planning problems", 2012.
+        This project's; a width-2 search (Lipovetzky and Geffner, "Width and serialization of
+        classical planning problems", 2012) without the pairs that have no pose in them.
 
     Example:
+        >>> from torchrl_hmcts.envs import GridFeatures
         >>> from torchrl_hmcts.envs.gym.settable import make_gym
-        >>> env = make_gym("MiniGrid-Empty-5x5-v0")
-        >>> _ = env.reset(seed=0)
-        >>> first = GridFeatures()(env, None)
-        >>> _ = env.step(0)
-        >>> (GridFeatures()(env, None) != first).nonzero()[0]
+        >>> env, features = make_gym("MiniGrid-Empty-5x5-v0"), GridFeatures()
+        >>> observation, _ = env.reset(seed=0)
+        >>> first = features(env, observation)
+        >>> observation = env.step(0)[0]  # to the left
+        >>> (features(env, observation) != first).nonzero()[0]
         array([ 0, 31, 32])
     """
 
-    width = _PLACES + _KINDS
-    stages = (_PLACES - 1, _PLACES)
+    width = _SINGLE + 1 + _KINDS
+    stages = (_SINGLE, _SINGLE + 1)
 
     def __init__(self, directed: bool = True) -> None:
-        self.directed = directed
+        self.directed = bool(directed)
         self._known: dict[tuple[Any, ...], tuple[list[Any], list[tuple[int, Any]]]] = {}
 
     def __reduce__(self) -> Any:
         return type(self), (self.directed,)
 
+    def __repr__(self) -> str:
+        return f"GridFeatures(directed={self.directed})"
+
     def __call__(self, env: gymnasium.Env, observation: Any) -> np.ndarray:
-        """Return the features of the present state, int64 ``[51]``."""
+        """Return the features of the env's state, int64 ``[51]``.
+
+        Args:
+            env: a MiniGrid or BabyAI env with its wrappers.
+            observation: is not read.
+        """
         inner: Any = env.unwrapped
-        grid, cells = inner.grid, inner.grid.grid
-        doors_there, objects = self._things(cells, grid.width)
-        carried, doors, kinds = 0, [0] * _DOORS, [0] * _KINDS
-        for i, (door, blocked) in enumerate(doors_there):
-            doors[i % _DOORS] = 8 * doors[i % _DOORS] + 1 + door.encode()[2] + 3 * blocked
+        cells, width = inner.grid.grid, inner.grid.width
+        doors, objects = self._things(cells, width)
+        kinds, states = [0] * _KINDS, [0] * _DOORS
         places: list[list[int]] = [[] for _ in kinds]
+        for i, (door, beside) in enumerate(doors):
+            state = 1 + door.encode()[2] + 3 * beside
+            states[i % _DOORS] = 16 * states[i % _DOORS] + state
         for cell, thing in objects:
             kind = _kind(thing)
             places[kind].append(cell)
             kinds[kind] += 64 if _is_moved(thing) else 1
-            if thing.contains:
-                kinds[_kind(thing.contains)] += 4096
-        if inner.carrying:
-            carried = 1 + _kind(inner.carrying)
-            if inner.carrying.contains:
-                kinds[_kind(inner.carrying.contains)] += 4096
-        done = _parts_done(getattr(inner, "instrs", None))
-        left = len(doors_there) + len(objects) + 256 * done
+        carrying = inner.carrying
+        for holder in (*(thing for _, thing in objects), carrying):
+            if holder is not None and holder.contains is not None:
+                kinds[_kind(holder.contains)] += 4096
+        carried = 0 if carrying is None else 1 + _kind(carrying)
+        there = len(doors) + len(objects) + 256 * _parts_done(getattr(inner, "instrs", None))
         x, y = inner.agent_pos
-        cell, direction = int(x) + grid.width * int(y), int(inner.agent_dir)
-        full = pose = 1 + 5 * cell + 1 + direction
+        cell, way = int(x) + width * int(y), int(inner.agent_dir)
+        pose = directed = 5 * cell + 2 + way
         if not self.directed:
-            dx, dy = _STEPS[direction]
-            front = cells[cell + dx + grid.width * dy]
-            if front is None or front.type in _UNMOVED:
-                pose = 1 + 5 * cell
-        poses = 1 + 5 * len(cells)
+            dx, dy = STEPS[way]
+            if not is_thing(inner.grid.get(int(x) + dx, int(y) + dy)):
+                pose = 5 * cell + 1
+        poses = 5 * len(cells) + 1
         row = [pose + poses * carried]
-        row += [pose + poses * value if value else 0 for value in doors]
-        row += [pose + poses * value if value else 0 for value in kinds]
-        row.append(pose + poses * left)
-        joint = (full if "f" in V or ("c" in V and carried) else pose, carried, left, *doors, *kinds)
-        if "e" in V:
-            joint += tuple(map(tuple, places))
-        row.append(hash(joint))
-        q = pose if 'p' in V else full
-        row += [hash((q, *place)) if place else 0 for place in places]
+        row += [pose + poses * value if value else 0 for value in (*states, *kinds)]
+        row.append(pose + poses * there)
+        row.append(hash((pose, carried, there, *states, *kinds)))
+        row += [hash((directed, *place)) if place else 0 for place in places]
         return np.array(row, np.int64)
 
     def _things(self, cells: list[Any], width: int) -> tuple[list[Any], list[tuple[int, Any]]]:
-        """The doors, and the objects with their cells, of a grid that may have been seen before."""
-        known = tuple(cells)  # compared by identity, which takes a few microseconds
-        if known not in self._known:
+        """The doors with the number of objects beside them, and the objects with their cells.
+
+        Grids are compared by the identity of what they hold, which takes a few microseconds.
+        """
+        key = tuple(cells)
+        if key not in self._known:
             if len(self._known) == _MEMORY:
                 self._known.clear()
-            things = [(i, c) for i, c in enumerate(cells) if c and c.type not in _UNMOVED]
-            objects = [(i, c) for i, c in things if c.type != "door"]
+            things = [(i, thing) for i, thing in enumerate(cells) if is_thing(thing)]
+            objects = [(i, thing) for i, thing in things if thing.type != "door"]
             full = {i for i, _ in objects}
             doors = [
-                (c, not full.isdisjoint((i - 1, i + 1, i - width, i + width)))
-                for i, c in things
-                if c.type == "door"
+                (door, len(full & {i - 1, i + 1, i - width, i + width}))
+                for i, door in things
+                if door.type == "door"
             ]
-            self._known[known] = doors, objects
-        return self._known[known]
+            self._known[key] = doors, objects
+        return self._known[key]
 
 
-class GridView(gymnasium.Wrapper):
-    """A MiniGrid env for planning: features and a mask of actions in place of pictures.
-
-    A picture of what the agent sees takes most of a step's time, and a search over features looks
-    at none. The observation has ``"features"``, those of :class:`GridFeatures`, and
-    ``"action_mask"``: turning is always possible; the others where what lies in front lets them
-    change something: forward onto a free cell, pick up an object with empty hands, drop what is
-    carried onto an empty cell, toggle and done before a door or an object. Everything else is as
-    in the env, rewards and draws too, so that a plan can be executed in one with pictures.
+def check_minigrid(env: gymnasium.Env, owner: str) -> None:
+    """Refuse an env that is none of MiniGrid's.
 
     Args:
-        env (gymnasium.Env): a MiniGrid or BabyAI env; from now on it draws no pictures.
+        env: with its wrappers.
+        owner: who asks.
 
-    Reference:
-        This project's.
-
-    Example:
-        >>> from torchrl_hmcts.envs.gym.settable import make_gym
-        >>> env = GridView(make_gym("MiniGrid-Empty-5x5-v0"))
-        >>> env.reset(seed=0)[0]["action_mask"]
-        array([ True,  True,  True, False, False, False, False])
+    Raises:
+        SnapshotError: if it is another env.
     """
-
-    def __init__(self, env: gymnasium.Env, moves: bool = True) -> None:
-        super().__init__(env)
-        inner: Any = env.unwrapped
-        space = inner.observation_space
-        blank = {"image": np.zeros(space["image"].shape, np.uint8), "direction": 0, "mission": ""}
-        inner.gen_obs = lambda: blank
-        self._features = GridFeatures(directed=not moves).__call__  # a method: snapshots take an object for state
-        self._moves = moves
-        self._num_actions = int(inner.action_space.n)
-        limits = np.iinfo(np.int64)
-        self.observation_space = spaces.Dict(
-            {
-                "features": spaces.Box(limits.min, limits.max, (GridFeatures.width,), np.int64),
-                "action_mask": spaces.MultiBinary(self._num_actions + moves),
-                "direction": spaces.Discrete(4),
-                "front": spaces.Box(0, 255, (3,), np.uint8),
-            }
+    if not MiniGridSnapshot.fits(env):
+        raise SnapshotError(
+            f"{owner} is for MiniGrid and BabyAI envs, e.g. 'MiniGrid-FourRooms-v0'; got {env}."
         )
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Reset the env."""
-        _, info = self.env.reset(seed=seed, options=options)
-        return self._observation(), info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Take a step."""
-        _, reward, terminated, truncated, info = self.env.step(action)
-        return self._observation(), reward, terminated, truncated, info
+def is_thing(item: Any) -> bool:
+    """Return whether a cell holds a door or an object, rather than nothing, wall, goal or lava.
 
-    def _observation(self) -> dict[str, np.ndarray]:
-        inner: Any = self.env.unwrapped
-        x, y = inner.agent_pos
-        around = [inner.grid.get(int(x) + dx, int(y) + dy) for dx, dy in _STEPS]
-        free = [c is None or c.can_overlap() for c in around]
-        things = [c is not None and c.type not in _UNMOVED for c in around]
-        way, carrying = inner.agent_dir, inner.carrying
-        front, thing = around[way], things[way]
-        if self._moves:
-            mask = [f or (t and d != way) for d, (f, t) in enumerate(zip(free, things))]
-        else:
-            mask = [True, True, free[way]]
-        mask += [
-            thing and carrying is None and front.can_pickup(),
-            front is None and carrying is not None,
-            thing,
-            thing,
-        ]
-        return {
-            "features": self._features(self.env, None),
-            "action_mask": np.array(mask[: self._num_actions + self._moves], np.bool_),
-            "direction": int(way),
-            "front": np.array((1, 0, 0) if front is None else front.encode(), np.uint8),
-        }
-
-
-class GridMoves:
-    def __init__(self, num_actions: int = 7) -> None:
-        self.num_options = num_actions + 1
-        self._last = 0
-
-    def act(self, observation: Any, option: int, generator: np.random.Generator) -> int:
-        if option >= 4:
-            self._last = option - 1
-        else:
-            turns = (option - int(observation["direction"])) % 4
-            self._last = (2, 1, 1, 0)[turns]
-        return self._last
-
-    def ends(self, observation: Any, option: int, steps: int) -> bool:
-        if self._last >= 2:
-            return True
-        if int(observation["direction"]) != option:
-            return False
-        front = observation.get("front")
-        if front is None:
-            image = observation["image"]
-            front = image[image.shape[0] // 2, image.shape[1] - 2]
-        return not (front[0] in (1, 3, 8, 9) or (front[0] == 4 and front[2] == 0))
+    Args:
+        item: what a grid has in the cell.
+    """
+    return item is not None and item.type not in _UNMOVED
 
 
 def _kind(thing: Any) -> int:
     """The column of an object: its type and colour."""
     number, colour, _ = thing.encode()
-    return (6 * (number - 5) + colour) % _KINDS
+    return int(6 * (number - 5) + colour) % _KINDS
 
 
 def _is_moved(thing: Any) -> bool:
-    """Whether an object that lies somewhere was put there by the agent."""
+    """Whether an object lies where the agent put it, and not where it was."""
     now, first = thing.cur_pos, thing.init_pos
     return now is not None and (first is None or now[0] != first[0] or now[1] != first[1])
 
