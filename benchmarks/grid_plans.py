@@ -163,7 +163,9 @@ def main() -> None:
             if args.out:
                 rows = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
                 rows = [r for r in rows if (r["id"], r["search"]) != (row["id"], row["search"])]
-                command = "python benchmarks/grid_plans.py --out docs/results/settable/minigrid.json"
+                command = (
+                    "python benchmarks/grid_plans.py --out docs/results/settable/minigrid.json"
+                )
                 content = {"command": command, "budget_cpu_seconds": SECONDS, "nodes": NODES}
                 text = json.dumps({**content, "rows": [*rows, row]}, indent=1)
                 args.out.write_text(text + "\n", encoding="utf-8")
