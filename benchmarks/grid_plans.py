@@ -39,6 +39,7 @@ WIDER = [
     "Unlock", "UnlockPickup", "BlockedUnlockPickup", "MultiRoom-N6", "KeyCorridorS6R3",
     "LavaCrossingS11N5", "Dynamic-Obstacles-16x16", "ObstructedMaze-Full", "BossLevel",
 ]  # fmt: skip
+COMMAND = "python benchmarks/grid_plans.py --out docs/results/settable/minigrid.json"
 SECONDS, NODES, CHUNK = 60.0, 130_000, 5_000  # base steps between two looks at the clock
 
 

@@ -82,7 +82,8 @@ def test_the_vector_of_a_grid_is_what_a_hand_computes() -> None:
     assert vector[TOGETHER] == hash((pose, 0, 4, *doors, *kinds))
     places = {f: int(n) for f, n in enumerate(vector[TOGETHER + 1 :]) if n}
     assert places == {4: hash((pose, 13)), 6: hash((pose, 9)), 14: hash((pose, 14))}
-    assert vector.dtype == np.int64 and vector.shape == (GridFeatures.width,) == (51,)
+    assert vector.dtype == np.int64
+    assert vector.shape == (GridFeatures.width,) == (51,)
     assert GridFeatures.stages == (32, 33)
 
 
@@ -240,7 +241,8 @@ def test_a_plan_opens_the_door_and_pays_in_the_env_with_pictures() -> None:
         td = real.step(td.set("option", option))["next"]
         paid = td["reward"].item()
         td = td.exclude("reward")
-    assert paid > 0.0 and td["done"]
+    assert paid > 0.0
+    assert td["done"]
 
 
 def test_features_suit_the_options_and_can_be_sent() -> None:
