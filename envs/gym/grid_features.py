@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.envs.gym.minigrid import _UNMOVED, MiniGridSnapshot
 from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
@@ -25,7 +26,7 @@ class GridFeatures:
 
     .. math:: \phi_f = p + P\,v_f, \qquad f < F = 51
 
-    and 0 where there is nothing of the kind. Width-1 novelty over them keeps "here with the key"
+    int64 ``[F]``, and 0 where there is nothing of the kind. Width-1 novelty over them keeps "here with the key"
     apart from "here without it". All MiniGrid and BabyAI envs have the same columns, so that the
     vector fits whatever an episode brings:
 
@@ -51,6 +52,9 @@ class GridFeatures:
             something lies in front that can be used, for options that turn by themselves, as those
             of :class:`GridMoves` do. Default True.
 
+    Raises:
+        TypeError: if ``directed`` is not a bool.
+
     Reference:
         This project's; a width-2 search (Lipovetzky and Geffner, "Width and serialization of
         classical planning problems", 2012) without the pairs that have no pose in them.
@@ -70,7 +74,8 @@ class GridFeatures:
     stages = (_SINGLE, _SINGLE + 1)
 
     def __init__(self, directed: bool = True) -> None:
-        self.directed = bool(directed)
+        instance("GridFeatures", "directed", directed, bool)
+        self.directed = directed
         self._known: dict[tuple[Any, ...], tuple[list[Any], list[tuple[int, Any]]]] = {}
 
     def __reduce__(self) -> Any:

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.envs.gym.grid_features import STEPS, check_minigrid, is_thing
 
 _LEFT, _RIGHT, _FORWARD = range(3)
@@ -94,6 +94,7 @@ class GridView(gymnasium.Wrapper):
 
     Raises:
         SnapshotError: if it is another env.
+        TypeError: if ``moves`` is not a bool.
 
     Reference:
         This project's.
@@ -115,7 +116,8 @@ class GridView(gymnasium.Wrapper):
         image = np.zeros(inner.observation_space["image"].shape, np.uint8)
         blank = {"image": image, "direction": 0, "mission": ""}
         inner.gen_obs = lambda: blank
-        self.moves = bool(moves)
+        instance("GridView", "moves", moves, bool)
+        self.moves = moves
         self._num_options = int(inner.action_space.n) + self.moves
         self.observation_space = spaces.Dict(
             {
