@@ -9,6 +9,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from torchrl_hmcts.envs.gym.grid_features import GridFeatures
+from torchrl_hmcts.envs.gym.minigrid import MiniGridSnapshot
 from torchrl_hmcts.envs.gym.mujoco import find_physics
 from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
@@ -39,8 +41,8 @@ def whole_observation(env: gymnasium.Env, observation: Any, *, scale: Any = 1.0)
 def features_of(env: gymnasium.Env) -> Features:
     """Return the features that suit an env.
 
-    They are the achieved goal of an env with goals; the place of the robot in MuJoCo; and else the
-    observation.
+    They are the achieved goal of an env with goals; :class:`GridFeatures` in MiniGrid; the place of
+    the robot in MuJoCo; and else the observation.
 
     Args:
         env: with its wrappers.
@@ -48,6 +50,9 @@ def features_of(env: gymnasium.Env) -> Features:
     space = env.observation_space
     if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
         return achieved_goal
+    if MiniGridSnapshot.fits(env):
+        turns = env.has_wrapper_attr("moves") and env.get_wrapper_attr("moves")  # of a GridView
+        return GridFeatures(directed=not turns)
     try:
         model, _ = find_physics(env)
     except SnapshotError:
