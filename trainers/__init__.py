@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.a3c.learner_processes import LearnerError
     from torchrl_hmcts.trainers.a3c.shared_optimizers import SharedRMSprop
     from torchrl_hmcts.trainers.a3c.trainer import A3CTrainer
+    from torchrl_hmcts.trainers.agent import HMCTS, Solution, load_worker
     from torchrl_hmcts.trainers.collectors import CollectorError
     from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
     from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch

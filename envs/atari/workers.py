@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numbers
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,8 @@ class RepeatActions:
     """Options that take one action all the time.
 
     Args:
-        actions (int or sequence of int): the index of each option's action; a number means all
-            actions below it.
+        actions (int or sequence): the action of each option, an index or an array; a number means
+            all indices below it.
 
     Raises:
         TypeError: if it is neither a number nor a sequence.
@@ -34,7 +35,7 @@ class RepeatActions:
         (4, 2)
     """
 
-    def __init__(self, actions: int | Sequence[int]) -> None:
+    def __init__(self, actions: int | Sequence[Any]) -> None:
         if isinstance(actions, numbers.Real):
             actions = range(whole_number("RepeatActions", "actions", actions, least=1))
         if not isinstance(actions, Sequence):
@@ -46,7 +47,7 @@ class RepeatActions:
             raise ValueError("RepeatActions needs at least one action; got actions=().")
         self.num_options = len(self.actions)
 
-    def act(self, ram: np.ndarray, option: int, generator: np.random.Generator) -> int:
+    def act(self, observation: Any, option: int, generator: np.random.Generator) -> Any:
         """Return the option's action."""
         return self.actions[option]
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import gymnasium
 
 from torchrl_hmcts.checks import real_number, whole_number
+from torchrl_hmcts.envs.gym.features import Features
 from torchrl_hmcts.envs.gym.option_run import GymRun, OptionWorker
 from torchrl_hmcts.envs.gym.process_pool import ProcessPool
 from torchrl_hmcts.envs.gym.snapshots import DEFAULT_CAP
@@ -41,7 +42,7 @@ class OptionPool(ProcessPool):
     run as with ``num_processes=0``. Threads take turns.
 
     Writes, besides the observation: ``"snapshot"`` (uint8 ``[*B, width]``), ``"duration"`` (int64
-    ``[*B, 1]``, base steps).
+    ``[*B, 1]``, base steps), and ``"features"`` (``[*B, F]``) where ``features`` are given.
 
     Args:
         env (str or callable): an id, or a function that makes the env, called in each process.
@@ -54,6 +55,8 @@ class OptionPool(ProcessPool):
         gamma (float): discount per base step; the planner takes it over. Default 0.99.
         determinised (bool): see above. Default True.
         snapshot, cap: as in :class:`SettableGymEnv`.
+        features (callable, optional): ``features(env, observation)`` gives an array ``[F]`` of the
+            state at an option's end, e.g. a place for a novelty test that no observation has.
         start_method ("forkserver" or "spawn"): how processes are started. Default forkserver, or
             spawn where the path of the temporary folder (``TMPDIR``) is too long for it. As
             always with :mod:`multiprocessing`, a script needs ``if __name__ == "__main__":``.
@@ -99,6 +102,7 @@ class OptionPool(ProcessPool):
         determinised: bool = True,
         snapshot: Any = None,
         cap: int = DEFAULT_CAP,
+        features: Features | None = None,
         start_method: Literal["forkserver", "spawn"] = "forkserver",
         step_seconds: float = 60.0,
         batch_size: Sequence[int] = (),
@@ -119,6 +123,7 @@ class OptionPool(ProcessPool):
             whole_number("OptionPool", "max_steps", max_steps, least=1),
             real_number("OptionPool", "gamma", gamma, above=0.0, most=1.0),
             not determinised,
+            features,
         )
         super().__init__(
             run,

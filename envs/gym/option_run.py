@@ -17,12 +17,14 @@ from torchrl.data.utils import CloudpickleWrapper
 
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
-from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
-from torchrl_hmcts.envs.gym.snapshots import SNAPSHOT_KEY, Snapshot, env_layers
+from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
+from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.envs.gym.snapshots import SNAPSHOT_KEY, Snapshot, env_layers, redraw
 
 Shape = tuple[tuple[int, ...], Any]
 """Shape and dtype of an entry."""
 _ROW_BEFORE, _ROW_AFTER = f"before {SNAPSHOT_KEY}", f"after {SNAPSHOT_KEY}"
+_FEATURES = f"after {FEATURES_KEY}"
 
 
 class OptionWorker(Protocol):
@@ -187,6 +189,7 @@ class GymRun(OptionRun):
         snapshot, cap: as in :func:`snapshot_of`.
         worker, max_steps, gamma: as in :class:`OptionPool`.
         redrawing: whether the env's own generators begin every option with new draws.
+        features: as in :class:`OptionPool`.
     """
 
     def __init__(
@@ -199,11 +202,13 @@ class GymRun(OptionRun):
         max_steps: int,
         gamma: float,
         redrawing: bool,
+        features: Features | None = None,
     ) -> None:
         super().__init__(worker, max_steps, gamma)
         if callable(env) and not isinstance(env, CloudpickleWrapper):
             env = CloudpickleWrapper(env)
-        self.arguments = (env, keywords, snapshot, cap, worker, max_steps, gamma, redrawing)
+        parts = (worker, max_steps, gamma, redrawing, features)
+        self.arguments = (env, keywords, snapshot, cap, *parts)
         self.env: gymnasium.Env = make_gym(env, **keywords)
         self.snapshot: Snapshot = snapshot_of(self.env, snapshot, cap=cap)
         self._layers = env_layers(self.env)
@@ -230,6 +235,10 @@ class GymRun(OptionRun):
         }
         self.outputs[SNAPSHOT_KEY] = ((self.snapshot.width,), np.dtype(np.uint8))
         self.state_keys = list(self.outputs)
+        self._features = features
+        if features is not None:
+            first = features(self.env, observation)
+            self.outputs[FEATURES_KEY] = (first.shape, first.dtype)
 
     def reset(self, generator: np.random.Generator, seed: int | None) -> Any:
         seed = int(generator.integers(2**31)) if seed is None else seed & 0x7FFFFFFF
@@ -245,7 +254,7 @@ class GymRun(OptionRun):
             mark += b"%d " % (clock["_elapsed_steps"] or 0)
         seed = self.seed_of(slots, index, mark)
         if self._redrawing:
-            self._redraw(seed)
+            redraw(self._layers, seed)
         self._bits.state = {
             "bit_generator": "PCG64",
             "state": {"state": seed << 64 | seed, "inc": seed << 1 | 1},
@@ -260,13 +269,6 @@ class GymRun(OptionRun):
             self.snapshot.note_step(None)
         return (values[0] if self._single else _nested(self._paths, values)), self._draws
 
-    def _redraw(self, seed: int) -> None:
-        for number, layer in enumerate(self._layers):
-            if vars(layer).get("_np_random") is not None:
-                layer._np_random = np.random.default_rng((seed, number))
-            if isinstance(layer, PrivateRandom):
-                layer.seed(seed)
-
     def _noted_step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         self.snapshot.note_step(action)
         return self.env.step(action)
@@ -275,6 +277,8 @@ class GymRun(OptionRun):
         slots[_ROW_AFTER][index] = self.snapshot.read()
         for name, path in zip(self._after, self._paths, strict=True):
             slots[name][index] = _leaf(observation, path)
+        if self._features is not None:
+            slots[_FEATURES][index] = self._features(self.env, observation)
 
     def check_action(self, action: Any) -> str:
         space = self.env.action_space

@@ -20,6 +20,7 @@ from torchrl.envs import GymWrapper
 
 from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.gym.families import snapshot_of
+from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
 from torchrl_hmcts.envs.gym.snapshots import (
     DEFAULT_CAP,
     SNAPSHOT_KEY,
@@ -43,9 +44,9 @@ class PrivateRandom(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
-        self.seed(0)
+        self.seed_globals(0)
 
-    def seed(self, seed: int) -> None:
+    def seed_globals(self, seed: int) -> None:
         """Seed its own states of the global generators."""
         state = np.random.RandomState(seed % 2**32).get_state()
         self._states: tuple[Any, Any] = state, random.Random(seed).getstate()
@@ -55,7 +56,7 @@ class PrivateRandom(gymnasium.Wrapper):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the env; a seed also seeds its own states of the global generators."""
         if seed is not None:
-            self.seed(seed)
+            self.seed_globals(seed)
         return self._inside(lambda: self.env.reset(seed=seed, options=options))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -180,6 +181,8 @@ class SettableGymEnv(GymWrapper):
             see :func:`~torchrl_hmcts.envs.gym.families.snapshot_of`. Default: found by itself, and
             named in the ``repr``.
         cap (int): bytes of the attributes in a row at most. Default 65,536.
+        features (callable, optional): ``features(env, observation)`` gives an array ``[F]``, the
+            entry ``"features"``. Default: none.
         seed (int, optional): of the starts of its episodes. Default: drawn from torch's global
             generator.
         device (optional): of the tensors.
@@ -211,6 +214,7 @@ class SettableGymEnv(GymWrapper):
         *,
         snapshot: Any = None,
         cap: int = DEFAULT_CAP,
+        features: Features | None = None,
         seed: int | None = None,
         device: Any = None,
         **keywords: Any,
@@ -221,11 +225,16 @@ class SettableGymEnv(GymWrapper):
         }
         made = make_gym(env, **keywords)
         stored = snapshot_of(made, snapshot, cap=cap)
-        self.__dict__["_snapshot"] = stored
+        self.__dict__["_snapshot"], self.__dict__["_features"] = stored, features
         super().__init__(made, categorical_action_encoding=True, device=device, **theirs)
         row = Unbounded((stored.width,), dtype=torch.uint8, device=device)
         self.observation_spec[SNAPSHOT_KEY] = row
         self.state_spec = self.observation_spec.clone()
+        if features is not None:
+            first = _tensor(features(made, made.reset(seed=0)[0]))
+            self.observation_spec[FEATURES_KEY] = Unbounded(
+                first.shape, dtype=first.dtype, device=device
+            )
         self._discrete = type(made.action_space) is spaces.Discrete and made.action_space.start == 0
         self._single = None if isinstance(made.observation_space, spaces.Dict) else "observation"
         self._generator = torch.Generator()
@@ -249,7 +258,8 @@ class SettableGymEnv(GymWrapper):
             return self._restored(tensordict)
         seed = int(torch.randint(2**31, (), generator=self._generator))
         self.snapshot.note_reset(seed)
-        return self._with_row(super()._reset(tensordict, seed=seed, **kwargs))
+        observation, _ = self._env.reset(seed=seed, **kwargs)
+        return self._observed(observation, {})
 
     def _restored(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         keys = list(self.observation_spec.keys(True, True))
@@ -271,17 +281,21 @@ class SettableGymEnv(GymWrapper):
             taken = self.read_action(action)
         self.snapshot.note_step(taken)
         observation, reward, terminated, truncated, _ = self._env.step(taken)
-        entries = _entries(observation, self._single)
+        entries: dict[Any, Any] = {}
         entries[self.reward_key] = torch.tensor([float(reward)])
         entries["terminated"] = torch.tensor([bool(terminated)])
         entries["truncated"] = torch.tensor([bool(truncated)])
         entries["done"] = torch.tensor([bool(terminated or truncated)])
-        after = TensorDict(entries, [])
-        return self._with_row(after if self.device is None else after.to(self.device))
+        return self._observed(observation, entries)
 
-    def _with_row(self, td: TensorDictBase) -> TensorDictBase:
-        row = torch.from_numpy(self.snapshot.read())
-        return td.set(SNAPSHOT_KEY, row if self.device is None else row.to(self.device))
+    def _observed(self, observation: Any, entries: dict[Any, Any]) -> TensorDictBase:
+        """Joins the entries of a step with those of the state that it led to."""
+        entries |= _entries(observation, self._single)
+        entries[SNAPSHOT_KEY] = torch.from_numpy(self.snapshot.read())
+        if self._features is not None:
+            entries[FEATURES_KEY] = _tensor(self._features(self._env, observation))
+        td = TensorDict(entries, [])
+        return td if self.device is None else td.to(self.device)
 
     def __repr__(self) -> str:
         spec = self._env.spec

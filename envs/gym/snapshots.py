@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -100,6 +100,8 @@ class Snapshot(ABC):
 def env_layers(env: gymnasium.Env) -> list[gymnasium.Env]:
     """Return the wrappers from the outside, the env itself, and envs that it holds as attributes.
 
+    Wrappers with a class attribute ``is_stateless = True`` are left out: they hold no state.
+
     Args:
         env (gymnasium.Env): any env.
 
@@ -114,9 +116,24 @@ def env_layers(env: gymnasium.Env) -> list[gymnasium.Env]:
         layer = waiting.pop(0)
         if any(layer is known for known in layers):
             continue
-        layers.append(layer)
+        if not getattr(type(layer), "is_stateless", False):
+            layers.append(layer)
         waiting += [value for value in vars(layer).values() if isinstance(value, gymnasium.Env)]
     return layers
+
+
+def redraw(layers: Sequence[gymnasium.Env], seed: int) -> None:
+    """Give all generators of an env other numbers.
+
+    Args:
+        layers: of :func:`env_layers`.
+        seed: of the numbers.
+    """
+    for number, layer in enumerate(layers):
+        if vars(layer).get("_np_random") is not None:
+            layer._np_random = np.random.default_rng((seed, number))
+        if hasattr(type(layer), "seed_globals"):
+            layer.seed_globals(seed)  # type: ignore[attr-defined]
 
 
 class ReplaySnapshot(Snapshot):

@@ -59,7 +59,8 @@ class HierarchicalPolicy(TensorDictModuleBase):
         planner (MCTSPlanner): the manager.
         max_plan_length (int): options of a plan that are kept, L. Default 64.
         replan_every (int, optional): options after which to plan again though the plan continues; 1
-            for every option. Default: at the plan's end.
+            for every option, which is then the planner's ``final_choice``. Default: at the plan's
+            end.
         divergence (float, optional): distance from the predicted state, in units of the entries,
             above which to plan again. Default: the prediction is not looked at.
         divergence_key (NestedKey or sequence of them, optional): entries of the simulator's state
@@ -258,6 +259,8 @@ class HierarchicalPolicy(TensorDictModuleBase):
     ) -> None:
         """Plan for the elements ``needs`` and write their plans."""
         found, fallback = self._searched(td, needs, executed)
+        if self.replan_every == 1:  # only the first option counts, which is the planner's choice
+            found.found = torch.zeros_like(found.found)
         device = kept["plan"].device
         width = min(found.options.shape[-1], self.max_plan_length)
         plan = torch.zeros((len(found), self.max_plan_length), dtype=torch.int64)

@@ -123,6 +123,14 @@ EXPERIMENTS = {
     )
 }
 
+GYM = Experiment(
+    "gym",
+    "any Gymnasium env: tree search over skills that are learned there, or over its actions",
+    ".settings:GymConfig",
+    *_SKILLS,
+    objective="test.solved",
+    kit="gym",
+)
 DEMO = Experiment(
     "demo",
     "learn four skills and solve random mazes",
@@ -131,8 +139,8 @@ DEMO = Experiment(
     objective="solved",
     kit="waterworld",
 )
-ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS}
-"""The experiments of ``hmcts train``, and the demo: all that leave a folder of a run."""
+ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS, "gym": GYM}
+"""The experiments of ``hmcts train``, the demo and the gym kit: all that leave a run's folder."""
 KITS = {e.kit: e for e in ALL_EXPERIMENTS.values() if e.kit}
 """The experiments that ``hmcts train kit=NAME`` runs, by kit."""
 

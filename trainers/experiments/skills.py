@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
@@ -41,7 +40,6 @@ from torchrl_hmcts.trainers.experiments.kits import (
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, SkillsConfig
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.trainers.parts import build, merged, named
-from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
@@ -119,7 +117,7 @@ def evaluate_skills(config: SkillsConfig) -> dict[str, Any]:
     """
     torch.set_num_threads(1)
     kit = make_kit(config.sized())
-    checkpoint, worker = "", given_worker(kit)
+    checkpoint, worker = "", kit.given_worker()
     if worker is None:
         loss = make_loss(kit)
         checkpoint = load_networks(loss, config.out).name
@@ -157,7 +155,7 @@ def learn(
     """
     config = kit.config
     begin = time.process_time()
-    given = given_worker(kit)
+    given = kit.given_worker()
     if given is not None:
         return LearnedSkills(given, None, {}, RoundRecords(), 0, 0, 0, 0.0)
     frames = config.train_steps * config.frames_per_step
@@ -193,24 +191,6 @@ def learn(
         len(trainer.records) if rounds else 0,
         round(time.process_time() - begin, 1),
     )
-
-
-def given_worker(kit: Kit) -> TensorDictModuleBase | None:
-    """Return the worker of options that need no learning; None where they are learned.
-
-    Args:
-        kit: with ``options="actions"`` an option repeats one action.
-
-    Raises:
-        ExperimentError: if the actions cannot be counted.
-    """
-    if kit.config.options == "learned":
-        return None
-    env = kit.make_env("test")
-    if not hasattr(env.action_spec.space, "n"):
-        raise ExperimentError("options=actions needs discrete actions; these are within bounds.")
-    kit.config = dataclasses.replace(kit.config, num_skills=int(env.action_spec.space.n))
-    return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
 
 
 def make_loss(kit: Kit) -> Any:
@@ -407,6 +387,7 @@ def solve(
         worker: executes the options.
         say: told what is done, e.g. ``print``. Default: nobody is.
     """
+    kit.prepare(worker)
     config = kit.config
     starts = kit.starts("test", config.mazes)
     planner = kit.make_planner(kit.make_simulator(worker))
@@ -442,7 +423,7 @@ def _solve(
     parts: list[Results] = []
     bar = tqdm(starts.split(kit.group), desc="plan and act", unit="group", disable=quiet)
     for some in bar:
-        parts.append(plan_and_execute(planner, real, some, group=kit.group))
+        parts.append(kit.act(planner, real, some))
         bar.set_postfix(solved=int(sum(part.solved.sum() for part in parts)))
     return Results.concatenate(parts)
 

@@ -1,0 +1,291 @@
+"""The agent in one line: an environment's id, learned skills, plans, and a folder to keep it in."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
+from tqdm import tqdm
+
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import MCTSPlanner, Plan
+from torchrl_hmcts.trainers.evaluation import Results
+from torchrl_hmcts.trainers.experiments import skills
+from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, make_kit
+from torchrl_hmcts.trainers.experiments.kits.gym import GymKit
+from torchrl_hmcts.trainers.experiments.registry import load_config
+from torchrl_hmcts.trainers.experiments.settings import GymConfig, SkillsConfig
+from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run, start_record
+from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """One episode: what was planned, and what came of it in an env of its own.
+
+    Attributes:
+        solved (bool): whether the goal was reached, or the reward that the env asks for.
+        reward (float): the env's own rewards, summed.
+        base_steps (int): of the episode.
+        num_options (int): that were executed.
+        simulated_steps (int): base steps of all searches.
+        plan_seconds (float): of all searches.
+        plan (Plan, optional): that was executed; None where every option had a search of its own.
+    """
+
+    solved: bool
+    reward: float
+    base_steps: int
+    num_options: int
+    simulated_steps: int
+    plan_seconds: float = dataclasses.field(compare=False)
+    plan: Plan | None = dataclasses.field(default=None, repr=False, compare=False)
+
+
+class HMCTS:
+    """Learns skills in any environment whose state can be set, plans over them, and acts.
+
+    Without :meth:`learn` the planner's options repeat the env's actions. The parts are TorchRL's
+    and this library's: :attr:`env` is the macro environment, :attr:`planner` the manager,
+    :attr:`loss` the skill loss with its networks.
+
+    Args:
+        env (str or callable): a Gymnasium id, or a function that makes such an env.
+        num_skills (int): skills to learn. Default 8.
+        seed (int): of all random numbers. Default 0.
+        **keys: of :class:`~torchrl_hmcts.trainers.experiments.settings.GymConfig`, e.g.
+            ``option_steps=10``, ``task="return"``, ``make={"max_episode_steps": 500}``,
+            ``planner={"leaves_per_wave": 8}``. What is not given is found by a short look at the
+            env.
+
+    Raises:
+        ValueError: if the id is unknown (the nearest are named), or the state cannot be stored.
+        ImportError: if a package is missing; the extra that has it is named.
+
+    Reference:
+        Dissertation, chapters 4 and 5.
+
+    Example:
+        >>> from torchrl_hmcts.trainers import HMCTS
+        >>> agent = HMCTS("MountainCar-v0")
+        >>> agent
+        HMCTS(MountainCar-v0, 3 actions, each for 14 base steps)
+        >>> agent.solve(seed=0).solved
+        True
+    """
+
+    def __init__(
+        self,
+        env: str | Callable[[], Any] | SkillsConfig,
+        *,
+        num_skills: int = 8,
+        seed: int = 0,
+        **keys: Any,
+    ) -> None:
+        if isinstance(env, SkillsConfig):
+            self.kit: Kit = make_kit(env)
+        else:
+            keys = {"options": "directions", "num_skills": num_skills, "seed": seed, **keys}
+            name = env if isinstance(env, str) else ""
+            self.kit = GymKit(GymConfig(id=name, **keys), env=env)
+        self.learned: LearnedSkills | None = None
+        self._num_skills = self.config.num_skills  # given options may be more or fewer
+        self._worker = self.kit.given_worker()
+
+    # ------------------------------------------------------------ parts
+
+    @property
+    def config(self) -> SkillsConfig:
+        """All keys, those that were found by a look at the env included."""
+        return self.kit.config
+
+    @property
+    def loss(self) -> LossModule | None:
+        """The loss of the worker, with its networks; None before :meth:`learn`."""
+        return None if self.learned is None else self.learned.loss
+
+    @property
+    def worker(self) -> TensorDictModuleBase:
+        """The policy that executes the options."""
+        if self._worker is None:
+            raise RuntimeError("No skills have been learned. Call learn() first.")
+        return self._worker
+
+    @cached_property
+    def env(self) -> EnvBase:
+        """The macro environment in which the planner searches."""
+        return self.kit.make_simulator(self.worker)
+
+    @cached_property
+    def planner(self) -> MCTSPlanner:
+        """The manager."""
+        return self.kit.make_planner(self.env)
+
+    @cached_property
+    def real_env(self) -> EnvBase:
+        """The macro environment in which the agent acts, another instance."""
+        return self.kit.make_options(self.kit.make_env("test"), self.worker)
+
+    # ------------------------------------------------------------ what it does
+
+    def learn(
+        self, base_steps: int = 50_000, *, progress: bool = True, save_dir: Any = None
+    ) -> HMCTS:
+        """Learn skills without reward; return the agent.
+
+        Args:
+            base_steps: of training.
+            progress: show a bar.
+            save_dir: folder of checkpoints. Default: none.
+        """
+        changes: dict[str, Any] = {"options": "learned", "num_skills": self._num_skills}
+        changes["train_base_steps"] = base_steps
+        names = {f.name for f in dataclasses.fields(self.config)}
+        changes = {key: value for key, value in changes.items() if key in names}
+        self.kit.config = dataclasses.replace(self.config, **changes)
+
+        def bar(total: int) -> Any:
+            return tqdm(total=total, desc="learn", unit="step", disable=not progress)
+
+        self._take(skills.learn(self.kit, save_dir=save_dir, progress=bar))
+        return self
+
+    def _take(self, learned: LearnedSkills) -> None:
+        self.learned, self._worker = learned, learned.worker
+        for name in ("env", "planner", "real_env"):
+            part = self.__dict__.pop(name, None)
+            if isinstance(part, EnvBase):
+                part.close()
+        self.kit.prepare(learned.worker)
+
+    def solve(self, seed: int = 0) -> Solution:
+        """Plan from a start and act in an env of its own.
+
+        Args:
+            seed: of the start.
+        """
+        return _solution(self.kit.act(self.planner, self.real_env, self._start(seed)))
+
+    def play(
+        self, seed: int = 0, *, render: bool = True, out: str | Path | None = None
+    ) -> Solution:
+        """Act in one episode that is shown.
+
+        Args:
+            seed: of the start.
+            render: show a window, as Gymnasium's ``render_mode="human"`` does.
+            out: GIF to write instead, with a video (``.mp4``) beside it: the env's own pictures
+                where it draws any, else its features.
+        """
+        start = self._start(seed)
+        if out is None:
+            mode = "human" if render else ""
+            return _solution(self.kit.film(self.worker, self.planner, start, render=mode))
+        episode = self.kit.film(self.worker, self.planner, start, render="rgb_array")
+        self.kit.write_film(episode, Path(out).with_suffix(".gif"))
+        return _solution(episode)
+
+    def _start(self, seed: int) -> TensorDictBase:
+        self.kit.config = dataclasses.replace(self.config, seed=seed)
+        return self.kit.starts("test", 1)
+
+    # ------------------------------------------------------------ files
+
+    def save(self, folder: str | Path) -> Path:
+        """Write keys and networks into a folder: JSON and plain arrays, no code.
+
+        Args:
+            folder: made if absent; ``hmcts play run=FOLDER`` shows the agent.
+
+        Returns:
+            The folder.
+
+        Raises:
+            ValueError: if the env is a function, which cannot be written.
+        """
+        if isinstance(self.kit, GymKit) and not self.kit.config.id:
+            raise ValueError(
+                "An agent over a function that makes its env cannot be saved: register the env "
+                "with gymnasium.register and build the agent from its id."
+            )
+        config = dataclasses.replace(self.config, out=str(folder))
+        start_record(config.EXPERIMENT, config, [], {})
+        if self.learned is not None and self.learned.loss is not None:
+            save_worker(folder, self.learned.loss, self.learned.worker_step)
+        end_record(folder, "finished")
+        return Path(folder)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> HMCTS:
+        """Read an agent that :meth:`save` or ``hmcts train`` wrote.
+
+        Args:
+            folder: of the agent, or of a run of the kits ``gym``, ``waterworld`` and ``labmaze``.
+
+        Raises:
+            FileNotFoundError: if there is none, or it has no networks yet.
+            ValueError: if it is another kind of run, or damaged.
+        """
+        _, config = load_config(read_run(folder))
+        if not isinstance(config, SkillsConfig):
+            raise ValueError(f"{folder} holds a run of {config.EXPERIMENT}, which has no skills.")
+        agent = cls(config)
+        if config.options == "learned":
+            agent._take(_load_skills(agent.kit, folder))
+        return agent
+
+    def __repr__(self) -> str:
+        config = self.config
+        name = getattr(config, "id", "") or config.EXPERIMENT
+        what = "skills" if config.options == "learned" else "actions"
+        return (
+            f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
+        )
+
+
+def _solution(results: Results) -> Solution:
+    return Solution(
+        bool(results.solved[0]),
+        float(results.rewards[0]),
+        int(results.episode_steps[0]),
+        int(results.plan_options[0]),
+        int(results.simulated_steps[0]),
+        float(results.plan_seconds[0]),
+        results.plans[0] if results.plans else None,
+    )
+
+
+def _load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
+    loss = skills.make_loss(kit)
+    path = load_networks(loss, folder)
+    worker = SkillPolicy(loss.actor_network, deterministic=True)
+    step = int("".join(filter(str.isdigit, path.stem)) or 0)
+    return LearnedSkills(worker, loss, {}, skills.RoundRecords(), step, step, 0, 0.0)
+
+
+def load_worker(folder: str | Path) -> SkillPolicy:
+    """Return the skills of an agent alone: a policy that reads an observation and a skill.
+
+    Args:
+        folder: as of :meth:`HMCTS.load`.
+
+    Returns:
+        The policy, in evaluation mode, with its most probable actions.
+
+    Raises:
+        FileNotFoundError: if there is none, or it has no networks yet.
+    """
+    agent = HMCTS.load(folder)
+    worker = agent.worker
+    if not isinstance(worker, SkillPolicy):
+        raise ValueError(f"{folder} holds an agent whose options are given, not learned.")
+    torch.nn.Module.eval(worker)
+    return worker

@@ -1,0 +1,352 @@
+"""The kit of any Gymnasium env: learn skills in it, plan over options of it, act in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_hmcts.envs import (
+    OptionPool,
+    RepeatActions,
+    SettableGymEnv,
+    SkillWorker,
+)
+from torchrl_hmcts.envs.gym.features import WithFeatures, achieved_goal, root_place
+from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, extract_plans
+from torchrl_hmcts.trainers.evaluation import Results, spread
+from torchrl_hmcts.trainers.experiments.kits import Kit, Trial
+from torchrl_hmcts.trainers.experiments.kits.film import Film
+from torchrl_hmcts.trainers.experiments.settings import GymConfig
+from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+
+_PLAYED = 1_000_003  # added to the seed of envs to act in
+_WORKER_KEYS = ("achieved_goal", "desired_goal", "features", "snapshot")
+
+
+def make_task(name: Any, look: Look, real: bool, keywords: Mapping[str, Any]) -> gymnasium.Env:
+    """Make an env as the task that a look found, in any process.
+
+    Args:
+        name: id, or a function that makes the env.
+        look: of :func:`look_at`.
+        real: pay what the env itself pays, and call only a success terminal.
+        keywords: of ``gymnasium.make``.
+    """
+    task = look.task(make_gym(name, **keywords))
+    task.is_real = real
+    return task
+
+
+class _Rows:
+    """Steps the states of a batch one after the other, for pictures of skills."""
+
+    def __init__(self, env: EnvBase) -> None:
+        self.env, self.reset = env, env.reset
+
+    def step(self, td: TensorDictBase) -> TensorDictBase:
+        rows = []
+        for row in td.unbind(0):
+            self.env.reset(row, set_state=True)
+            rows.append(self.env.step(row))
+        return torch.stack(rows)
+
+
+class GymKit(Kit):
+    """Any Gymnasium env whose state can be set: tasks with a goal, and rewards to collect.
+
+    Option length, features, novelty radius and the kind of task are found by a short look at the
+    env, printed, and changed by the keys of :class:`GymConfig`.
+
+    Args:
+        config: keys of the experiment.
+        env: makes the env instead of the id of ``config``.
+
+    Example:
+        >>> from torchrl_hmcts.trainers.experiments.settings import GymConfig
+        >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
+        >>> kit.look.kind, kit.config.option_steps
+        ('goal', 14)
+    """
+
+    place_key = "features"
+    state_keys = ("features",)
+    title = "Planning over options of a Gymnasium env"
+    group = 1  # each search is timed on its own
+    config: GymConfig
+
+    def __init__(self, config: GymConfig, env: Any = None) -> None:
+        super().__init__(config)
+        if env is None:
+            config.check_inputs()
+        self._env = config.id if env is None else env
+        look = look_at(self._env, gamma=config.gamma, **config.make)
+        if config.task != "auto":
+            look = dataclasses.replace(look, kind=config.task)
+        self.look = look
+        steps = config.option_steps or look.option_steps
+        self.config = dataclasses.replace(
+            config,
+            option_steps=steps,
+            skill_steps=config.skill_steps or 2 * steps,
+            novelty_radius=config.novelty_radius or look.novelty_radius,
+        )
+        self._fixed: RepeatActions | None = None
+        self._radius = config.novelty_radius  # 0: half of how far the options reach
+
+    @cached_property
+    def gym_env(self) -> gymnasium.Env:
+        """Return the env as Gymnasium makes it, for what it says of itself."""
+        made: gymnasium.Env = make_gym(self._env, **self.config.make)
+        return made
+
+    # ------------------------------------------------------- envs
+
+    def make_env(self, split: str) -> SettableGymEnv:
+        make = partial(make_task, self._env, self.look, split == "test", self.config.make)
+        seed = self.config.seed + (_PLAYED if split == "test" else 0)
+        return SettableGymEnv(make, features=self.look.features, seed=seed)
+
+    @cached_property
+    def worker_keys(self) -> Sequence[Any]:  # type: ignore[override]
+        """Entries of the observation but those of goals."""
+        keys = self.make_env("train").observation_spec.keys(True, True)
+        return [key for key in keys if key not in _WORKER_KEYS]
+
+    def make_training_env(self, num_envs: int = 16) -> EnvBase:
+        config = self.config
+
+        def make() -> gymnasium.Env:
+            return WithFeatures(make_gym(self._env, **config.make), self.look.features)
+
+        envs = SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
+        return TransformedEnv(
+            GymWrapper(envs, categorical_action_encoding=True),
+            Compose(
+                StepCounter(max_steps=10 * config.skill_steps),
+                DoubleToFloat(),
+                SkillTransform(config.num_skills, max_skill_steps=config.skill_steps),
+                DisplacementTransform("features"),
+            ),
+        )
+
+    def starts(self, split: str, num_starts: int) -> TensorDictBase:
+        env = self.make_env(split)
+        tasks = getattr(self.gym_env.unwrapped, "num_tasks", 0)
+        found = []
+        for number in range(num_starts):
+            options = {"options": {"task_id": number % tasks + 1}} if tasks else {}
+            found.append(env.reset(**options))
+        return torch.stack(found).exclude("done", "terminated", "truncated")
+
+    def make_options(
+        self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
+    ) -> EnvBase:
+        return self.make_pool(worker, real=True)
+
+    def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
+        return self.make_pool(worker)
+
+    def make_pool(
+        self,
+        worker: TensorDictModuleBase,
+        *,
+        real: bool = False,
+        film: Film | None = None,
+        render: str = "",
+    ) -> OptionPool:
+        """Return a pool of options.
+
+        Args:
+            worker: executes them.
+            real: to act in, rather than to plan in: rewards are the env's own, not discounted.
+            film: records what happens.
+            render: mode in which the env draws itself.
+        """
+        config, keywords = self.config, dict(self.config.make)
+        if render:
+            keywords["render_mode"] = render
+        make: Any = partial(make_task, self._env, self.look, real, keywords)
+        acts: Any = self._fixed
+        if isinstance(worker, SkillPolicy):
+            acts = SkillWorker(worker.actor, deterministic=worker.deterministic)
+        if film is not None:
+            make, acts = film.of(make, acts)
+        return OptionPool(
+            make,
+            acts,
+            max_steps=config.option_steps,
+            num_processes=0 if real else config.processes,
+            gamma=1.0 if real else config.gamma,
+            determinised=not self.look.stochastic,
+            features=self.look.features,
+            seed=config.seed + (_PLAYED if real else 0),
+        )
+
+    def given_worker(self) -> TensorDictModuleBase | None:
+        if self.config.options == "learned":
+            return None
+        actions = fixed_actions(self.gym_env.action_space)
+        self._fixed = RepeatActions(actions)
+        self.config = dataclasses.replace(self.config, num_skills=len(actions))
+        table = torch.from_numpy(np.array(actions))
+        return TensorDictModule(lambda skill: table[skill], ["skill"], ["action"])
+
+    def prepare(self, worker: TensorDictModuleBase) -> None:
+        """Set the novelty radius to half of how far learned options move the features."""
+        if self._radius or self.config.options != "learned":
+            return
+        starts = self.starts("train", 8)
+        pool = self.make_pool(worker)
+        options = torch.arange(pool.num_options).repeat_interleave(len(starts))
+        before = starts.repeat(pool.num_options)
+        after = pool.step(before.set("option", options))["next"]
+        moved = (after["features"] - before["features"]).float().norm(dim=-1)
+        radius = float(moved.quantile(0.75)) / 2
+        if radius > 0.0:
+            self.config = dataclasses.replace(self.config, novelty_radius=radius)
+
+    # ------------------------------------------------------- the planner
+
+    def planner_part(self) -> dict[str, Any]:
+        config, part = self.config, super().planner_part()
+        if self.look.stochastic:
+            part |= {
+                "chance": {"_component_": "torchrl_hmcts.planners.ProgressiveWidening"},
+                "novelty": None,
+                "leaves_per_wave": 1,
+                "expand": "one",
+            }
+        if self.look.kind == "return" or self.look.stochastic:
+            part["budget"] |= {
+                "expansions": None,
+                "base_steps": config.search_steps,
+                "until_plan": False,
+            }
+        if self.look.kind == "return":
+            part |= {"novelty": None}
+            if not self.look.stochastic:
+                part |= {
+                    "backup": "max",
+                    "final_choice": {"_component_": "torchrl_hmcts.planners.HighestValue"},
+                }
+        return part
+
+    def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
+        planner = super().make_planner(simulator, **budget)
+        planner.simulator.keep([self.place_key])  # for pictures
+        return planner
+
+    @property
+    def replans(self) -> bool:
+        """Whether it plans again after every option, rather than execute one plan."""
+        return self.look.stochastic or self.look.kind == "return"
+
+    def act(
+        self,
+        planner: MCTSPlanner,
+        real: EnvBase,
+        starts: TensorDictBase,
+        keys: Sequence[Any] = (),
+    ) -> Results:
+        if not self.replans:
+            return super().act(planner, real, starts, keys)
+        return Results.concatenate([self._play(planner, real, one, keys) for one in starts])
+
+    def _play(
+        self, planner: MCTSPlanner, real: EnvBase, start: TensorDictBase, keys: Sequence[Any]
+    ) -> Results:
+        """Act in one episode, with a search before every option."""
+        policy = HierarchicalPolicy(planner, replan_every=1, reuse=not self.look.stochastic)
+        pool: Any = planner.simulator.given_env
+        before, begin = pool.num_steps, time.perf_counter()
+        limit = getattr(self.gym_env.spec, "max_episode_steps", None) or 10_000
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            episode = real.rollout(limit, policy, auto_reset=False, tensordict=start.clone())
+        last = episode[-1]["next"]
+        return Results(
+            found=np.array([True]),
+            solved=last["terminated"].numpy().reshape(1),
+            simulated_steps=np.array([pool.num_steps - before]),
+            expansions=np.array([0]),
+            simulations=np.array([0]),
+            plan_options=np.array([len(episode)]),
+            episode_steps=np.array([int(episode["next", "duration"].sum())]),
+            rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
+            plan_seconds=np.array([time.perf_counter() - begin]),
+            plans=[extract_plans(planner.last_search)[0]] if planner.last_search else [],
+        )
+
+    # ------------------------------------------------------- figures
+
+    def map(self, env: EnvBase) -> Any:
+        if self.look.discrete:
+            return None
+        from torchrl_hmcts.trainers.figures.maps import FeatureMap
+
+        is_place = self.look.features in (achieved_goal, root_place)
+        names = ("x", "y") if is_place else ("feature 0", "feature 1")
+        return FeatureMap(_Rows(env), "features", names=names, is_place=is_place)  # type: ignore[arg-type]
+
+    @cached_property
+    def _draws_itself(self) -> bool:
+        """Whether the env can draw here; what hinders it is printed."""
+        try:
+            env = make_gym(self._env, **{**self.config.make, "render_mode": "rgb_array"})
+            env.reset(seed=0)
+            picture = env.render()
+            env.close()
+        except Exception as error:
+            print(f"{self.gym_env} cannot draw itself here ({error}): its features are drawn.")
+            return False
+        return isinstance(picture, np.ndarray)
+
+    def film(
+        self,
+        worker: TensorDictModuleBase,
+        planner: MCTSPlanner,
+        start: TensorDictBase,
+        *,
+        render: str = "",
+    ) -> Results:
+        if render == "rgb_array" and not self._draws_itself:
+            render = ""
+        film = Film(self.look.features, render == "rgb_array")
+        real = self.make_pool(worker, real=True, film=film, render=render)
+        film.clear()
+        film.points.append(start["features"][0].numpy())
+        episode = self.act(planner, real, start)
+        real.close()
+        points = torch.from_numpy(np.array(film.points))
+        episode.states = [TensorDict({"features": points}, [len(points)])]
+        episode.options = [torch.tensor(film.options, dtype=torch.int64)]
+        episode.frames = film.frames
+        return episode
+
+    def figures(self, trial: Trial) -> dict[str, Any]:
+        results = trial.results
+        found = results.summary() | {"reward": spread(results.rewards)}
+        threshold = self.threshold
+        if threshold is not None:
+            found["reward_threshold"] = threshold
+        return found | {"plan_seconds": spread(results.plan_seconds)}
+
+    @cached_property
+    def threshold(self) -> float | None:
+        """Return at which the env counts as solved; None where it names none."""
+        spec = self.gym_env.spec
+        return None if spec is None else spec.reward_threshold
