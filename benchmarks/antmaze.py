@@ -45,7 +45,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from torchrl_hmcts.envs import MujocoBatch
 from torchrl_hmcts.envs.gym.settable import make_gym
@@ -59,20 +59,21 @@ from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.transforms import OptionTransform, SkillReward, SkillTransform
 
 OUT, WORKERS = Path("docs/results/antmaze"), Path("runs/antmaze")
-NUM_SKILLS, HIDDEN = 3, (128, 128)
+NUM_SKILLS = 3
 OPTION_STEPS = 25  # actions, of 0.1 s
 
 
-def make_actor() -> SkillActor:
+def make_actor(width: int = 256) -> SkillActor:
     spec = Bounded(-1.0, 1.0, shape=(ACTIONS,))
-    return SkillActor(BODY, spec, NUM_SKILLS, hidden=HIDDEN, in_keys=["body"])
+    return SkillActor(BODY, spec, NUM_SKILLS, hidden=(width, width), in_keys=["body"])
 
 
 def learn(
     name: str,
     *,
     seed: int = 0,
-    total_frames: int = 75_000,
+    total_frames: int = 51_200,
+    width: int = 256,
     copies: int = 16,
     skill_steps: int = 100,
     updates_per_batch: int = 16,
@@ -86,6 +87,7 @@ def learn(
         name: of an env with the ant.
         seed: of the run.
         total_frames: actions; of gymnasium-robotics' ant each is two env steps.
+        width: of the two hidden layers of actor and critics.
         copies: ants side by side.
         skill_steps: actions of a mini-episode.
         updates_per_batch: for each 64 actions.
@@ -104,16 +106,16 @@ def learn(
     encoder = SkillEncoder(
         2, NUM_SKILLS, in_keys=["displacement"], hidden=(), linear=SpectralLinear
     )
-    actor = make_actor()
+    actor = make_actor(width)
     loss = SkillSACLoss(
         actor,
         SkillActionCritic(
             BODY,
             ACTIONS,
             NUM_SKILLS,
-            hidden=HIDDEN,
+            hidden=(width, width),
             in_keys=["body"],
-            activation=normalized(HIDDEN[0]),
+            activation=normalized(width),
         ),
         LSDEncoderLoss(encoder),
         gamma=0.98,
@@ -140,8 +142,11 @@ def learn(
     trainer.register_op("post_steps_log", curve)
     trainer.train()
     actor.load_state_dict(_weights(loss, actor))
-    cost = {"actions": total_frames, "env_steps": total_frames * gait.repeat}
-    cost |= {"updates": len(trainer.history["alpha"]) * updates_per_batch}
+    cost: dict[str, Any] = {"width": width, "actions": total_frames}
+    cost |= {
+        "env_steps": total_frames * gait.repeat,
+        "updates": len(trainer.history["alpha"]) * updates_per_batch,
+    }
     return actor, cost | {"cpu_seconds": round(time.process_time() - begin), "curve": curve.rows}
 
 
@@ -179,7 +184,7 @@ class Curve:
 def starts_of(name: str, per_task: int) -> list[tuple[int, dict[str, Any] | None]]:
     """Seeds and options of ``env.reset``."""
     if name.startswith("antmaze"):
-        return [(10 * t + i, {"task_id": t}) for t in range(1, 6) for i in range(per_task)]
+        return [(10 * t + i, {"task_id": t}) for i in range(per_task) for t in range(1, 6)]
     return [(seed, None) for seed in range(5 * per_task)]
 
 
@@ -190,17 +195,20 @@ class Agent:
         keywords = {} if name.startswith("antmaze") else {"continuing_task": False}
         self.worker = Walker(actor)
         self.batch = MujocoBatch(name, task=Gait.of(name).task, seed=0, **keywords)
+        self.env = make_gym(name, **keywords)
+        self.repeat = Gait.of(name).repeat
+        limit = StepCounter(max_steps=self.env.spec.max_episode_steps // self.repeat)
         options = OptionTransform(
             self.worker, self.worker.num_options, OPTION_STEPS, termination=fallen
         )
         self.planner = MCTSPlanner(
-            TransformedEnv(self.batch, options),
+            TransformedEnv(self.batch, Compose(limit, options)),
             tree_policy=UCT(c=1.0),
             novelty=RadiusNovelty("position", radius),
             budget=SearchBudget(base_steps=budget),
             leaves_per_wave=4,
+            seed=0,
         )
-        self.env = make_gym(name, **keywords)
 
     def solve(self, seed: int, options: dict[str, Any] | None, max_plans: int) -> dict[str, Any]:
         """One episode of the env; what it cost, and the places on the way."""
@@ -211,7 +219,8 @@ class Agent:
         path, ended = [start["position"].tolist()], False
         while not ended and row["plans"] < max_plans:
             begin = time.process_time()
-            search = self.planner.search(self.batch.read(self.env))
+            taken = torch.tensor([row["steps"] // self.repeat])
+            search = self.planner.search(self.batch.read(self.env).set("step_count", taken))
             plan = extract_plans(search)[0]
             row["plan_cpu"] += time.process_time() - begin
             row["simulated"] += int(search.num_base_steps[0])
@@ -326,9 +335,9 @@ def note_episodes(key: str, rows: list[dict[str, Any]], out: Path) -> None:
 
 
 def load_actor(name: str, seed: int) -> SkillActor:
-    actor = make_actor()
-    path = WORKERS / f"{kind_of(name)}-{seed}.pt"
-    actor.load_state_dict(torch.load(path, weights_only=True))
+    weights = torch.load(WORKERS / f"{kind_of(name)}-{seed}.pt", weights_only=True)
+    actor = make_actor(width=len(next(iter(weights.values()))))
+    actor.load_state_dict(weights)
     return actor
 
 
@@ -337,7 +346,8 @@ def main() -> None:
     parser.add_argument("part", choices=("learn", "solve", "draw"))
     parser.add_argument("names", nargs="*")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--frames", type=int, default=75_000, help="actions of learning")
+    parser.add_argument("--frames", type=int, default=51_200, help="actions of learning")
+    parser.add_argument("--width", type=int, default=256, help="of the networks that learn")
     parser.add_argument("--starts", type=int, default=10, help="of each of 5 tasks")
     parser.add_argument("--radius", type=float, default=2.0, help="metres that are a new place")
     parser.add_argument("--budget", type=int, default=300_000, help="actions that a plan simulates")
@@ -349,19 +359,20 @@ def main() -> None:
     for name in args.names:
         for seed in args.seeds:
             if args.part == "learn":
-                actor, cost = learn(name, seed=seed, total_frames=args.frames)
+                actor, cost = learn(name, seed=seed, total_frames=args.frames, width=args.width)
                 torch.save(actor.state_dict(), WORKERS / f"{kind_of(name)}-{seed}.pt")
                 note("learning", f"{kind_of(name)} seed {seed}", cost, args.out)
             elif args.part == "solve":
                 torch.manual_seed(seed)
                 actor = make_actor() if args.untrained else load_actor(name, seed)
                 agent, rows = Agent(name, actor, args.radius, args.budget), []
-                for start in starts_of(name, args.starts):
+                key = f"{name} seed {seed}" + " untrained" * args.untrained
+                for i, start in enumerate(starts_of(name, args.starts)):
                     rows.append(agent.solve(*start, max_plans=5))
                     print(rows[-1], flush=True)
-                key = f"{name} seed {seed}" + " untrained" * args.untrained
-                note("solving", key, summary(rows), args.out)
-                note_episodes(key, rows, args.out)
+                    if i % 5 == 4:
+                        note("solving", key, summary(rows), args.out)
+                        note_episodes(key, rows, args.out)
     if args.part == "draw":
         seed = args.seeds[0]
         actors = {n: load_actor(n, seed) for n in ("antmaze-giant-v0", "AntMaze_Large-v5")}
