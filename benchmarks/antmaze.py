@@ -181,11 +181,15 @@ class Curve:
 # ---------------------------------------------------------------- planning
 
 
-def starts_of(name: str, per_task: int) -> list[tuple[int, dict[str, Any] | None]]:
+def starts_of(name: str, per_task: int, first: int) -> list[tuple[int, dict[str, Any] | None]]:
     """Seeds and options of ``env.reset``."""
     if name.startswith("antmaze"):
-        return [(10 * t + i, {"task_id": t}) for i in range(per_task) for t in range(1, 6)]
-    return [(seed, None) for seed in range(5 * per_task)]
+        return [
+            (10 * t + i, {"task_id": t})
+            for i in range(first, first + per_task)
+            for t in range(1, 6)
+        ]
+    return [(seed, None) for seed in range(5 * first, 5 * (first + per_task))]
 
 
 class Agent:
@@ -349,8 +353,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=51_200, help="actions of learning")
     parser.add_argument("--width", type=int, default=256, help="of the networks that learn")
     parser.add_argument("--starts", type=int, default=10, help="of each of 5 tasks")
+    parser.add_argument(
+        "--first", type=int, default=0, help="the first of these, to share them out"
+    )
     parser.add_argument("--radius", type=float, default=2.0, help="metres that are a new place")
-    parser.add_argument("--budget", type=int, default=300_000, help="actions that a plan simulates")
+    parser.add_argument("--budget", type=int, default=80_000, help="actions that a plan simulates")
     parser.add_argument("--untrained", action="store_true", help="the worker before it learns")
     parser.add_argument("--out", type=Path, default=OUT)
     args = parser.parse_args()
@@ -367,7 +374,7 @@ def main() -> None:
                 actor = make_actor() if args.untrained else load_actor(name, seed)
                 agent, rows = Agent(name, actor, args.radius, args.budget), []
                 key = f"{name} seed {seed}" + " untrained" * args.untrained
-                for i, start in enumerate(starts_of(name, args.starts)):
+                for i, start in enumerate(starts_of(name, args.starts, args.first)):
                     rows.append(agent.solve(*start, max_plans=5))
                     print(rows[-1], flush=True)
                     if i % 5 == 4:
