@@ -297,7 +297,7 @@ def draw_plan(agent: Agent, path: Path) -> None:
             corner, size = geom.pos[:2] - geom.size[:2], 2 * geom.size[:2]
             axes.add_patch(Rectangle(tuple(corner), *size, color="0.2"))
     assert tree.states is not None
-    places = tree.states["position"][0, : int(tree.num_nodes[0])]
+    places = tree.states["physics"][0, : int(tree.num_nodes[0]), 1:3]
     axes.plot(*places.T.numpy(), ".", color="0.6", markersize=4, label="states the search held")
     axes.plot(*np.array(agent.path).T, color=option_color(0), label="executed", linewidth=2)
     goal = agent.start["goal"].tolist()
