@@ -125,7 +125,7 @@ def test_a_search_before_every_option_takes_the_final_choice() -> None:
 
 
 def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
-    agent = HMCTS("MountainCar-v0", option_steps=14, novelty_radius=0.06)
+    agent = HMCTS("MountainCar-v0", option_steps=14, novelty_radius=0.06, expansions=300)
     solution = agent.solve(seed=3)
     assert solution.solved
     assert solution.reward == -solution.base_steps

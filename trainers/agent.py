@@ -90,15 +90,17 @@ class HMCTS:
         seed: int = 0,
         **keys: Any,
     ) -> None:
-        if isinstance(env, SkillsConfig):
-            self.kit: Kit = make_kit(env)
-        else:
+        config = env
+        if not isinstance(config, SkillsConfig):
             keys = {"options": "directions", "num_skills": num_skills, "seed": seed, **keys}
-            name = env if isinstance(env, str) else ""
-            self.kit = GymKit(GymConfig(id=name, **keys), env=env)
+            config = GymConfig(id=env if isinstance(env, str) else "", **keys)
+        self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
+        self.kit = self._make_kit(config)
         self.learned: LearnedSkills | None = None
-        self._num_skills = self.config.num_skills  # given options may be more or fewer
         self._worker = self.kit.given_worker()
+
+    def _make_kit(self, config: Any) -> Kit:
+        return GymKit(config, self._env) if isinstance(config, GymConfig) else make_kit(config)
 
     # ------------------------------------------------------------ parts
 
@@ -146,11 +148,10 @@ class HMCTS:
             progress: show a bar.
             save_dir: folder of checkpoints. Default: none.
         """
-        changes: dict[str, Any] = {"options": "learned", "num_skills": self._num_skills}
-        changes["train_base_steps"] = base_steps
-        names = {f.name for f in dataclasses.fields(self.config)}
-        changes = {key: value for key, value in changes.items() if key in names}
-        self.kit.config = dataclasses.replace(self.config, **changes)
+        changes = {"options": "learned", "train_base_steps": base_steps}
+        names = {field.name for field in dataclasses.fields(self._asked)}
+        known = {key: value for key, value in changes.items() if key in names}
+        self.kit = self._make_kit(dataclasses.replace(self._asked, **known))
 
         def bar(total: int) -> Any:
             return tqdm(total=total, desc="learn", unit="step", disable=not progress)
