@@ -181,3 +181,17 @@ def test_wrong_words_say_what_to_write(words: list[str], message: str, capsys: A
 def test_no_skills_no_worker() -> None:
     with pytest.raises(RuntimeError, match=r"Call learn\(\) first"):
         HMCTS("MountainCar-v0", options="learned").solve()
+
+
+def test_a_distilled_manager_guides_the_search_and_acts_alone(tmp_path: Path) -> None:
+    gymnasium.register("TestLine-v0", Line)
+    agent = HMCTS("TestLine-v0", option_steps=1, gamma=0.9)
+    with pytest.raises(RuntimeError, match=r"Call distill\(\) first"):
+        agent.solve(search=False)
+    agent.distill(2, iterations=2, updates=80, progress=False)
+    alone = agent.solve(search=False)
+    assert (alone.solved, alone.base_steps, alone.simulated_steps) == (True, 9, 0)
+    again = HMCTS.load(agent.save(tmp_path))
+    assert again.solve(search=False) == alone
+    assert again.solve() == agent.solve()
+    gymnasium.registry.pop("TestLine-v0")
