@@ -149,7 +149,10 @@ def test_a_search_is_the_same_on_processes_that_die_and_without(
         search = planner.search(local(worker).reset(), seed=1)
         if killing:
             timer.join()
-            pool.step(every_option(pool))  # notices one that was killed after the last wave
+            for _ in range(1000):  # notices one that was killed after the last wave
+                pool.step(every_option(pool))
+                if pool.num_restarts:
+                    break
         count = int(search.tree.num_nodes[0])
         assert count > 30
         trees.append(search.tree.nodes[0, :count].tobytes())
