@@ -33,6 +33,7 @@ FAMILIES = [
     ("Taxi-v4", "ToyTextSnapshot", None, {}),
     ("Blackjack-v1", "ToyTextSnapshot", None, {}),  # observes a tuple
     ("LunarLander-v3", "Box2DSnapshot", "Box2D", {}),
+    ("BipedalWalker-v3", "Box2DSnapshot", "Box2D", {}),  # keeps one world for all its episodes
     ("MiniGrid-KeyCorridorS3R3-v0", "MiniGridSnapshot", "minigrid", {}),
     ("MiniGrid-Dynamic-Obstacles-6x6-v0", "MiniGridSnapshot", "minigrid", {}),
     ("BabyAI-GoToLocal-v0", "MiniGridSnapshot", "minigrid", {}),

@@ -219,8 +219,9 @@ class ReplaySnapshot(Snapshot):
         if seed == self._seed and len(self._actions) <= steps and _same(self._actions, actions):
             ahead = actions[len(self._actions) :]  # the state lies on the way to that one
         else:
+            self.note_reset(seed)
             self.env.reset(seed=seed)
-            self._seed, ahead = seed, actions
+            ahead = actions
         self._actions = actions
         for action in ahead:
             self.env.step(self._plain(action))
