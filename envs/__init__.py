@@ -12,6 +12,8 @@ from torchrl_hmcts.envs.atari.pool import AtariOptionPool
 from torchrl_hmcts.envs.atari.ram import AtariRAMEnv
 from torchrl_hmcts.envs.atari.workers import RepeatActions, SharedMLP
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
+from torchrl_hmcts.envs.gym.mujoco_batch import MujocoBatch
+from torchrl_hmcts.envs.gym.mujoco_tasks import MujocoTask
 from torchrl_hmcts.envs.gym.option_pool import OptionPool
 from torchrl_hmcts.envs.gym.option_run import OptionWorker
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv
@@ -49,6 +51,8 @@ __all__ = [
     "JoinedWorkers",
     "LAB_ACTIONS",
     "LabMazeEnv",
+    "MujocoBatch",
+    "MujocoTask",
     "OccasionalAction",
     "OptionPool",
     "OptionWorker",
