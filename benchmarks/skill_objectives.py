@@ -7,7 +7,7 @@ mazes with the skills; of vectors, with eight that are spread out.
     python benchmarks/skill_objectives.py --seeds 0 1 2 \\
         --out docs/results/skills/skill_objectives.json
     python benchmarks/skill_objectives.py --seeds 0 1 2 \\
-        --objectives "METRA, vectors" "LSD, vectors" "DADS, vectors" \\
+        --objectives "METRA, vectors" "LSD, vectors" \\
         --out docs/results/skills/skill_vectors.json
     python benchmarks/skill_objectives.py --quick
 """
