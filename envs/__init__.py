@@ -12,6 +12,8 @@ from torchrl_hmcts.envs.atari.pool import AtariOptionPool
 from torchrl_hmcts.envs.atari.ram import AtariRAMEnv
 from torchrl_hmcts.envs.atari.workers import RepeatActions, SharedMLP
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
+from torchrl_hmcts.envs.gym.grid_features import GridFeatures
+from torchrl_hmcts.envs.gym.grid_moves import GridMoves, GridView
 from torchrl_hmcts.envs.gym.mujoco_batch import MujocoBatch
 from torchrl_hmcts.envs.gym.mujoco_tasks import MujocoTask
 from torchrl_hmcts.envs.gym.option_pool import OptionPool
@@ -47,6 +49,9 @@ __all__ = [
     "ByteGoal",
     "DeepMindLabEnv",
     "FollowGoals",
+    "GridFeatures",
+    "GridMoves",
+    "GridView",
     "GridworldMazeEnv",
     "JoinedWorkers",
     "LAB_ACTIONS",

@@ -233,6 +233,8 @@ GOOD: dict[str, Good] = {
         GridworldMazeEnv={},
         WaterworldMazeEnv={},
         LabMazeEnv={"maze_seeds": range(2)},
+        GridFeatures={},
+        GridMoves={},
         RepeatActions={"actions": 3},
         SharedMLP={"num_options": 2, "num_actions": 3, "hidden": (4,)},
     ),
@@ -292,7 +294,7 @@ EXCLUDED = {  # why public names are not fuzzed here
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
-    "SkillWorker "
+    "SkillWorker GridView "
     "AttributeSnapshot ReplaySnapshot SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",
     "hands its arguments to SkillReward": "SkillRewardHook",

@@ -281,10 +281,11 @@ def test_width_novelty_accepts_what_sets_of_values_accept(
     seed: int, dtype: type[np.generic], num_features: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    novelty = WidthNovelty("x")
+    stages = sorted(rng.choice(num_features - 1, size=min(2, num_features - 1), replace=False) + 1)
+    novelty = WidthNovelty("x", stages=[int(n) for n in stages])
     novelty.start(2)
     counts: list[Counter[tuple[int, int]]] = [Counter(), Counter()]
-    limits = [1, 1]
+    limits, compared = [1, 1], [[*stages, num_features] for _ in range(2)]
     ends = np.iinfo(dtype)
     spread = int(rng.choice([3, 100]))
     for _ in range(5):
@@ -294,18 +295,54 @@ def test_width_novelty_accepts_what_sets_of_values_accept(
         expected = []
         for root, state in zip(roots.tolist(), states.tolist(), strict=True):
             values = list(enumerate(state))
-            novel = any(counts[root][value] < limits[root] for value in values)
+            some = values[: compared[root][0]]
+            novel = any(counts[root][value] < limits[root] for value in some)
             counts[root].update(values if novel else [])
             expected.append(novel)
         assert accept(novelty, roots, states).tolist() == expected
         if rng.random() < 0.5:
             root = int(rng.integers(2))
             assert novelty.relax(root)
-            limits[root] += 1
+            if len(compared[root]) > 1:
+                compared[root].pop(0)
+            else:
+                limits[root] += 1
         elif rng.random() < 0.3:
             novelty.restart(1)
             counts[1].clear()
-            limits[1] = 1
+            limits[1], compared[1] = 1, [*stages, num_features]
+
+
+def test_stages_compare_more_features_before_values_may_repeat() -> None:
+    novelty = WidthNovelty("x", stages=[1, 2], max_relaxations=1)
+    novelty.start(2)
+    states = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1]], np.int64)
+    assert accept(novelty, 0, states).tolist() == [True, False, False]  # column 0 alone
+    assert novelty.relax(0)
+    # What was accepted is known in all columns; the second state is new in column 1.
+    assert accept(novelty, 0, states).tolist() == [False, True, False]
+    assert novelty.relax(0)
+    assert accept(novelty, 0, states).tolist() == [False, False, True]  # new in column 2
+    assert novelty.relax(0)
+    # Twice now: the zero in column 0 was accepted three times, the others less often.
+    assert accept(novelty, 0, states).tolist() == [True, False, True]
+    assert not novelty.relax(0)
+    assert accept(novelty, 1, states).tolist() == [True, False, False]
+    novelty.restart(0)
+    assert accept(novelty, 0, states).tolist() == [True, False, False]
+    assert repr(novelty) == "WidthNovelty(['x'], stages=(1, 2))"
+
+
+def test_stages_that_do_not_fit_are_refused() -> None:
+    for stages in ([2, 2], [3, 1]):
+        with pytest.raises(ValueError, match="compares more features in each stage; got stages="):
+            WidthNovelty("x", stages=stages)
+    with pytest.raises(ValueError, match=r"stages .*0"):
+        WidthNovelty("x", stages=[0])
+    novelty = WidthNovelty("x", stages=[3])
+    novelty.start(1)
+    with pytest.raises(ValueError, match=r"stages=\(3,\)\) needs more than 3 features; .* have 3"):
+        accept(novelty, 0, np.zeros((1, 3), np.int64))
 
 
 def test_features_keep_their_integer_type_in_the_tree() -> None:

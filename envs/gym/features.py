@@ -9,6 +9,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from torchrl_hmcts.envs.gym.grid_features import GridFeatures
+from torchrl_hmcts.envs.gym.minigrid import MiniGridSnapshot
 from torchrl_hmcts.envs.gym.mujoco import find_physics
 from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
@@ -30,17 +32,20 @@ def root_place(env: gymnasium.Env, observation: Any) -> np.ndarray:
 
 
 def whole_observation(env: gymnasium.Env, observation: Any, *, scale: Any = 1.0) -> np.ndarray:
-    """Return the observation, each number times its scale, float32 ``[F]``."""
+    """Return the observation, each number times its scale, float32 ``[F]``; int64 without one."""
     parts = observation.values() if isinstance(observation, dict) else [observation]
-    flat = [np.asarray(part, np.float32).reshape(-1) for part in parts]
-    return np.concatenate(flat) * np.float32(scale)
+    flat = [np.asarray(part).reshape(-1) for part in parts]
+    whole = flat[0] if len(flat) == 1 else np.concatenate(flat)
+    if scale is None:
+        return whole.astype(np.int64)
+    return whole.astype(np.float32) * np.float32(scale)
 
 
 def features_of(env: gymnasium.Env) -> Features:
     """Return the features that suit an env.
 
-    They are the achieved goal of an env with goals; the place of the robot in MuJoCo; and else the
-    observation.
+    They are the achieved goal of an env with goals; :class:`GridFeatures` in MiniGrid; the place of
+    the robot in MuJoCo; and else the observation.
 
     Args:
         env: with its wrappers.
@@ -48,6 +53,9 @@ def features_of(env: gymnasium.Env) -> Features:
     space = env.observation_space
     if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
         return achieved_goal
+    if MiniGridSnapshot.fits(env):
+        turns = env.has_wrapper_attr("moves") and env.get_wrapper_attr("moves")  # of a GridView
+        return GridFeatures(directed=not turns)
     try:
         model, _ = find_physics(env)
     except SnapshotError:

@@ -6,6 +6,7 @@ Letters: ``B`` roots, ``m`` new nodes of a wave, ``F`` features.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -274,13 +275,20 @@ class WidthNovelty(_Counted):
     search, the "IW(1)" of classical planning. For discrete features, e.g. the 128 RAM bytes of an
     Atari game.
 
+    With ``stages`` an exhausted search first compares more features, before :math:`n` is raised:
+    those that tell many states apart come last. The values of all features are remembered from the
+    start.
+
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``, of an integer
             type or bool.
         max_relaxations: how often :math:`n` may be raised for a search. Default 14; at most 254.
+        stages (sequence of int): how many of the features, the first ones, are compared at first,
+            after one relaxation, and so on, rising; then all are. Default: all at once.
 
     Raises:
-        ValueError: if no key is given or ``max_relaxations`` is out of its range.
+        ValueError: if no key is given, ``max_relaxations`` is out of its range, or the stages do
+            not rise from 1; at the call, if there are no more features than in the last stage.
         TypeError: at the call, if an entry is not of an integer type.
 
     Reference:
@@ -296,8 +304,20 @@ class WidthNovelty(_Counted):
         array([ True,  True,  True, False])
     """
 
-    def __init__(self, key: NestedKey | Sequence[NestedKey], *, max_relaxations: int = 14) -> None:
+    def __init__(
+        self,
+        key: NestedKey | Sequence[NestedKey],
+        *,
+        max_relaxations: int = 14,
+        stages: Sequence[int] = (),
+    ) -> None:
         self.in_keys = nested_keys("WidthNovelty", "key", key)
+        instance("WidthNovelty", "stages", stages, Sequence)
+        self.stages = tuple(whole_number("WidthNovelty", "stages", n, least=1) for n in stages)
+        if any(a >= b for a, b in pairwise(self.stages)):
+            raise ValueError(
+                f"WidthNovelty compares more features in each stage; got stages={self.stages}."
+            )
         self.max_relaxations = whole_number("WidthNovelty", "max_relaxations", max_relaxations)
         if self.max_relaxations > 254:
             raise ValueError(
@@ -309,6 +329,7 @@ class WidthNovelty(_Counted):
     def start(self, num_roots: int) -> None:
         """Forget everything: ``num_roots`` searches begin."""
         self._limits = np.ones(num_roots, np.int64)
+        self._stage = np.zeros(num_roots, np.int64)
         self._used: np.ndarray | None = None
         self.num_tested = 0
         self._tally = np.zeros(1, np.int64)
@@ -328,7 +349,7 @@ class WidthNovelty(_Counted):
 
     def restart(self, root: int) -> None:
         """Forget the states of one root."""
-        self._limits[root] = 1
+        self._limits[root], self._stage[root] = 1, 0
         if self._used is not None:
             self._used[root] = 0
             self._counts[root] = 0
@@ -341,6 +362,12 @@ class WidthNovelty(_Counted):
         self._kernels = novelty_kernels
         num_roots, num_features = len(self._limits), features.shape[1]
         if self._used is None:
+            if self.stages and self.stages[-1] >= num_features:
+                raise ValueError(
+                    f"WidthNovelty(stages={self.stages}) needs more than {self.stages[-1]} "
+                    f"features; {self.in_keys} have {num_features}."
+                )
+            self._compared = np.array([*self.stages, num_features])  # features, by stage
             self._used = np.zeros(num_roots, np.int64)  # values in the table
             self._slots = np.zeros(num_features, np.int64)
             self._values = np.zeros((num_roots, 0), np.int64)
@@ -366,7 +393,8 @@ class WidthNovelty(_Counted):
         while True:
             begin = self._kernels.accept_new(
                 self._values, self._owners, self._counts, self._used, self._limits,
-                self._tally, roots, features, accepted, self._slots, begin,
+                self._compared[self._stage], self._tally, roots, features, accepted, self._slots,
+                begin,
             )  # fmt: skip
             if begin == len(roots):
                 break
@@ -376,13 +404,17 @@ class WidthNovelty(_Counted):
 
     def relax(self, root: int) -> bool:
         """Be less strict for one root from now on; False if that is impossible."""
+        if self._stage[root] < len(self.stages):
+            self._stage[root] += 1
+            return True
         if self._limits[root] > self.max_relaxations:
             return False
         self._limits[root] += 1
         return True
 
     def __repr__(self) -> str:
-        return f"WidthNovelty({self.in_keys})"
+        stages = f", stages={self.stages}" if self.stages else ""
+        return f"WidthNovelty({self.in_keys}{stages})"
 
 
 def _side_by_side(parts: list[torch.Tensor]) -> np.ndarray:

@@ -213,10 +213,11 @@ def _slot(values, owners, b, f, value):
 
 @njit()
 def accept_new(
-    values, owners, counts, used, limits, tally, roots, features, accepted, slots, first
+    values, owners, counts, used, limits, compared, tally, roots, features, accepted, slots, first
 ):
     """Accept, in order, the states with a value that was seldom seen; return how far it came.
 
+    The first ``compared [B]`` features count.
     Slots of ``values``, ``owners`` (the feature, -1 for none) and ``counts``, all ``[B, slots]``,
     are a hash table of each root, at most half full; ``slots [F]`` is room to work in.
     """
@@ -229,7 +230,8 @@ def accept_new(
         for f in range(num_features):
             slots[f] = _slot(values, owners, b, f, features[i, f])
             free = owners[b, slots[f]] < 0
-            novel = novel or free or counts[b, slots[f]] < limits[b]
+            rare = free or counts[b, slots[f]] < limits[b]
+            novel = novel or (rare and f < compared[b])
         accepted[i] = novel
         if novel:
             for f in range(num_features):
