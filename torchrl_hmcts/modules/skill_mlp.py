@@ -360,7 +360,8 @@ def refuse_unknown(skill: Tensor, num_skills: int | None) -> None:
     if low < 0 or high >= num_skills:
         raise ValueError(
             f"Skill {low if low < 0 else high} does not exist: a network of "
-            f"num_skills={num_skills} knows 0 to {num_skills - 1}. Give the SkillTransform or OptionTransform as many."
+            f"num_skills={num_skills} knows 0 to {num_skills - 1}. Give the "
+            f"SkillTransform or OptionTransform as many."
         )
 
 
