@@ -176,10 +176,12 @@ def test_the_kit_from_the_command_line(tmp_path: Path) -> None:
         (["env.id=MountainCar-v0", "options=fly"], "options is one of"),
     ],
 )
-def test_wrong_words_say_what_to_write(words: list[str], message: str, capsys: Any) -> None:
-    assert main(["train", "kit=gym", *words, "out=nowhere"]) in (1, 2)
+def test_wrong_words_say_what_to_write(
+    words: list[str], message: str, capsys: Any, tmp_path: Path
+) -> None:
+    assert main(["train", "kit=gym", *words, f"out={tmp_path / 'run'}"]) in (1, 2)
     assert message in capsys.readouterr().err
-    assert not Path("nowhere").exists()
+    assert not (tmp_path / "run").exists()
 
 
 def test_no_skills_no_worker() -> None:

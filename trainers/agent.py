@@ -44,7 +44,12 @@ class Solution:
         num_options (int): that were executed.
         simulated_steps (int): base steps of all searches.
         plan_seconds (float): of all searches.
-        plan (Plan, optional): that was executed; None where every option had a search of its own.
+        plan (Plan, optional): that was executed, or the last one where every option had a search of
+            its own; options ``[L]``.
+
+    Example:
+        >>> Solution(True, 1.0, 40, 4, 900, 0.1).solved
+        True
     """
 
     solved: bool
@@ -81,7 +86,7 @@ class HMCTS:
 
     Example:
         >>> from torchrl_hmcts.trainers import HMCTS
-        >>> agent = HMCTS("MountainCar-v0")
+        >>> agent = HMCTS("MountainCar-v0", option_steps=14)
         >>> agent
         HMCTS(MountainCar-v0, 3 actions, each for 14 base steps)
         >>> agent.solve(seed=0).solved
@@ -372,6 +377,15 @@ def load_worker(folder: str | Path) -> SkillPolicy:
 
     Raises:
         FileNotFoundError: if there is none, or it has no networks yet.
+        ValueError: if its options are given, not learned.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_hmcts.trainers import HMCTS, load_worker
+        >>> folder = tempfile.mkdtemp()
+        >>> agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
+        >>> load_worker(agent.save(folder)).in_keys
+        ['observation', 'skill']
     """
     agent = HMCTS.load(folder)
     worker = agent.worker

@@ -56,5 +56,11 @@ print(worker.in_keys, worker(td)["action"].tolist())
 # A film
 # ------
 
+import matplotlib.pyplot as plt
+
 film = folder / "car.gif"
-print(again.play(seed=1, out=film).solved, film.stat().st_size // 1000, "kB")
+print(again.play(seed=1, out=film))
+figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
+axes.imshow(plt.imread(film))
+axes.axis("off")
+plt.show()

@@ -450,11 +450,18 @@ class GymConfig(SkillsConfig):
         return max(BATCH_STEPS, self.train_base_steps // BATCH_STEPS * BATCH_STEPS)
 
     def check_inputs(self) -> None:
-        """Check that there is an id.
+        """Check that there is such an env.
 
         Raises:
-            ExperimentError: if there is none.
+            ExperimentError: if there is no id, or none like it.
+            ImportError: if the env needs a package that is not installed.
         """
         super().check_inputs()
         if not self.id:
             raise ExperimentError("say which env: env.id=NAME, e.g. env.id=PointMaze_Large-v3.")
+        from torchrl_hmcts.envs.gym.settable import make_gym  # here: it loads torch
+
+        try:
+            make_gym(self.id, **self.make).close()
+        except ValueError as error:
+            raise ExperimentError(str(error)) from None

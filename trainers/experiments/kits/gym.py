@@ -93,7 +93,7 @@ class GymKit(Kit):
         >>> from torchrl_hmcts.trainers.experiments.settings import GymConfig
         >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
         >>> kit.look.kind, kit.config.option_steps
-        ('goal', 14)
+        ('goal', 20)
     """
 
     place_key = "features"
