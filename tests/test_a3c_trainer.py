@@ -21,11 +21,11 @@ import pytest
 import torch
 from small_trainers import make_networks
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase, GymEnv
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import A2CLoss
 from torchrl.record import CSVLogger
 from trainer_parts import Bars, weights
@@ -54,6 +54,23 @@ def make_trainer(
     settings = {"total_frames": 10 * SEGMENT, "num_learners": 0, **settings}
     settings = {"optimizer": "adam", "lr": 0.05, "start_method": "forkserver", **settings}
     return A3CTrainer(env, make_loss() if loss is None else loss, segment_steps=T, **settings)
+
+
+@pytest.mark.parametrize("kind", [TanhNormal, IndependentNormal])
+def test_continuous_actions_are_learned_from(kind: Any) -> None:
+    torch.manual_seed(0)
+    outputs = nn.Sequential(nn.Linear(3, 2), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(outputs, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=kind,
+        distribution_kwargs={"low": -2.0, "high": 2.0} if kind is TanhNormal else {},
+    )
+    loss = A3CLoss(actor, ValueOperator(nn.Linear(3, 1), in_keys=["observation"]))
+    before = [p.detach().clone() for p in loss.parameters()]
+    history = make_trainer(loss, lambda: GymEnv("Pendulum-v1"), total_frames=50).train()
+    assert all(not p.equal(old) for p, old in zip(loss.parameters(), before, strict=True))
+    assert np.isfinite([history[f"loss_{name}"] for name in ("objective", "critic")]).all()
 
 
 def right_everywhere(policy: Any) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -254,6 +254,92 @@ def test_embeddings_of_any_shape_and_dtype_give_the_same_tree(
     if tensors:
         root = Root(*map(torch.from_numpy, root))
     assert trees(tree_search(root, transition, 40, tree_policy=policy)) == trees(plain)
+
+
+class Place(NamedTuple):
+    at: Any
+    seen: Any
+
+
+def chain(at: np.ndarray, option: np.ndarray) -> Transition:
+    at = np.clip(at + 2 * option - 1, 0, 4)
+    end = (at == 4).astype(F32)
+    return Transition(end, F32(0.9) * (1 - end), uniform(len(at), 2), 0 * end, at)
+
+
+def of_dicts(state: Any, option: Any) -> Transition:
+    out = chain(state["at"], option)
+    return out._replace(embedding={"deep": {"n": state["deep"]["n"] + 1}, "at": out.embedding})
+
+
+def of_tuples(state: Any, option: Any) -> Transition:
+    assert isinstance(state, Place)
+    out = chain(state.at, option)
+    return out._replace(embedding=Place(out.embedding, (state.seen[0],)))
+
+
+def of_tensordicts(state: Any, option: Any) -> Transition:
+    assert state.batch_size == option.shape
+    *numbers, at = map(torch.from_numpy, chain(state["at"].numpy(), option.numpy()))
+    return Transition(*numbers, TensorDict(at=at, batch_size=at.shape))
+
+
+def of_objects(states: Any, option: Any) -> Transition:
+    out = chain(np.array([state["at"] for state in states]), option)
+    return out._replace(embedding=[{"at": int(at)} for at in out.embedding])
+
+
+STARTS = np.array([2, 1])
+
+
+@pytest.mark.parametrize(
+    ("states", "transition", "tensors"),
+    [
+        ({"at": STARTS, "deep": {"n": np.zeros((2, 3), np.int8)}}, of_dicts, False),
+        (Place(STARTS, (np.zeros(2, bool),)), of_tuples, False),
+        (TensorDict(at=torch.from_numpy(STARTS), batch_size=[2]), of_tensordicts, True),
+        ([{"at": 2}, {"at": 1}], of_objects, False),
+    ],
+    ids=["mapping", "tuple", "TensorDict", "list"],
+)
+@pytest.mark.parametrize("policy", [PUCT(), UCT_IN_PYTHON])
+def test_states_of_any_structure_give_the_tree_of_an_array(
+    states: Any, transition: Any, tensors: bool, policy: Any
+) -> None:
+    found = []
+    for embedding, step in ((STARTS, chain), (states, transition)):
+        root = Root(uniform(2, 2), np.zeros(2, F32), embedding)
+        if tensors and embedding is states:
+            root = root._replace(prior=torch.from_numpy(root.prior), value=torch.zeros(2))
+        tree = tree_search(root, step, 30, tree_policy=policy).tree
+        found.append((tree.nodes.tobytes(), tree.edges.tobytes()))
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize(
+    ("embedding", "transition", "message"),
+    [
+        ({"at": STARTS}, lambda s, o: chain(s["at"], o), "embedding is built as the roots'"),
+        (
+            {"at": STARTS},
+            lambda s, o: chain(s["at"], o)._replace(embedding={"at": s["at"].astype(F32)}),
+            r"int64 \[2\].*got.*float32 \[2\]",
+        ),
+        ({"at": STARTS}, lambda s, o: 3, "got {'embedding': 'None'}"),
+        ({"at": STARTS, "x": torch.zeros(2)}, chain, "holds NumPy arrays only, or tensors"),
+        ({"at": STARTS, "x": np.zeros(3)}, chain, "one row for each root.*'at'.*2.*'x'.*3"),
+        ({}, chain, "holds NumPy arrays only, or tensors; got {}"),
+        ([1], chain, "one row for each of the 2 rows"),
+        ([1, 2], lambda s, o: chain(np.array(s), o), "a list of 2 states.*got array int64"),
+        (5.0, chain, "or a list of states; got a float"),
+    ],
+)
+def test_structures_that_do_not_fit_are_named(
+    embedding: Any, transition: Any, message: str
+) -> None:
+    root = Root(uniform(2, 2), np.zeros(2, F32), embedding)
+    with pytest.raises((TypeError, ValueError), match=message):
+        tree_search(root, transition, 10)
 
 
 def test_a_network_with_gradients_may_be_the_transition_function() -> None:

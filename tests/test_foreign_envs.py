@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from torchrl_hmcts.envs import SettableGymEnv
 from torchrl_hmcts.planners import (
     UCT,
     HighestValue,
@@ -30,7 +32,7 @@ from torchrl_hmcts.planners import (
     ProgressiveWidening,
     SearchBudget,
 )
-from torchrl_hmcts.testing import TableEnv
+from torchrl_hmcts.testing import ChainEnv, TableEnv
 from torchrl_hmcts.transforms import OptionTransform
 
 # ---------------------------------------------------------------------- pendulum
@@ -208,6 +210,27 @@ def test_what_transforms_count_is_restored_in_an_env_with_a_state_of_its_own() -
     assert depths.tolist() == [0] + [1] * 4 + [2] * 16
     counts = search.tree.states["step_count"][0, :21].flatten().tolist()
     assert counts == [0] + [4] * 4 + [6] * 16
+
+
+@pytest.mark.parametrize("make", [partial(SettableGymEnv, "CartPole-v1"), partial(ChainEnv, 12)])
+@pytest.mark.parametrize("behind", [True, False])
+def test_what_is_counted_behind_the_options_is_a_nodes_own(make: Any, behind: bool) -> None:
+    worker = TensorDictModule(lambda skill: skill.clone(), ["skill"], ["action"])
+    parts: list[Any] = [OptionTransform(worker, 2, 2), StepCounter(50)]
+    env = TransformedEnv(make(), Compose(*(parts if behind else parts[::-1])))
+    planner = MCTSPlanner(env, budget=SearchBudget(simulations=14, until_plan=False))
+    td = env.step(env.reset().set("option", torch.tensor(1)))["next"].exclude("reward")
+    tree, each = planner.search(td.clone()).tree, 1 if behind else 2
+    count = int(tree.num_nodes[0])
+    depth = torch.from_numpy(tree.nodes["depth"][0, :count].astype(np.int64))
+    assert depth.max() >= 2
+    assert tree.states is not None
+    counted = tree.states["step_count"][0, :count].flatten()
+    running = torch.from_numpy(tree.nodes["base_steps"][0, :count] == 2 * depth.numpy())
+    assert counted[running].equal(each * (1 + depth[running]))
+    # The env that is acted in counts on from where it was.
+    acted = env.step(td.set("option", torch.tensor(1)))["next", "step_count"]
+    assert acted.item() == 2 * each
 
 
 def test_a_batch_of_mujoco_walkers_gives_the_tree_of_one() -> None:

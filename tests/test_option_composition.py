@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import pytest
 import torch
+import torchrl
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import (
@@ -27,6 +30,7 @@ from torchrl.envs import (
     TimeMaxPool,
     Transform,
     TransformedEnv,
+    VecNorm,
     VecNormV2,
 )
 from torchrl.envs.utils import (
@@ -43,11 +47,16 @@ from torchrl_hmcts.modules import (
     ConcatSkillMLP,
     SkillActor,
     SkillDiscriminator,
+    SkillDynamics,
+    SkillEncoder,
     SkillMLP,
     SkillPolicy,
+    SpectralLinear,
 )
+from torchrl_hmcts.objectives import METRAEncoderLoss, SkillDynamicsLoss
 from torchrl_hmcts.testing import ChainEnv, ContractError, TableEnv, check_worker
-from torchrl_hmcts.transforms import OptionTransform
+from torchrl_hmcts.trainers import DIAYNTrainer
+from torchrl_hmcts.transforms import DisplacementTransform, OptionTransform, SkillTransform
 
 GAMMA = 0.9
 
@@ -184,13 +193,17 @@ class TestTransformsBelow:
     @pytest.mark.parametrize(
         "make",
         [
+            pytest.param(
+                partial(VecNorm, in_keys=["observation"]),
+                marks=pytest.mark.filterwarnings("ignore:.*VecNorm:FutureWarning"),
+            ),
             partial(VecNormV2, in_keys=["observation"]),
             partial(CatFrames, N=3, dim=-1, in_keys=["observation"]),
             partial(TimeMaxPool, T=3, in_keys=["observation"]),
             partial(RewardSum),
             partial(StepCounter, 7),
         ],
-        ids=["VecNormV2", "CatFrames", "TimeMaxPool", "RewardSum", "StepCounter"],
+        ids=["VecNorm", "VecNormV2", "CatFrames", "TimeMaxPool", "RewardSum", "StepCounter"],
     )
     def test_they_do_what_they_do_without_options(self, make: Callable[[], Transform]) -> None:
         plain, options = stacked(make())
@@ -308,6 +321,94 @@ class TestRecurrentWorker:
         base = TransformedEnv(GymEnv("Pendulum-v1"), InitTracker())
         with pytest.raises(ValueError, match=r"keep \['memory'\].*make_tensordict_primer"):
             base.append_transform(OptionTransform(worker, 1, 3, worker_memory="keep"))
+
+
+class Fading(TensorDictModuleBase):
+    """Acts by what it is told, half as strongly in each step; how strongly is its memory."""
+
+    in_keys = ["told", "strength", "is_init"]
+    out_keys = ["action", ("next", "strength")]
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        strength = td["strength"]
+        assert td["is_init"].equal(strength == 1)  # begins where its primer says
+        return td.set("action", td["told"] * strength).set(("next", "strength"), strength / 2)
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        strength = Composite(strength=Unbounded(1))
+        return TensorDictPrimer(strength, default_value=1.0, expand_specs=True)
+
+
+class StandIn(TensorDictModuleBase):
+    """Calls a policy as the LowLevelController of TorchRL's nightly does.
+
+    The policy's own entries, and ``is_init``, live under one key and are written under ``"next"``.
+    """
+
+    def __init__(self, policy: Fading, decision_spec: Composite) -> None:
+        super().__init__()
+        self.policy, self.decision_spec, self.state_key = policy, decision_spec, "_controller"
+        self.in_keys = ["told", self.state_key]
+        self.out_keys = ["action", ("next", self.state_key)]
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        state = td.get(self.state_key)
+        work = td.select("told").clone()
+        work.update(state.clone())
+        work = self.policy(work.reshape(-1)).reshape(td.batch_size)
+        kept = {"strength": work["next", "strength"], "is_init": torch.zeros_like(state["is_init"])}
+        return td.set("action", work["action"]).set(("next", self.state_key), TensorDict(kept))
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        specs = Composite(strength=Unbounded(1), is_init=Binary(1, dtype=torch.bool))
+        begins = {"strength": 1.0, "is_init": True}
+        return TensorDictPrimer(
+            Composite({self.state_key: specs}),
+            default_value={self.state_key: begins},
+            expand_specs=True,
+        )
+
+
+@pytest.mark.parametrize("number", [0, 2], ids=["one env", "SerialEnv"])
+@pytest.mark.parametrize("memory", ["reset", "keep"])
+def test_torchrls_low_level_controller_is_a_worker(memory: str, number: int) -> None:
+    make = getattr(torchrl.modules, "LowLevelController", StandIn)
+    controller = make(Fading(), Composite(told=Bounded(-2.0, 2.0, shape=(1,))))
+    table = torch.tensor([[-1.0], [2.0]])
+    options = OptionTransform(
+        controller,
+        2,
+        4,
+        skill_key="told",
+        skills=table,
+        trajectory_keys=["action"],
+        worker_memory=memory,
+    )
+    one = partial(GymEnv, "Pendulum-v1")
+    base = SerialEnv(number, one) if number else one()
+    env = base.append_transform(controller.make_tensordict_primer()).append_transform(options)
+    check_env_specs(env)
+    chosen = torch.arange(2) if number else torch.tensor(1)
+    data = env.rollout(2, lambda td: td.set("option", chosen))
+    strength = 0.5 ** torch.arange(8.0).view(2, 4)
+    right = table[chosen].view(-1, 1, 1) * (strength if memory == "keep" else strength[:1])
+    torch.testing.assert_close(
+        data["next", "trajectory", "action"].reshape(-1, 2, 4), right.expand(-1, 2, 4)
+    )
+
+
+def test_a_controller_without_its_primer_or_with_another_decision_is_refused() -> None:
+    controller = StandIn(Fading(), Composite(told=Bounded(-2.0, 2.0, shape=(1,))))
+    table = torch.zeros(2, 1)
+    bare = OptionTransform(controller, 2, 4, skill_key="told", skills=table)
+    with pytest.raises(ValueError, match="append its make_tensordict_primer"):
+        GymEnv("Pendulum-v1").append_transform(bare)
+    env = GymEnv("Pendulum-v1").append_transform(controller.make_tensordict_primer())
+    with pytest.raises(ValueError, match="if it is the option, pass skill_key='told'"):
+        env.append_transform(OptionTransform(controller, 2, 4, skills=table))
+    env = GymEnv("Pendulum-v1").append_transform(controller.make_tensordict_primer())
+    with pytest.raises(ValueError, match="vectors of 1 numbers and is told options by their num"):
+        env.append_transform(OptionTransform(controller, 2, 4, skill_key="told"))
 
 
 class Counting(torch.nn.Module):
@@ -549,11 +650,53 @@ def test_more_options_than_a_worker_has_skills_are_refused() -> None:
         TransformedEnv(cart_pole(), OptionTransform(SkillPolicy(actor), 4, 5))
 
 
+def test_float64_observations_are_read_in_the_precision_of_the_networks() -> None:
+    seen = torch.randn(5, 4, dtype=torch.float64)
+    td = TensorDict(observation=seen, skill=torch.arange(5) % 3, batch_size=[5])
+    keys: dict[str, Any] = {"in_keys": ["observation"]}
+    for network in (
+        SkillActor(4, Bounded(-1.0, 1.0, shape=(2,)), 3, **keys).module[0],
+        SkillActor(4, Categorical(2), 3, network=ConcatSkillMLP, **keys).module[0],
+        SkillDiscriminator(4, 3, **keys),
+        SkillEncoder(4, 3, linear=SpectralLinear, **keys),
+    ):
+        with torch.no_grad():  # a spectral norm takes a step of its iteration with gradients
+            double = network(td.clone())
+            single = network(td.clone().set("observation", seen.float()))
+        for key in network.out_keys:
+            assert double[key].dtype == torch.float32
+            assert double[key].equal(single[key]), key
+    narrow = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float64)
+    assert SkillPolicy(SkillActor(4, narrow, 3, **keys))(td)["action"].dtype == torch.float64
+
+
+def test_skills_are_learned_in_mujoco_as_it_is() -> None:
+    pytest.importorskip("mujoco")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of MuJoCo, about its own models
+        base = GymEnv("HalfCheetah-v5")
+        assert base.observation_spec["observation"].dtype == torch.float64
+        env = base.append_transform(SkillTransform(3, 10))
+        env.append_transform(DisplacementTransform("observation"))
+        for make in (
+            lambda: None,
+            lambda: METRAEncoderLoss(SkillEncoder(17, 3, in_keys=["observation"])),
+            lambda: SkillDynamicsLoss(
+                SkillDynamics(17, 17, 3, in_keys=["observation"], target_key="observation")
+            ),
+        ):
+            loss = DIAYNTrainer.make_loss(env, objective=make(), seed=0)
+            trainer = DIAYNTrainer(env, loss, total_frames=64, batch_size=16, seed=0)
+            trainer.train()
+            assert all(math.isfinite(x[-1]) for x in trainer.history.values())
+            assert trainer.replay_buffer[:]["next", "reward"].dtype == torch.float32
+
+
 @pytest.mark.parametrize(
     ("features", "dtype", "message"),
     [
         (3, torch.float32, r"for 3 features of torch.float32 was given 4.*in_features=4"),
-        (4, torch.float64, r"of torch.float64 was given 4 of torch.float32.*DoubleToFloat"),
+        (4, torch.int64, r"of torch.float32 was given 4 of torch.int64.*DTypeCastTransform"),
     ],
 )
 @pytest.mark.parametrize("kind", ["actor", "discriminator", "concatenated"])
@@ -568,6 +711,7 @@ def test_a_network_that_does_not_fit_what_it_reads_says_so(
         module = SkillActor(features, Categorical(2), num_skills=3, network=network, **keys)
     given = 4 if features == 3 else features
     message = message if kind != "concatenated" else "was given"
-    td = TensorDict(observation=torch.zeros(5, given), skill=torch.zeros(5, dtype=torch.int64))
+    seen = torch.zeros(5, given, dtype=dtype)
+    td = TensorDict(observation=seen, skill=torch.zeros(5, dtype=torch.int64))
     with pytest.raises(ValueError, match=message):
-        module.to(dtype)(td.auto_batch_size_(1))
+        module(td.auto_batch_size_(1))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,9 +16,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.data import Categorical, LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SoftUpdate
+from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.trainers.algorithms import SACTrainer
 
 from torchrl_hmcts.modules import (
@@ -218,6 +220,25 @@ def test_skills_that_are_switched_off_count_for_nothing(name: str) -> None:
     assert objective.reward(td)[~on].any()
 
 
+@pytest.mark.parametrize("prior", [None, [0.5, 0.5, 0.0]])
+@pytest.mark.parametrize("name", LOSSES)
+def test_transitions_may_be_on_another_device_than_the_prior(name: str, prior: Any) -> None:
+    # The device "meta" holds no numbers, and refuses to be mixed with the CPU as a GPU does.
+    torch.manual_seed(0)
+    network: Any = {
+        "diayn": lambda: SkillDiscriminator(2, 3, in_keys=["position"]),
+        "dads": lambda: SkillDynamics(2, 2, 3),
+        "lsd": lambda: SkillEncoder(2, 3, linear=SpectralLinear),
+        "metra": lambda: SkillEncoder(2, 3),
+    }[name]()
+    made = type(make_objective(name))(network.to("meta"), prior=prior)
+    if name == "metra":
+        made.log_dual = torch.nn.Parameter(made.log_dual.detach().to("meta"))
+    data = make_data().to("meta")
+    assert made.finite_reward(data).device.type == "meta"
+    assert all(made(data).get(key).device.type == "meta" for key in LOSSES[name])
+
+
 def test_a_discriminator_shares_all_its_belief_among_the_skills_that_are_on() -> None:
     td = make_data()
     td["skill"].zero_()
@@ -238,7 +259,7 @@ def test_a_prior_is_a_sequence_or_an_object_of_the_right_size() -> None:
         make_objective("diayn", prior=FixedSkillPrior(4))
     with pytest.raises(ValueError, match="num_skills="):
         METRAEncoderLoss(SkillNetwork(torch.nn.Identity(), ["x"], "representation"))
-    with pytest.raises(ValueError, match="num_skills=5.*3"):
+    with pytest.raises(ValueError, match="told of 5 skills.*3 skills"):
         METRAEncoderLoss(SkillEncoder(2, 3), num_skills=5)
     with pytest.raises(AttributeError, match="target_key"):
         SkillDynamicsLoss(identity_encoder(3))
@@ -381,10 +402,12 @@ def test_a_policy_prior_is_neither_trained_nor_saved_and_must_write_logits() -> 
 @pytest.mark.parametrize("continuous", [False, True], ids=["discrete", "continuous"])
 @pytest.mark.parametrize("name", LOSSES)
 def test_torchrls_sac_trainer_runs_with_another_objective_by_changing_one_object(
-    name: str, continuous: bool
+    name: str, continuous: bool, tmp_path: Path
 ) -> None:
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     objective = make_objective(name, num_skills=4)  # the one object
     env = make_env(16, continuous)
+    env.append_transform(RewardSum(["reward"], ["reward_sum"]))  # what SACTrainer logs
     loss: Any = make_loss(objective)
     if continuous:
         actor = SkillActor(2, env.action_spec, 4, in_keys=["velocity"])
@@ -412,8 +435,12 @@ def test_torchrls_sac_trainer_runs_with_another_objective_by_changing_one_object
         batch_size=32,
         target_net_updater=SoftUpdate(loss, tau=0.05),
         progress_bar=False,
-        enable_logging=False,
+        logger=TensorboardLogger("run", tmp_path),
+        log_interval=1,
     ).train()
+    (events,) = tmp_path.rglob("events*")
+    logged = accumulator.EventAccumulator(str(events)).Reload().Tags()["scalars"]
+    assert {"r_training", "loss_actor", "loss_qvalue", *LOSSES[name]} <= set(logged)
     now = loss.named_parameters()
     still = [k for (k, p), old in zip(now, before, strict=True) if torch.equal(p, old)]
     assert still in ([], ["objective.encoder_params.network.2.bias"])  # phi(s') - phi(s) has none

@@ -22,11 +22,11 @@ from torchrl.data import (
     Storage,
     Unbounded,
 )
-from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_hmcts.modules import GrowingSkillPrior, SkillDiscriminator
-from torchrl_hmcts.objectives import SkillDiscriminatorLoss
+from torchrl_hmcts.modules import GrowingSkillPrior, SkillDiscriminator, SkillDynamics
+from torchrl_hmcts.objectives import SkillDiscriminatorLoss, SkillDynamicsLoss
 from torchrl_hmcts.testing import ContractError, check_transform
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
@@ -222,6 +222,30 @@ def test_the_reward_has_its_closed_form(kwargs: dict[str, Any], expected: list[f
     out = discriminator_reward(a_discriminator(), **kwargs)(transitions())
     torch.testing.assert_close(out["next", "reward"], torch.tensor(expected)[:, None])
     assert not out["next", "reward"].requires_grad
+
+
+def test_a_reward_of_another_name_stands_beside_the_envs_own() -> None:
+    objective = SkillDiscriminatorLoss(SkillDiscriminator(3, 4, in_keys=["observation"]))
+
+    def rewarded(reward: SkillReward) -> EnvBase:
+        return TransformedEnv(GymEnv("Pendulum-v1"), Compose(SkillTransform(4, 3), reward))
+
+    env = rewarded(SkillReward(objective, reward_key=("own", "intrinsic")))
+    check_env_specs(env)
+    after = env.rollout(5)["next"]
+    assert after["own", "intrinsic"].shape == after["reward"].shape == (5, 1)
+    assert (after["reward"] < 0).all()  # Pendulum's cost
+    mixed = SkillReward(objective, reward_key="intrinsic", extrinsic_coeff=1.0)
+    with pytest.raises(ValueError, match=r"mixes in.*'intrinsic'.*has \['reward'\].*reward_key"):
+        rewarded(mixed).rollout(1)
+
+
+def test_dynamics_of_another_size_than_what_they_predict_are_refused() -> None:
+    keys = {"in_keys": ["observation"], "target_key": "observation"}
+    objective = SkillDynamicsLoss(SkillDynamics(3, 5, 4, **keys))
+    env = GymEnv("Pendulum-v1").append_transform(SkillTransform(4))
+    with pytest.raises(ValueError, match="dynamics of 5 numbers, but 'observation' has 3"):
+        env.append_transform(SkillReward(objective)).rollout(1)
 
 
 def test_entries_that_are_missing_are_named() -> None:

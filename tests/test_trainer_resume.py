@@ -6,6 +6,8 @@ import random
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,10 @@ import torch
 from torch import nn
 from torchrl.checkpoint import CheckpointError, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.envs import Compose, GymEnv, TransformedEnv
+from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, TransformedEnv
 from trainer_parts import differences
 
-from torchrl_hmcts.envs import WaterworldMazeEnv
+from torchrl_hmcts.envs import SettableGymEnv, WaterworldMazeEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.saving.run_state import GeneratorStates, RunningEpisodes
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
@@ -173,9 +175,14 @@ def test_episodes_of_a_collector_go_on_in_another() -> None:
     copy.shutdown()
 
 
-def make_gym_trainer(total: int, folder: Path, **kw: Any) -> DIAYNTrainer:
-    gym = GymEnv("CartPole-v1", categorical_action_encoding=True)
-    env = TransformedEnv(gym, SkillTransform(4, 5, seed=3))
+def gym_env() -> EnvBase:
+    return GymEnv("CartPole-v1", categorical_action_encoding=True)
+
+
+def make_gym_trainer(
+    total: int, folder: Path, make: Callable[[], EnvBase] = gym_env, **kw: Any
+) -> DIAYNTrainer:
+    env = TransformedEnv(make(), SkillTransform(4, 5, seed=3))
     keys = dict.fromkeys(("in_keys", "critic_keys", "discriminator_keys"), ["observation"])
     loss = DIAYNTrainer.make_loss(env, 4, hidden=(8,), seed=0, **keys)
     settings = {"frames_per_batch": 16, "batch_size": 8, "buffer_size": 64, "seed": 0, **kw}
@@ -198,6 +205,23 @@ def test_in_an_env_with_state_of_its_own_all_but_the_episodes_continues(
     assert [again.collected_frames, again._optim_count] == [64, 12]
     said = "GymEnv keeps state of its own, so the episodes that were under way are left out"
     assert capsys.readouterr().err.count(said) == (new_episodes is None)
+
+
+@pytest.mark.parametrize("copies", [0, 2])
+def test_an_env_that_is_set_to_a_state_of_its_own_continues_its_episodes(
+    copies: int, tmp_path: Path
+) -> None:
+    def make() -> EnvBase:
+        one = partial(SettableGymEnv, "CartPole-v1", seed=0)
+        return SerialEnv(copies, one) if copies else one()
+
+    whole = make_gym_trainer(64, tmp_path / "whole", make)
+    whole.train()
+    make_gym_trainer(32, tmp_path / "half", make).train()
+    again = make_gym_trainer(64, tmp_path / "half", make, seed=7).load(tmp_path / "half")
+    again.train()
+    assert differences(again.loss_module.state_dict(), whole.loss_module.state_dict()) == []
+    assert differences(again.replay_buffer[:].to_dict(), whole.replay_buffer[:].to_dict()) == []
 
 
 def test_episodes_that_cannot_continue_are_refused_on_request(tmp_path: Path) -> None:

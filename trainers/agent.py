@@ -95,6 +95,7 @@ class HMCTS:
             name = env if isinstance(env, str) else ""
             self.kit = GymKit(GymConfig(id=name, **keys), env=env)
         self.learned: LearnedSkills | None = None
+        self._num_skills = self.config.num_skills  # given options may be more or fewer
         self._worker = self.kit.given_worker()
 
     # ------------------------------------------------------------ parts
@@ -143,7 +144,8 @@ class HMCTS:
             progress: show a bar.
             save_dir: folder of checkpoints. Default: none.
         """
-        changes = {"options": "learned", "train_base_steps": base_steps}
+        changes: dict[str, Any] = {"options": "learned", "num_skills": self._num_skills}
+        changes["train_base_steps"] = base_steps
         names = {f.name for f in dataclasses.fields(self.config)}
         changes = {key: value for key, value in changes.items() if key in names}
         self.kit.config = dataclasses.replace(self.config, **changes)

@@ -25,6 +25,7 @@ from torchrl_hmcts.modules import (
     SkillDiscriminator,
     SkillPolicy,
 )
+from torchrl_hmcts.modules.skill_spec import require_known
 from torchrl_hmcts.objectives import (
     DIAYNLoss,
     DiscreteSkillSACLoss,
@@ -108,7 +109,9 @@ class DIAYNTrainer(OffPolicyTrainer):
             (``logger``, ``keep_last``, ``save_trainer_interval``, ...).
 
     Raises:
-        ValueError: if a number is out of range, or a batch does not divide among the env's copies.
+        ValueError: if a number is out of range, a batch does not divide among the env's copies, or
+            the env draws other skills than actor and objective know.
+        KeyError: if the env does not write what the actor reads, e.g. without a SkillTransform.
         TypeError: if the loss has no skill objective and no ``reward`` is given.
 
     Reference:
@@ -180,6 +183,7 @@ class DIAYNTrainer(OffPolicyTrainer):
         # Only what is read is stored.
         keys = list(dict.fromkeys([*loss_module.in_keys, *objective.in_keys, coverage.key]))
         policy = SkillPolicy(loss_module.actor_network)
+        _check_fits(env, policy, objective)
         super().__init__(
             partial(_collect, make_collector, env, policy, keys, frames_per_batch, total_frames),
             loss_module,
@@ -234,13 +238,13 @@ class DIAYNTrainer(OffPolicyTrainer):
     @staticmethod
     def make_loss(
         env: EnvBase,
-        num_skills: int = 4,
+        num_skills: int | TensorSpec | None = None,
         *,
         objective: SkillObjective | None = None,
         loss_class: type[LossModule] | None = None,
-        in_keys: Sequence[NestedKey] = ("velocity",),
-        critic_keys: Sequence[NestedKey] = ("velocity", "displacement"),
-        discriminator_keys: Sequence[NestedKey] = ("displacement",),
+        in_keys: Sequence[NestedKey] | None = None,
+        critic_keys: Sequence[NestedKey] | None = None,
+        discriminator_keys: Sequence[NestedKey] | None = None,
         hidden: Sequence[int] = (64, 64),
         discriminator_hidden: Sequence[int] = (),
         seed: int | None = None,
@@ -253,19 +257,22 @@ class DIAYNTrainer(OffPolicyTrainer):
 
         Args:
             env (EnvBase): env that writes ``in_keys`` and ``discriminator_keys``.
-            num_skills (int): number of skills. Default ``4``.
+            num_skills (int or TensorSpec, optional): number of skills, or the spec of one that is a
+                vector. Default ``None``: what the ``objective`` distinguishes, or what the env
+                draws (:class:`SkillTransform`), or 4.
             objective (SkillObjective, optional): what makes skills different, e.g.
                 :class:`METRAEncoderLoss`. Default ``None``: DIAYN's discriminator, built with
                 ``discriminator_keys`` and ``discriminator_hidden``.
             loss_class (type, optional): one of :func:`worker_losses`. Default ``None``: the first
                 of these that takes the ``objective``.
-            in_keys (sequence of NestedKey): what the actor sees besides the skill. Default
-                ``("velocity",)``.
-            critic_keys (sequence of NestedKey): what the critics see besides the skill. Default
-                ``("velocity", "displacement")``: the reward is a function of the displacement.
-                Critics serve only in training, so they may see what the actor does not.
-            discriminator_keys (sequence of NestedKey): what the discriminator sees. Default
-                ``("displacement",)``.
+            in_keys (sequence of NestedKey, optional): what the actor sees besides the skill.
+                Default ``None``: ``["velocity"]``, or ``["observation"]`` of an env without.
+            critic_keys (sequence of NestedKey, optional): what the critics see besides the skill.
+                Default ``None``: ``in_keys``, and ``"displacement"`` if the env writes it, of which
+                the reward is a function. Critics serve only in training, so they may see what the
+                actor does not.
+            discriminator_keys (sequence of NestedKey, optional): what the discriminator sees.
+                Default ``None``: ``["displacement"]``, or ``in_keys`` in an env without.
             hidden (sequence of int): widths of actor's and critics' shared layers. Default
                 ``(64, 64)``.
             discriminator_hidden (sequence of int): widths of the discriminator's hidden layers.
@@ -279,8 +286,19 @@ class DIAYNTrainer(OffPolicyTrainer):
 
         Raises:
             KeyError: if the env does not write one of the keys.
-            ValueError: if ``loss_class`` does not train such actions, or such an objective.
+            ValueError: if ``loss_class`` does not train such actions, or such an objective; for
+                skills that are vectors without an ``objective``.
         """
+        shown = env.full_observation_spec_unbatched
+        written = shown.keys(True, True)
+        if num_skills is None:
+            drawn = shown["skill"] if "skill" in written else 4
+            num_skills = drawn if objective is None else objective.skill_spec
+        moved = ["displacement"] if "displacement" in written else []
+        if in_keys is None:
+            in_keys = ["velocity" if "velocity" in written else "observation"]
+        critic_keys = [*in_keys, *moved] if critic_keys is None else critic_keys
+        discriminator_keys = moved or in_keys if discriminator_keys is None else discriminator_keys
         action_spec = env.action_spec_unbatched
         losses = worker_losses(action_spec, objective)
         if loss_class is None:
@@ -406,6 +424,23 @@ def _collect(
         return_same_td=True,  # each batch is a new one as it is
         auto_register_policy_transforms=False,
     )
+
+
+def _check_fits(env: EnvBase, policy: SkillPolicy, objective: SkillObjective) -> None:
+    """Refuses an env that does not write what is read, or draws other skills than are known."""
+    shown, state = env.full_observation_spec, env.full_state_spec
+    written = {*shown.keys(True, True), *state.keys(True, True)}
+    missing = [key for key in policy.in_keys if key not in written]
+    if missing:
+        raise KeyError(
+            f"DIAYNTrainer's actor reads {missing[0]!r}, which the env does not write; it writes "
+            f"{sorted(map(str, written))}. Append a SkillTransform for the skill, give the actor "
+            f"other in_keys, or append the transform that writes it."
+        )
+    for part in (policy, objective):
+        key = policy.in_keys[-1] if part is policy else objective.tensor_keys.skill
+        if key in shown.keys(True, True):
+            require_known("DIAYNTrainer", part, part.skill_spec, shown[key])
 
 
 def _objective(loss_module: LossModule) -> SkillObjective:

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_hmcts.checks import instance
 from torchrl_hmcts.envs.gym.shared_network import SharedNetwork, choose, run_network
 from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillMLP
+from torchrl_hmcts.modules.skill_spec import described
 from torchrl_hmcts.processes import share
 
 # NormalParamExtractor's mapping of the raw scale: softplus(x + shift) + least, 1 at x = 0.
@@ -25,19 +26,22 @@ _SHIFT = float(np.log(np.expm1(1.0 - _LEAST_SCALE)))
 class SkillWorker:
     r"""Acts as a :class:`SkillActor` inside the processes of a pool.
 
-    Its options are the actor's skills. The weights are a copy in shared memory: :meth:`load` writes
-    new ones, which the processes use from their next step on. For a ``SkillMLP`` or
-    ``ConcatSkillMLP`` of linear layers and ReLU, one forward pass takes a few microseconds; another
-    network runs in torch.
+    Its options are the actor's skills, or some vectors of them. The weights are a copy in shared
+    memory: :meth:`load` writes new ones, which the processes use from their next step on. For a
+    ``SkillMLP`` or ``ConcatSkillMLP`` of linear layers and ReLU, one forward pass takes a few
+    microseconds; another network runs in torch.
 
     Args:
         actor (SkillActor): of discrete or continuous actions; its ``in_keys`` name entries of the
             env's observation, ``"observation"`` where that is one array.
         deterministic (bool): take the most probable action, or the squashed mean, instead of a
             sample. Default False.
+        skills (Tensor, optional): ``[Z, D]``, of an actor whose skills are vectors those that are
+            the options, e.g. of :func:`~torchrl_hmcts.modules.spread_skills`.
 
     Raises:
         TypeError: if ``actor`` is something else.
+        ValueError: if ``skills`` does not fit the actor.
         OSError: if there is too little shared memory.
 
     Reference:
@@ -53,9 +57,13 @@ class SkillWorker:
         3
     """
 
-    def __init__(self, actor: SkillActor, *, deterministic: bool = False) -> None:
+    def __init__(
+        self, actor: SkillActor, *, deterministic: bool = False, skills: Tensor | None = None
+    ) -> None:
         instance("SkillWorker", "actor", actor, SkillActor)
-        self.num_options = int(actor.num_skills)
+        self._told = _as_told(actor, skills)
+        self.num_options = len(self._told)
+        self._numbered = skills is None
         self.deterministic = bool(deterministic)
         self.keys = [k if isinstance(k, tuple) else (k,) for k in actor.module[0].in_keys[:-1]]
         self._bounds: tuple[np.ndarray, np.ndarray] | None = None
@@ -108,7 +116,7 @@ class SkillWorker:
         else:
             net, head = self._weights, option
             if self._shown:
-                x, head = np.concatenate([x, np.eye(1, self.num_options, option)[0]]), 0
+                x, head = np.concatenate([x, self._told[option]]), 0
             arrays = x, net._array, net._sizes, net._heads[head], net._logits
             if self._bounds is None:
                 return int(choose(*arrays, draw, 1.0))
@@ -134,8 +142,24 @@ class SkillWorker:
 
     def _run_module(self, x: np.ndarray, option: int) -> np.ndarray:
         assert self._module is not None
+        told = torch.tensor(option) if self._numbered else torch.from_numpy(self._told[option])
         with torch.no_grad():
-            return self._module(torch.from_numpy(x), torch.tensor(option)).numpy()
+            return self._module(torch.from_numpy(x), told).numpy()
+
+
+def _as_told(actor: SkillActor, skills: Tensor | None) -> np.ndarray:
+    """What a network that is shown the skill is told of each option, float32 ``[Z, ...]``."""
+    if actor.num_skills is not None and skills is None:
+        return np.eye(actor.num_skills, dtype=np.float32)
+    size = actor.skill_spec.shape[-1:]
+    if actor.num_skills is not None or skills is None or skills.shape[1:] != size:
+        wanted = "no skills=" if actor.num_skills is not None else f"skills= of [Z, {size[0]}]"
+        got = "none" if skills is None else list(skills.shape)
+        raise ValueError(
+            f"SkillWorker of an actor that knows {described(actor.skill_spec)} needs {wanted}; got "
+            f"{got}."
+        )
+    return np.ascontiguousarray(skills.detach().cpu().numpy(), np.float32)
 
 
 def _pick(logits: np.ndarray, draw: float) -> int:

@@ -18,6 +18,7 @@ from torchrl_hmcts.modules.skill_prior import (
     LearnedSkillPrior,
     SkillPrior,
 )
+from torchrl_hmcts.modules.skill_spec import UnitSphere, spread_skills
 from torchrl_hmcts.modules.termination import (
     AnyTermination,
     LearnedTermination,
@@ -47,6 +48,8 @@ __all__ = [
     "SpectralLinear",
     "StallTermination",
     "TerminationNetwork",
+    "UnitSphere",
+    "spread_skills",
 ]
 
 

@@ -21,7 +21,9 @@ from torchrl_hmcts.modules.skill_mlp import (
     check_sizes,
     entries,
     key_list,
+    skill_network,
 )
+from torchrl_hmcts.modules.skill_spec import Skills, as_skill_spec, needs_number, number_of
 
 
 class SkillDiscriminator(SkillNetwork):
@@ -35,7 +37,7 @@ class SkillDiscriminator(SkillNetwork):
 
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
-        num_skills (int): number of skills ``Z``.
+        num_skills (int or TensorSpec): number of skills ``Z``.
         in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
             ``["displacement"]``.
         skill_logits_key (NestedKey): entry written, ``[*B, Z]``. Default ``"skill_logits"``.
@@ -59,14 +61,15 @@ class SkillDiscriminator(SkillNetwork):
     def __init__(
         self,
         in_features: int,
-        num_skills: int,
+        num_skills: Skills,
         *,
         in_keys: Sequence[NestedKey] = ("displacement",),
         skill_logits_key: NestedKey = "skill_logits",
         hidden: Sequence[int] = (),
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
-        check_sizes("SkillDiscriminator", in_features=in_features, num_skills=num_skills)
+        check_sizes("SkillDiscriminator", in_features=in_features)
+        num_skills = needs_number("SkillDiscriminator", num_skills)
         sizes = [in_features, *hidden, num_skills]
         network = FeatureMLP("SkillDiscriminator", sizes, activation)
         super().__init__(network, in_keys, skill_logits_key)
@@ -78,11 +81,14 @@ class SkillEncoder(SkillNetwork):
 
     .. math:: \phi(s) = \mathrm{MLP}(s) \in \mathbb{R}^Z
 
+    or, where skills are vectors, with their dimensions.
+
     What it reads decides what "far apart" means: with the position, skills travel through the maze.
     Losses call it on both ends of a transition, so ``in_keys`` are written without ``"next"``.
 
     Args:
-        in_features, num_skills: as :class:`SkillDiscriminator`'s.
+        in_features (int): as :class:`SkillDiscriminator`'s.
+        num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one that is a vector.
         in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
             ``["position"]``.
         representation_key (NestedKey): entry written, ``[*B, Z]``. Default ``"representation"``.
@@ -108,7 +114,7 @@ class SkillEncoder(SkillNetwork):
     def __init__(
         self,
         in_features: int,
-        num_skills: int,
+        num_skills: Skills,
         *,
         in_keys: Sequence[NestedKey] = ("position",),
         representation_key: NestedKey = "representation",
@@ -116,11 +122,12 @@ class SkillEncoder(SkillNetwork):
         activation: Callable[[], nn.Module] = nn.ReLU,
         linear: Callable[[int, int], nn.Module] = nn.Linear,
     ) -> None:
-        check_sizes("SkillEncoder", in_features=in_features, num_skills=num_skills)
-        sizes = [in_features, *hidden, num_skills]
+        check_sizes("SkillEncoder", in_features=in_features)
+        spec = as_skill_spec("SkillEncoder", num_skills)
+        sizes = [in_features, *hidden, number_of(spec) or spec.shape[-1]]
         network = FeatureMLP("SkillEncoder", sizes, activation, linear)
         super().__init__(network, in_keys, representation_key)
-        self.num_skills = num_skills
+        self.num_skills, self.skill_spec = number_of(spec), spec
 
 
 class SpectralLinear(nn.Linear):
@@ -181,10 +188,12 @@ class SkillDynamics(TensorDictModuleBase):
         q(s' \mid s, z) = \mathcal{N}\bigl(s' - s;\; \mu_z(s),\, \mathrm{diag}(\sigma^2)\bigr),
         \qquad \mu_z(s) = \mathrm{SkillMLP}(s, z)
 
-    It writes mean and standard deviation for all skills at once, since the reward compares them.
+    It writes mean and standard deviation for all skills at once, since the reward compares them; of
+    skills that are vectors for the one that it reads.
 
     Args:
-        in_features, num_skills: as :class:`SkillDiscriminator`'s.
+        in_features (int): as :class:`SkillDiscriminator`'s.
+        num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one that is a vector.
         target_features (int): size ``D`` of the entry whose change is predicted.
         in_keys (sequence of NestedKey): entries ``[*B, f_i]`` the prediction depends on. Default
             ``["position"]``.
@@ -195,8 +204,9 @@ class SkillDynamics(TensorDictModuleBase):
             Default ``True``.
         min_std (float): lower bound of a learned one. Default ``1e-3``: a target that never
             changes must not get an infinite density.
-        loc_key, scale_key (NestedKey): entries written, both ``[*B, Z, D]``. Defaults
-            ``"skill_loc"`` and ``"skill_scale"``.
+        loc_key, scale_key (NestedKey): entries written, both ``[*B, Z, D]``, or ``[*B, D]``.
+            Defaults ``"skill_loc"`` and ``"skill_scale"``.
+        skill_key (NestedKey): entry of a skill that is a vector. Default ``"skill"``.
         hidden, activation, network: as :class:`SkillActor`'s; the network needs ``all_skills``.
 
     Raises:
@@ -221,7 +231,7 @@ class SkillDynamics(TensorDictModuleBase):
         self,
         in_features: int,
         target_features: int,
-        num_skills: int,
+        num_skills: Skills,
         *,
         in_keys: Sequence[NestedKey] = ("position",),
         target_key: NestedKey = "position",
@@ -230,6 +240,7 @@ class SkillDynamics(TensorDictModuleBase):
         min_std: float = 1e-3,
         loc_key: NestedKey = "skill_loc",
         scale_key: NestedKey = "skill_scale",
+        skill_key: NestedKey = "skill",
         hidden: Sequence[int] = (64, 64),
         activation: Callable[[], nn.Module] = nn.ReLU,
         network: Callable[..., nn.Module] = SkillMLP,
@@ -238,10 +249,14 @@ class SkillDynamics(TensorDictModuleBase):
         check_sizes("SkillDynamics", in_features=in_features, target_features=target_features)
         self.min_std = real_number("SkillDynamics", "min_std", min_std, above=0.0)
         above_min = real_number("SkillDynamics", "std", std, above=self.min_std) - self.min_std
-        self.network: Any = network(in_features, target_features, num_skills, hidden, activation)
-        self.num_skills = num_skills
+        net = skill_network(network, in_features, target_features, num_skills, hidden, activation)
+        self.network: Any = net
+        self.skill_spec = as_skill_spec("SkillDynamics", num_skills)
+        self.num_skills = number_of(self.skill_spec)
         self.target_key = unravel_key(target_key)
         self.in_keys = key_list("SkillDynamics", in_keys)
+        if self.num_skills is None:
+            self.in_keys.append(unravel_key(skill_key))
         self.out_keys = [unravel_key(loc_key), unravel_key(scale_key)]
         log_std = torch.full((target_features,), math.log(above_min))
         if learned_std:
@@ -250,8 +265,9 @@ class SkillDynamics(TensorDictModuleBase):
             self.register_buffer("log_std", log_std)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes mean and standard deviation of the change under every skill, ``[*B, Z, D]``."""
-        loc = self.network.all_skills(*entries(self, tensordict, self.in_keys))
+        """Writes mean and standard deviation of the change; see the class."""
+        run = self.network if self.num_skills is None else self.network.all_skills
+        loc = run(*entries(self, tensordict, self.in_keys))
         scale = (self.min_std + self.log_std.exp()).expand_as(loc)
         tensordict.set(self.out_keys[0], loc)
         return tensordict.set(self.out_keys[1], scale)

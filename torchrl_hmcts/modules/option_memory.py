@@ -101,6 +101,7 @@ class OptionMemory:
         place, outcome = self._places(td), self.model.targets(td, normalized=False)
         if self._place is None or self._outcome is None:
             shape = (self.num_contexts, self.capacity)
+            self._option = self._option.to(place.device)
             self._place = place.new_zeros(*shape, place.shape[-1])
             self._outcome = outcome.new_zeros(*shape, outcome.shape[-1])
         options = td.get(self.option_key)

@@ -20,7 +20,14 @@ from torchrl.modules import (
 )
 
 from torchrl_hmcts.checks import instance
-from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, entries, key_list
+from torchrl_hmcts.modules.skill_mlp import (
+    SkillMLP,
+    SkillNetwork,
+    entries,
+    key_list,
+    skill_network,
+)
+from torchrl_hmcts.modules.skill_spec import Skills, as_skill_spec, number_of
 
 
 class _Categorical(torch.distributions.Categorical):
@@ -113,7 +120,8 @@ class _Squashed:
         loc, scale = _gaussian(outputs)
         if not deterministic:
             loc = loc + scale * torch.empty_like(loc).normal_(generator=generator)
-        return self.half_range.to(loc) * loc.tanh() + self.middle.to(loc)
+        action = self.half_range.to(loc) * loc.tanh() + self.middle.to(loc)
+        return action.to(self.spec.dtype)
 
 
 _gaussian = NormalParamExtractor()
@@ -151,14 +159,17 @@ class SkillActor(ProbabilisticActor):
             or ``OneHot`` (action ``[*B, A]``) with ``A`` actions, or a ``Bounded`` of floats with
             the last dimension ``D`` (action ``[*B, D]``); leading (batch) dimensions must have the
             same bounds.
-        num_skills (int): number of skills.
+        num_skills (int or TensorSpec): number of skills, or the spec of one skill that is a vector
+            ``[D]``, e.g. :class:`UnitSphere`.
         in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
-        skill_key (NestedKey): entry of the skill, int64 ``[*B]``. Default ``"skill"``.
+        skill_key (NestedKey): entry of the skill, int64 ``[*B]``, or float ``[*B, D]``. Default
+            ``"skill"``.
         action_key (NestedKey): entry the action is written to. Default ``"action"``.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
         activation (callable): builds the activations. Default ``torch.nn.ReLU``.
         network (callable): builds the network, with the signature of :class:`SkillMLP`. Default
-            :class:`SkillMLP`; e.g. :class:`ConcatSkillMLP` for a skill that is concatenated.
+            :class:`SkillMLP`; e.g. :class:`ConcatSkillMLP` for a skill that is concatenated, which
+            a vector always is.
 
     Raises:
         ValueError: if the action spec is none of these, or its bounds are not finite.
@@ -184,7 +195,7 @@ class SkillActor(ProbabilisticActor):
         self,
         in_features: int,
         action_spec: TensorSpec,
-        num_skills: int,
+        num_skills: Skills,
         *,
         in_keys: Sequence[NestedKey],
         skill_key: NestedKey = "skill",
@@ -197,7 +208,7 @@ class SkillActor(ProbabilisticActor):
         kind = _kind_of_action(action_spec, action_key)
         group = () if isinstance(action_key, str) else action_key[:-1]
         written = [unravel_key((*group, name)) for name in kind.writes]
-        net = network(in_features, kind.size, num_skills, hidden, activation)
+        net = skill_network(network, in_features, kind.size, num_skills, hidden, activation)
         keys = [*key_list("SkillActor", in_keys), skill_key]
         run = (SkillNetwork if isinstance(kind, _Choice) else _GaussianNetwork)(net, keys, *written)
         super().__init__(
@@ -209,7 +220,8 @@ class SkillActor(ProbabilisticActor):
             distribution_kwargs=kind.distribution_kwargs,
             return_log_prob=False,
         )
-        self.num_skills = num_skills
+        self.skill_spec = as_skill_spec("SkillActor", num_skills)
+        self.num_skills = number_of(self.skill_spec)
         if isinstance(kind, _Choice):
             self.num_actions = kind.num_actions
         self.skill_key = unravel_key(skill_key)
@@ -285,7 +297,7 @@ class SkillPolicy(TensorDictModuleBase):
         instance("SkillPolicy", "actor", actor, SkillActor)
         self.__dict__["actor"] = actor  # no sub-module: its parameters are the network's
         self.network = actor.network
-        self.num_skills = actor.num_skills
+        self.num_skills, self.skill_spec = actor.num_skills, actor.skill_spec
         self.in_keys = list(actor.module[0].in_keys)
         self.out_keys = [actor.action_key]
         self.action_key = actor.action_key

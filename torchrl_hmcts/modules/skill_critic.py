@@ -7,7 +7,14 @@ from collections.abc import Callable, Sequence
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, check_sizes, key_list
+from torchrl_hmcts.modules.skill_mlp import (
+    SkillMLP,
+    SkillNetwork,
+    check_sizes,
+    key_list,
+    skill_network,
+)
+from torchrl_hmcts.modules.skill_spec import Skills, as_skill_spec, number_of
 
 
 class SkillCritic(SkillNetwork):
@@ -37,7 +44,7 @@ class SkillCritic(SkillNetwork):
         self,
         in_features: int,
         num_actions: int,
-        num_skills: int,
+        num_skills: Skills,
         *,
         in_keys: Sequence[NestedKey],
         skill_key: NestedKey = "skill",
@@ -47,11 +54,12 @@ class SkillCritic(SkillNetwork):
         network: Callable[..., nn.Module] = SkillMLP,
     ) -> None:
         check_sizes("SkillCritic", in_features=in_features, num_actions=num_actions)
-        net = network(in_features, num_actions, num_skills, hidden, activation)
+        net = skill_network(network, in_features, num_actions, num_skills, hidden, activation)
         keys = [*key_list("SkillCritic", in_keys), skill_key]
         super().__init__(net, keys, action_value_key)
         self.num_actions = num_actions
-        self.num_skills = num_skills
+        self.skill_spec = as_skill_spec("SkillCritic", num_skills)
+        self.num_skills = number_of(self.skill_spec)
 
 
 class SkillActionCritic(SkillNetwork):
@@ -80,7 +88,7 @@ class SkillActionCritic(SkillNetwork):
         self,
         in_features: int,
         action_features: int,
-        num_skills: int,
+        num_skills: Skills,
         *,
         in_keys: Sequence[NestedKey],
         skill_key: NestedKey = "skill",
@@ -91,7 +99,9 @@ class SkillActionCritic(SkillNetwork):
         network: Callable[..., nn.Module] = SkillMLP,
     ) -> None:
         check_sizes("SkillActionCritic", in_features=in_features, action_features=action_features)
-        net = network(in_features + action_features, 1, num_skills, hidden, activation)
+        width = in_features + action_features
+        net = skill_network(network, width, 1, num_skills, hidden, activation)
         keys = [*key_list("SkillActionCritic", in_keys), action_key, skill_key]
         super().__init__(net, keys, state_action_value_key)
-        self.num_skills = num_skills
+        self.skill_spec = as_skill_spec("SkillActionCritic", num_skills)
+        self.num_skills = number_of(self.skill_spec)

@@ -15,8 +15,10 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torchrl.data import TensorSpec
 
 from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.modules.skill_spec import Skills, as_skill_spec, described, number_of
 
 
 class SkillMLP(nn.Module):
@@ -31,7 +33,7 @@ class SkillMLP(nn.Module):
     Args:
         in_features (int): number of input features ``F``, after concatenation.
         out_features (int): number of outputs ``O`` of each head.
-        num_skills (int): number of skills ``Z``, one head each.
+        num_skills (int or TensorSpec): number of skills ``Z``, one head each.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``: two layers, as
             in the dissertation.
         activation (callable): builds the activation after each shared layer. Default
@@ -43,7 +45,7 @@ class SkillMLP(nn.Module):
         copies stacked in place of its own, ``[N, *B, O]``.
 
     Raises:
-        ValueError: if a size is not positive or there is no shared layer.
+        ValueError: if a size is not positive, there is no shared layer, or skills are vectors.
 
     Reference:
         Bartley, "Hierarchical Reinforcement Learning with Model-Based Planning for Finding Sparse
@@ -60,17 +62,17 @@ class SkillMLP(nn.Module):
         self,
         in_features: int,
         out_features: int,
-        num_skills: int,
+        num_skills: Skills,
         hidden: Sequence[int] = (64, 64),
         activation: Callable[[], nn.Module] = nn.ReLU,
     ) -> None:
         super().__init__()
         owner = type(self).__name__
-        check_sizes(
-            owner, in_features=in_features, out_features=out_features, num_skills=num_skills
-        )
+        check_sizes(owner, in_features=in_features, out_features=out_features)
         self.in_features, self.out_features = in_features, out_features
-        self.num_skills = num_skills
+        self.skill_spec = as_skill_spec(owner, num_skills)
+        self.num_skills = number_of(self.skill_spec)
+        self.skill_size = None if self.num_skills else self.skill_spec.shape[-1]  # of a vector
         self._build(owner, tuple(hidden), activation)
 
     def _build(
@@ -80,6 +82,11 @@ class SkillMLP(nn.Module):
             raise ValueError(
                 f"{owner} needs at least one shared layer, which the heads read; got hidden=(). "
                 "Pass e.g. hidden=(64, 64)."
+            )
+        if self.num_skills is None:
+            raise ValueError(
+                f"{owner} has a head for each of a number of skills; these are "
+                f"{described(self.skill_spec)}. Use ConcatSkillMLP, which reads them."
             )
         self.trunk = hidden_layers(owner, self.in_features, hidden, activation)
         self.heads = nn.Linear(hidden[-1], self.num_skills * self.out_features)
@@ -94,7 +101,7 @@ class SkillMLP(nn.Module):
         They are in the order of ``parameters()``; of N copies, stacked.
         """
         *features, skill = inputs
-        check_skill(skill, features[0])
+        check_skill(skill, features[0], self.skill_size)
         y = self._all_skills(weights, features)  # [*B, Z, O], of stacked weights [N, *B, Z, O]
         index = skill.unsqueeze(-1).unsqueeze(-1).expand(*y.shape[:-2], 1, self.out_features)
         return y.gather(-2, index).squeeze(-2)
@@ -105,7 +112,7 @@ class SkillMLP(nn.Module):
 
     def _all_skills(self, weights: Sequence[Tensor], features: Sequence[Tensor]) -> Tensor:
         y = run_layers(self.trunk, weights, concatenate(features))
-        return y.view(*y.shape[:-1], self.num_skills, self.out_features)
+        return y.view(*y.shape[:-1], self.num_skills or 1, self.out_features)
 
     def _weights(self) -> list[Tensor]:
         """Returns the network's own weights and biases, in the order of ``parameters()``."""
@@ -120,7 +127,7 @@ class SkillMLP(nn.Module):
 
     def extra_repr(self) -> str:
         """Returns the sizes that ``print`` shows."""
-        return f"num_skills={self.num_skills}, out_features={self.out_features}"
+        return f"{described(self.skill_spec)}, out_features={self.out_features}"
 
 
 class ConcatSkillMLP(SkillMLP):
@@ -128,10 +135,15 @@ class ConcatSkillMLP(SkillMLP):
 
     .. math:: y = B h(x, e_z) + b, \qquad h = \sigma(A_2 \sigma(A_1 [x; e_z] + a_1) + a_2)
 
-    with :math:`e_z` the one-hot skill. It is built and called as :class:`SkillMLP` is: pass it as
-    ``network=ConcatSkillMLP`` to an actor or critic. All layers are shared by all skills, as in the
-    paper on DIAYN; its number of weights hardly grows with the number of skills. There may be no
-    hidden layer.
+    with :math:`e_z` the one-hot skill, or a skill that is a vector as it is. It is built and called
+    as :class:`SkillMLP` is: pass it as ``network=ConcatSkillMLP`` to an actor or critic. All layers
+    are shared by all skills, as in the paper on DIAYN; its number of weights hardly grows with the
+    number of skills. There may be no hidden layer.
+
+    Args:
+        num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one skill that is a
+            vector ``[D]``, e.g. :class:`UnitSphere`; ``skill`` is then float ``[*B, D]``.
+        in_features, out_features, hidden, activation: as :class:`SkillMLP`'s.
 
     Returns:
         From ``forward(*features, skill)``: Tensor ``[*B, O]``.
@@ -150,17 +162,23 @@ class ConcatSkillMLP(SkillMLP):
     def _build(
         self, owner: str, hidden: tuple[int, ...], activation: Callable[[], nn.Module]
     ) -> None:
-        width = self.in_features + self.num_skills
+        width = self.in_features + (self.skill_size or self.num_skills or 0)
         self.trunk = hidden_layers(owner, width, hidden, activation)
         self.last = nn.Linear((width, *hidden)[-1], self.out_features)
 
     def run(self, weights: Sequence[Tensor], *inputs: Tensor) -> Tensor:
         *features, skill = inputs
-        check_skill(skill, features[0])
-        x = torch.cat((*features, self._one_hot(skill, features[0])), -1)
-        return run_layers(self.trunk, weights, x)
+        check_skill(skill, features[0], self.skill_size)
+        if self.num_skills is not None:
+            skill = self._one_hot(skill, features[0])
+        return run_layers(self.trunk, weights, torch.cat((*features, skill), -1))
 
     def all_skills(self, *features: Tensor) -> Tensor:
+        if self.num_skills is None:
+            raise ValueError(
+                f"{type(self).__name__} cannot return its outputs for every skill: its skills are "
+                f"{described(self.skill_spec)}. Call it with the skills that are meant."
+            )
         x = torch.cat(features, -1).unsqueeze(-2)
         x = x.expand(*x.shape[:-2], self.num_skills, -1)
         skill = torch.arange(self.num_skills, device=x.device)
@@ -168,8 +186,18 @@ class ConcatSkillMLP(SkillMLP):
         return run_layers(self.trunk, self._weights(), torch.cat((x, one_hot), -1))
 
     def _one_hot(self, skill: Tensor, like: Tensor) -> Tensor:
-        skills = torch.arange(self.num_skills, device=like.device)
+        skills = torch.arange(self.num_skills or 0, device=like.device)
         return (skill.unsqueeze(-1) == skills).to(like.dtype)
+
+
+def skill_network(
+    network: Callable[..., nn.Module], in_features: int, size: int, skills: Skills, *args: Any
+) -> Any:
+    """Builds the network of an actor or critic; vectors are read, by no heads of their own."""
+    if isinstance(skills, TensorSpec) and network is SkillMLP:
+        if number_of(as_skill_spec("ConcatSkillMLP", skills)) is None:
+            network = ConcatSkillMLP
+    return network(in_features, size, skills, *args)
 
 
 class FeatureMLP(nn.Sequential):
@@ -186,9 +214,7 @@ class FeatureMLP(nn.Sequential):
         super().__init__(*hidden, linear(sizes[-2], sizes[-1]))
 
     def forward(self, *features: Tensor) -> Tensor:
-        x = concatenate(features)
-        check_features(x, next(self.parameters()))
-        return super().forward(x)
+        return super().forward(fitting(concatenate(features), next(self.parameters())))
 
     def run(self, weights: Sequence[Tensor], *features: Tensor) -> Tensor:
         """Does what ``forward`` does, with weights in place of its own, as :meth:`SkillMLP.run`."""
@@ -250,7 +276,7 @@ def run_layers(hidden: Iterable[nn.Module], weights: Sequence[Tensor], x: Tensor
 
     Layers are applied here, not called as modules, with ``weights`` in the order of parameters.
     """
-    check_features(x, weights[0])
+    x = fitting(x, weights[0])
     num_nets = weights[-1].shape[:-1]  # () or, stacked, (N,)
     batch = x.shape[:-1]
     if num_nets:
@@ -280,20 +306,36 @@ def can_stack(layers: Iterable[nn.Module]) -> bool:
     return not any(True for layer in others for _ in (*layer.parameters(), *layer.buffers()))
 
 
-def check_features(x: Tensor, weight: Tensor) -> None:
-    """Raises ValueError unless features ``[*B, F]`` fit the weights of a first layer ``[O, F]``."""
-    if x.shape[-1] != weight.shape[-1] or x.dtype != weight.dtype:
+def fitting(x: Tensor, weight: Tensor) -> Tensor:
+    """Returns features ``[*B, F]`` in the precision of a first layer's weights ``[O, F]``.
+
+    MuJoCo's observations are float64.
+
+    Raises:
+        ValueError: if they are others, or no floats.
+    """
+    if x.shape[-1] != weight.shape[-1] or not x.is_floating_point():
         fix = f"Build it with in_features={x.shape[-1]}, or give it other in_keys."
         if x.shape[-1] == weight.shape[-1]:
-            fix = "Append DoubleToFloat() to the env, or change the network by network.to(dtype)."
+            fix = f"Append DTypeCastTransform({x.dtype}, {weight.dtype}, in_keys=...) to the env."
         raise ValueError(
             f"A network for {weight.shape[-1]} features of {weight.dtype} was given "
             f"{x.shape[-1]} of {x.dtype}, the entries of its in_keys side by side. {fix}"
         )
+    return x if x.dtype == weight.dtype else x.to(weight.dtype)
 
 
-def check_skill(skill: Tensor, features: Tensor) -> None:
-    """Raises ValueError unless skills are int64 ``[*B]`` for features ``[*B, f]``."""
+def check_skill(skill: Tensor, features: Tensor, size: int | None) -> None:
+    """Raises ValueError unless skills fit features ``[*B, f]``: int64 ``[*B]``, or vectors."""
+    if size is not None:
+        right = (*features.shape[:-1], size)
+        if skill.shape != right or not skill.is_floating_point():
+            raise ValueError(
+                f"Skills must be vectors, floats {list(right)} for features "
+                f"{list(features.shape)}; got {skill.dtype} {list(skill.shape)}. Give the "
+                f"SkillTransform their spec, or the OptionTransform skills=, a table of vectors."
+            )
+        return
     if skill.dtype not in (torch.int64, torch.int32) or skill.shape != features.shape[:-1]:
         raise ValueError(
             f"Skills must be indices, int64 {list(features.shape[:-1])} for features "

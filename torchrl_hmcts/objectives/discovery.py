@@ -14,8 +14,9 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.nn.utils.parametrize import is_parametrized
 
-from torchrl_hmcts.checks import real_number
+from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.modules.objective_networks import SpectralLinear
+from torchrl_hmcts.modules.skill_spec import draw_vectors, needs_number
 from torchrl_hmcts.objectives.loss import output_of, run_module
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
 
@@ -65,6 +66,7 @@ class SkillDiscriminatorLoss(SkillObjective):
 
     def __init__(self, discriminator: TensorDictModuleBase, **settings: Any) -> None:
         super().__init__(discriminator=discriminator, **settings)
+        needs_number("SkillDiscriminatorLoss", self.skill_spec)
 
     @property
     def next_features(self) -> list[NestedKey]:  # type: ignore[override]
@@ -75,7 +77,7 @@ class SkillDiscriminatorLoss(SkillObjective):
         """Returns the logits ``[*B, Z]`` of q(z | s') for transitions ``[*B]``."""
         module, params = self.discriminator, self.discriminator_params
         logits = output_of(module, params, tensordict.get("next"), self.tensor_keys.skill_logits)
-        off = self.inactive()
+        off = self.inactive(logits.device)
         return logits if off is None else logits.masked_fill(off, -torch.inf)
 
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
@@ -119,6 +121,8 @@ class EncoderObjective(SkillObjective):
     def skill_vectors(self) -> Tensor:
         r"""Returns the zero-centred vector of each skill under the prior of now, ``[Z, Z]``.
 
+        Skills that are vectors have no other.
+
         .. math:: \bar e_z = \frac{e_z - p}{1 - \sum_i p_i^2}
 
         with :math:`e_z` the one-hot skill and :math:`p` the prior. For a uniform prior over n
@@ -128,7 +132,7 @@ class EncoderObjective(SkillObjective):
         p = self.prior.probs().detach()
         spread = 1.0 - p.square().sum()
         # A single skill has nothing to differ from: its vector, and so its reward, is zero.
-        return (torch.eye(self.num_skills).to(p) - p) / spread.clamp_min(1e-6)
+        return (torch.eye(len(p)).to(p) - p) / spread.clamp_min(1e-6)
 
     def _step(self, tensordict: TensorDictBase) -> Tensor:
         """Returns phi(s') - phi(s), ``[*B, Z]``, for transitions ``[*B]``."""
@@ -142,6 +146,8 @@ class EncoderObjective(SkillObjective):
     def _travel(self, step: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Returns the part of steps ``[*B, Z]`` that is along the vector of the skill, ``[*B]``."""
         skill = self.skill(tensordict)
+        if self.num_skills is None:
+            return (step * skill).sum(-1)
         return self._of_active((step * self.skill_vectors().to(step)[skill]).sum(-1), skill)
 
     @torch.no_grad()
@@ -159,11 +165,12 @@ class METRAEncoderLoss(EncoderObjective):
         L(\lambda) &= \log \lambda \cdot \min(\epsilon, 1 - \|\phi(s') - \phi(s)\|^2), \qquad
         r = (\phi(s') - \phi(s))^\top \bar e_z
 
-    with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`). The
-    distance in latent space is thus the number of steps between two states, and skills are the
-    directions in which one can get furthest from elsewhere. :math:`\lambda` is held fixed in the
-    first loss and the encoder in the second; :math:`\log \lambda` is the parameter, so that
-    :math:`\lambda` stays positive, and its gradient does not depend on :math:`\lambda`.
+    with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`), or
+    the skill itself if it is a vector, as the authors' on the :class:`UnitSphere` are. The distance
+    in latent space is thus the number of steps between two states, and skills are the directions in
+    which one can get furthest from elsewhere. :math:`\lambda` is held fixed in the first loss and
+    the encoder in the second; :math:`\log \lambda` is the parameter, so that :math:`\lambda` stays
+    positive, and its gradient does not depend on :math:`\lambda`.
 
     Args:
         encoder (TensorDictModuleBase): reads its ``in_keys`` and writes ``representation``
@@ -234,9 +241,10 @@ class LSDEncoderLoss(EncoderObjective):
         L(\phi) = -r, \qquad r = (\phi(s') - \phi(s))^\top \bar e_z, \qquad
         \|\phi(x) - \phi(y)\| \le \|x - y\|
 
-    with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`).
-    Spectral normalisation keeps the encoder 1-Lipschitz, so only moving far in the units of what it
-    reads gives a large reward; scale it by the ``intrinsic_coeff`` of
+    with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`), or
+    the skill itself if it is a vector, as the authors' from a normal distribution are. Spectral
+    normalisation keeps the encoder 1-Lipschitz, so only moving far in the units of what it reads
+    gives a large reward; scale it by the ``intrinsic_coeff`` of
     :class:`~torchrl_hmcts.transforms.SkillReward`.
 
     Args:
@@ -295,7 +303,9 @@ class SkillDynamicsLoss(SkillObjective):
 
     with the skill dynamics :math:`q` a Gaussian of the change :math:`s' - s`. Where the paper draws
     skills from the prior for the second term, this sums over all of them, which for discrete skills
-    is exact. The reward is at most :math:`-\log p(z)`, as DIAYN's.
+    is exact. The reward is at most :math:`-\log p(z)`, as DIAYN's. Skills that are vectors are
+    drawn as in the paper, ``prior_samples`` of them, and averaged together with the skill itself,
+    as in the authors' code: the reward is at most the logarithm of their number.
 
     Args:
         dynamics (TensorDictModuleBase): reads its ``in_keys`` of a state and writes ``skill_loc``
@@ -303,6 +313,8 @@ class SkillDynamicsLoss(SkillObjective):
             its attribute ``target_key`` under each skill; e.g. a
             :class:`~torchrl_hmcts.modules.SkillDynamics`.
         num_skills, prior, reduction: as in :class:`SkillObjective`.
+        prior_samples (int): vectors drawn at each call, for skills that are vectors. Default 64;
+            the authors take up to 500.
 
     Returns:
         TensorDict with ``loss_dynamics`` (nats) and the detached ``dynamics_accuracy`` (fraction
@@ -337,24 +349,61 @@ class SkillDynamicsLoss(SkillObjective):
     dynamics_params: TensorDictParams
     target_dynamics_params: TensorDictParams
 
-    def __init__(self, dynamics: TensorDictModuleBase, **settings: Any) -> None:
+    def __init__(
+        self, dynamics: TensorDictModuleBase, *, prior_samples: int = 64, **settings: Any
+    ) -> None:
         super().__init__(dynamics=dynamics, **settings)
+        self.prior_samples = whole_number(
+            "SkillDynamicsLoss", "prior_samples", prior_samples, least=1
+        )
         self.next_features = [dynamics.target_key]
-        self.root_features = list(dict.fromkeys([*dynamics.in_keys, *self.next_features]))
+        read = list(dynamics.in_keys)
+        if self.num_skills is None:
+            self._skill_key = read.pop()
+        self.root_features = list(dict.fromkeys([*read, *self.next_features]))
 
     def log_densities(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns log q(s' | s, z) for every skill z, ``[*B, Z]``, for transitions ``[*B]``."""
+        """Returns log q(s' | s, z) for every skill z, ``[*B, Z]``, for transitions ``[*B]``.
+
+        Of vectors for the transition's own, which comes first, and for the drawn ones.
+        """
+        if self.num_skills is not None:
+            return self._log_density(tensordict)
+        own, batch = self.skill(tensordict), tensordict.batch_size
+        drawn = draw_vectors(self.skill_spec, (self.prior_samples,)).to(own)
+        drawn = drawn.view(-1, *[1] * len(batch), drawn.shape[-1]).expand(-1, *batch, -1)
+        others = tensordict.expand(self.prior_samples, *batch).copy().set(self._skill_key, drawn)
+        with torch.no_grad():
+            density = self._log_density(others).movedim(0, -1)
+        own_density = self._log_density(tensordict.copy().set(self._skill_key, own))
+        return torch.cat((own_density.unsqueeze(-1), density), -1)
+
+    def _log_density(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns log q of what the dynamics write, ``[*B, Z]``, or ``[*B]`` of vectors."""
         root = run_module(self.dynamics, self.dynamics_params, tensordict)
         loc = root.get(self.tensor_keys.skill_loc)
         scale = root.get(self.tensor_keys.skill_scale)
         key = self.dynamics.target_key
-        change = tensordict.get("next").get(key) - tensordict.get(key)
-        error = (change.unsqueeze(-2) - loc) / scale
+        change = (tensordict.get("next").get(key) - tensordict.get(key)).to(loc.dtype)
+        if change.shape[-1] != loc.shape[-1]:
+            raise ValueError(
+                f"SkillDynamicsLoss has dynamics of {loc.shape[-1]} numbers, but {key!r} has "
+                f"{change.shape[-1]}. Build them with target_features={change.shape[-1]}."
+            )
+        if self.num_skills is not None:
+            change = change.unsqueeze(-2)
+        error = (change - loc) / scale
         constant = 0.5 * math.log(2.0 * math.pi)
         return -(0.5 * error.square() + scale.log() + constant).sum(-1)
 
     def losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         density = self.log_densities(tensordict)
+        if self.num_skills is None:
+            likeliest = density[..., 0] >= density[..., 1:].amax(-1)
+            return {
+                "loss_dynamics": self._reduce(-density[..., 0], tensordict),
+                "dynamics_accuracy": self._average(likeliest.to(density.dtype)),
+            }
         skill = self.skill(tensordict)
         loss = -density.gather(-1, skill.unsqueeze(-1)).squeeze(-1)
         guess = (density.detach() + self.log_prior(density)).argmax(-1)
@@ -366,6 +415,9 @@ class SkillDynamicsLoss(SkillObjective):
     @torch.no_grad()
     def reward(self, tensordict: TensorDictBase) -> Tensor:
         density = self.log_densities(tensordict)
+        if self.num_skills is None:
+            evidence = density.logsumexp(-1, keepdim=True) - math.log(density.shape[-1])
+            return density[..., :1] - evidence
         skill = self.skill(tensordict).unsqueeze(-1)
         evidence = (density + self.log_prior(density)).logsumexp(-1, keepdim=True)
         return self._of_active(density.gather(-1, skill) - evidence, skill)

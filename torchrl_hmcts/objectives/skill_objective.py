@@ -12,9 +12,18 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
+from torchrl.data import TensorSpec
 
 from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
+from torchrl_hmcts.modules.skill_spec import (
+    Skills,
+    as_skill_spec,
+    described,
+    no_prior,
+    number_of,
+    same_skills,
+)
 from torchrl_hmcts.objectives.loss import Loss
 
 _EMPTY = "_empty_state"  # bool [*B]
@@ -34,9 +43,10 @@ class SkillObjective(Loss):
     ``out_keys``. Gradients of the losses stay within the objective's own parameters.
 
     Args:
-        num_skills (int, optional): number of skills ``Z``. Default ``None``: what the network says.
+        num_skills (int or TensorSpec, optional): number of skills ``Z``, or the spec of one skill
+            that is a vector ``[D]``. Default ``None``: what the network says.
         prior (SkillPrior, sequence of float or Tensor, optional): p(z), ``[Z]``, normalised; 0
-            switches a skill off. Default ``None``: uniform. A
+            switches a skill off. Default ``None``: uniform; vectors have that of their spec. A
             :class:`~torchrl_hmcts.modules.SkillPrior` is read at every use and stays its owner's.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
         **network (TensorDictModuleBase): what is trained, under the name of its attribute.
@@ -52,9 +62,9 @@ class SkillObjective(Loss):
     A terminal state may hold anything; where the entries that are read of one are not finite, its
     transition teaches nothing and is worth 0. So does one of a skill that the prior switches off.
 
-    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, default ``"skill"``), ``terminated`` (read under
-    ``"next"`` if it is there, default ``"terminated"``), ``priority_weight`` (default
-    ``"priority_weight"``).
+    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, or float ``[*B, D]``, default ``"skill"``),
+    ``terminated`` (read under ``"next"`` if it is there, default ``"terminated"``),
+    ``priority_weight`` (default ``"priority_weight"``).
 
     Reference:
         This project's: the common form of DIAYN, DADS, METRA and LSD.
@@ -91,11 +101,11 @@ class SkillObjective(Loss):
     #: Entries that are read of the state after a transition, without ``"next"``.
     next_features: Sequence[NestedKey]
 
-    prior: SkillPrior
+    prior: SkillPrior  # of a number of skills
 
     def __init__(
         self,
-        num_skills: int | None = None,
+        num_skills: Skills | None = None,
         *,
         prior: SkillPrior | Sequence[float] | Tensor | None = None,
         reduction: str = "mean",
@@ -103,12 +113,17 @@ class SkillObjective(Loss):
     ) -> None:
         super().__init__(reduction)
         owner = type(self).__name__
-        self.num_skills = _known_num_skills(owner, num_skills, *network.values())
-        # Past nn.Module.__setattr__: a prior is saved and trained by its owner.
-        self.__dict__["prior"] = as_skill_prior(owner, prior, self.num_skills)
-        # A fixed prior that switches nothing off costs nothing below.
-        fixed = not isinstance(prior, SkillPrior)
-        self._always_all_active = fixed and bool(self.prior.active().all())
+        self.skill_spec = _known_skills(owner, num_skills, *network.values())
+        self.num_skills = number_of(self.skill_spec)
+        self._always_all_active = True
+        if self.num_skills is not None:
+            # Past nn.Module.__setattr__: a prior is saved and trained by its owner.
+            self.__dict__["prior"] = as_skill_prior(owner, prior, self.num_skills)
+            # A fixed prior that switches nothing off costs nothing below.
+            fixed = not isinstance(prior, SkillPrior)
+            self._always_all_active = fixed and bool(self.prior.active().all())
+        elif prior is not None:
+            raise ValueError(no_prior(owner, self.skill_spec))
         for name, module in network.items():
             self.convert_to_functional(module, name, create_target_params=False)
 
@@ -116,9 +131,9 @@ class SkillObjective(Loss):
         """Returns log p(z) as it is now, ``[Z]``, detached, of the type and device of ``like``."""
         return self.prior.log_probs().detach().to(like)
 
-    def inactive(self) -> Tensor | None:
+    def inactive(self, device: torch.device | None = None) -> Tensor | None:
         """Returns which skills are switched off, bool ``[Z]``; None if all are on for good."""
-        return None if self._always_all_active else ~self.prior.active()
+        return None if self._always_all_active else ~self.prior.active().to(device)
 
     @abstractmethod
     def reward(self, tensordict: TensorDictBase) -> Tensor:
@@ -126,7 +141,7 @@ class SkillObjective(Loss):
         raise NotImplementedError
 
     def skill(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the skill of each transition, int64 ``[*B]``."""
+        """Returns the skill of each transition, int64 ``[*B]``, or float ``[*B, D]``."""
         return entries(self, tensordict, [self.tensor_keys.skill])[0]
 
     def without_empty_states(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -156,7 +171,7 @@ class SkillObjective(Loss):
 
     def _of_active(self, value: Tensor, skill: Tensor) -> Tensor:
         """Returns values, and 0 where the skill, of the same shape, is switched off."""
-        off = self.inactive()
+        off = self.inactive(skill.device)
         return value if off is None else value.masked_fill(off[skill], 0.0)
 
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
@@ -169,23 +184,29 @@ class SkillObjective(Loss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.num_skills is None:  # called with tensors, all may be of one shape
+            batch_size = self.skill(tensordict).shape[:-1]
+            if tensordict.batch_size != batch_size:
+                tensordict = tensordict.copy()
+                tensordict.batch_size = batch_size
         losses = self.losses(self.without_empty_states(tensordict))
         return self._output(tensordict, losses)
 
 
-def _known_num_skills(
-    owner: str, num_skills: int | None, network: TensorDictModuleBase | None = None
-) -> int:
-    """Returns the number of skills that a network distinguishes, or the given one."""
-    known: Any = getattr(network, "num_skills", None)
-    if known is None and num_skills is None:
+def _known_skills(
+    owner: str, skills: Skills | None, network: TensorDictModuleBase | None = None
+) -> TensorSpec:
+    """Returns the spec of the skills that a network distinguishes, or that of the given ones."""
+    known: Any = getattr(network, "skill_spec", getattr(network, "num_skills", None))
+    if known is None and skills is None:
         raise ValueError(
             f"{owner} cannot tell how many skills {type(network).__name__} distinguishes, since it "
             "has no attribute num_skills. Pass num_skills=."
         )
-    if None not in (known, num_skills) and known != num_skills:
+    spec = as_skill_spec(owner, known if skills is None else skills)
+    if None not in (known, skills) and not same_skills(as_skill_spec(owner, known), spec):
         raise ValueError(
-            f"{owner} was told of num_skills={num_skills}, but its {type(network).__name__} "
-            f"distinguishes {known}. Give both the same."
+            f"{owner} was told of {described(spec)}, but its {type(network).__name__} "
+            f"distinguishes {described(as_skill_spec(owner, known))}. Give both the same."
         )
-    return int(known) if num_skills is None else num_skills
+    return spec

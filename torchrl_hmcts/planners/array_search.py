@@ -18,6 +18,7 @@ from torchrl_hmcts.planners.outcomes import Outcomes, RootStates
 from torchrl_hmcts.planners.root_options import halve
 from torchrl_hmcts.planners.search import Search
 from torchrl_hmcts.planners.settings import SearchSettings
+from torchrl_hmcts.planners.structured_states import as_rows
 from torchrl_hmcts.planners.tree import LARGEST, MOST_NODES
 from torchrl_hmcts.planners.tree_policies import PUCT, CompiledPolicy, TreePolicy
 
@@ -39,7 +40,9 @@ class Root(NamedTuple):
         prior (Array): ``[B, A]`` float32, probabilities of options; those of the options that may
             be taken are scaled to sum to 1.
         value (Array): ``[B]`` float32.
-        embedding (Array): ``[B, ...]`` what the transition function needs of a state, any dtype.
+        embedding (Array): ``[B, ...]`` what the transition function needs of a state, any dtype. Or
+            a mapping or tuple of such arrays, nested in any way, a TensorDict included; or a list
+            of B states of any kind, which the search keeps and nobody may change.
 
     Example:
         >>> import numpy as np
@@ -51,7 +54,7 @@ class Root(NamedTuple):
 
     prior: Array
     value: Array
-    embedding: Array
+    embedding: Any
 
 
 class Transition(NamedTuple):
@@ -63,7 +66,8 @@ class Transition(NamedTuple):
         prior (Array): ``[m, A]`` float32, probabilities of options in the next state, scaled to
             sum to 1.
         value (Array): ``[m]`` float32, of the next state.
-        embedding (Array): ``[m, ...]`` of the next state, shape and dtype of the roots'.
+        embedding (Array): ``[m, ...]`` of the next state, shape and dtype of the roots', in the
+            same structure; a list of m states for one of roots.
 
     Example:
         >>> import numpy as np
@@ -79,7 +83,7 @@ class Transition(NamedTuple):
     discount: Array
     prior: Array
     value: Array
-    embedding: Array
+    embedding: Any
 
 
 TransitionFunction = Callable[[Any, Any], Transition]
@@ -107,7 +111,7 @@ def tree_search(
 
     Args:
         root: states to search from. NumPy arrays or CPU tensors; the transition function is called
-            with the kind the embedding has.
+            with the kind the embedding has, that of the prior for a list of states.
         transition: ``transition(embedding [m, ...], option [m] int64) -> Transition`` of
             contiguous float32 arrays. The arrays it is given are copies, reused by the next call.
         num_simulations: per root.
@@ -151,6 +155,8 @@ def tree_search(
         leaves_per_wave=leaves_per_wave,
         exhausted=exhausted,
     )
+    embedding, of_rows = as_rows(root.embedding, isinstance(root.prior, Tensor))
+    root, transition = root._replace(embedding=embedding), of_rows(transition)
     prior, value = _check_root(root)
     num_roots, num_options = prior.shape
     num_simulations = whole_number("tree_search", "num_simulations", num_simulations, least=1)
@@ -365,7 +371,7 @@ def _check_root(root: Root) -> tuple[np.ndarray, np.ndarray]:
     if root.embedding.dtype in (torch.bfloat16, np.dtype(object)):
         raise TypeError(
             f"The roots' embedding must be rows of numbers that NumPy has; got "
-            f"{root.embedding.dtype}. Pass float32, or indices into a list of your own."
+            f"{root.embedding.dtype}. Pass float32, or a list of states."
         )
     for name, array in (("prior", prior), ("value", value)):
         _check_range(f"The roots' {name} holds {{number}}, which is no {name}", name, array)

@@ -132,11 +132,11 @@ class Simulator:
 
     def step(self, states: TensorDictBase, options: np.ndarray) -> TensorDictBase:
         """Take option ``options[i]`` in state ``i``; return what the env writes as next."""
-        self._choose(states, options)
+        option = self._choose(states, options)
         if self.stateless:
             after = step_states(self.env, states)
         else:
-            after = self._turns.step(states, torch.from_numpy(options))
+            after = self._turns.step(states, option)
         return self._completed(states, after)
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
@@ -159,11 +159,13 @@ class Simulator:
         if self.works_beside:
             self.env.step_abandon(sent[1])
 
-    def _choose(self, states: TensorDictBase, options: np.ndarray) -> None:
+    def _choose(self, states: TensorDictBase, options: np.ndarray) -> Tensor:
+        """Write the options ``[m]``, encoded, into the states; return them, on the env's device."""
         option = torch.from_numpy(options)
         if self.env.device is not None and self.env.device.type != "cpu":
             option = option.to(self.env.device)
         put(states, self.option_key, self.encode(option))
+        return option
 
     def _completed(self, states: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
         if any(_entry(after, key) is None for key in self._done_keys):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from torchrl_hmcts.checks import instance, nested_key, real_number
+from torchrl_hmcts.modules.skill_spec import require_known
 from torchrl_hmcts.objectives.skill_objective import SkillObjective
 
 
@@ -28,13 +30,15 @@ class SkillReward(Transform):
         intrinsic_coeff (float): :math:`c_i`. Default ``1.0``.
         extrinsic_coeff (float): :math:`c_e`. Default ``0.0``: the env's reward is replaced.
         reward_key (NestedKey): reward to write, ``[*B, 1]``, under ``"next"``. Default
-            ``"reward"``.
+            ``"reward"``. An env gets a reward of another name beside its own.
 
     Returns:
         The transitions with ``("next", reward_key)`` set to ``r`` ``[*B, 1]``, detached.
 
     Raises:
         TypeError: if the objective is no :class:`SkillObjective`.
+        ValueError: on an env that draws other skills than the objective distinguishes, or has no
+            reward of this name to mix in.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, for replacing the
@@ -102,6 +106,18 @@ class SkillReward(Transform):
         return self._score(tensordict, next_tensordict)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        old = reward_spec[self.reward_key]
-        reward_spec[self.reward_key] = Unbounded(old.shape, dtype=old.dtype, device=old.device)
+        shown = self.parent.full_observation_spec
+        if (skill := self.objective.tensor_keys.skill) in shown.keys(True, True):
+            require_known("SkillReward", self.objective, self.objective.skill_spec, shown[skill])
+        shape, dtype, device = (*reward_spec.shape, 1), torch.float32, reward_spec.device
+        if self.reward_key in reward_spec.keys(True, True):
+            old = reward_spec[self.reward_key]
+            shape, dtype, device = old.shape, old.dtype, old.device
+        elif self.extrinsic_coeff != 0.0:
+            raise ValueError(
+                f"SkillReward mixes in the env's reward {self.reward_key!r} (extrinsic_coeff="
+                f"{self.extrinsic_coeff}), but the env has {self.parent.reward_keys}. Name one of "
+                f"them by reward_key, or pass extrinsic_coeff=0."
+            )
+        reward_spec[self.reward_key] = Unbounded(shape, dtype=dtype, device=device)
         return reward_spec

@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase, Transform
 from torchrl_hmcts.checks import instance, nested_key, one_of, real_number, whole_number
 from torchrl_hmcts.nesting import parts
 from torchrl_hmcts.transforms.env_transform import zero_count
-from torchrl_hmcts.transforms.option_checks import HasOptions, Termination
+from torchrl_hmcts.transforms.option_checks import HasOptions, Termination, check_skill_table
 from torchrl_hmcts.transforms.option_rollout import OptionRollout
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
@@ -52,7 +52,8 @@ class OptionTransform(HasOptions):
     Append it last of the transforms that must see base steps, each of which they see once; what is
     appended after it sees macro-steps. The worker is not registered as a sub-module: its owner
     moves, trains and saves it. What a recurrent worker writes under ``"next"`` is its memory; it is
-    carried from base step to base step.
+    carried from base step to base step. TorchRL's ``LowLevelController`` is such a worker: append
+    its ``make_tensordict_primer()`` before this transform, and name its decision ``skill_key``.
 
     With a group of agents and ``option_key=("agents", "option")`` each agent has an option. Their
     options begin and end together: at the termination, after ``max_steps`` or as soon as any
@@ -72,8 +73,8 @@ class OptionTransform(HasOptions):
         option_key (NestedKey): the macro action, int64 ``[*B]`` (one-hot bool ``[*B, num_options]``
             with ``one_hot=True``); ``[*B, n]`` in a group of n agents. With ``"action"`` every
             TorchRL actor, loss and trainer fits without ``set_keys``. Default ``"option"``.
-        skill_key (NestedKey): the entry by which the worker is told the option, int64 ``[*B]``.
-            Default ``"skill"``.
+        skill_key (NestedKey): the entry by which the worker is told the option, int64 ``[*B]``, or
+            a vector of ``skills``, ``[*B, D]``. Default ``"skill"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
         one_hot (bool): options are one-hot instead of categorical. Default ``False``.
         trajectory_keys (sequence of NestedKey, optional): base transitions to hand out, e.g. to
@@ -86,9 +87,12 @@ class OptionTransform(HasOptions):
             ``OptionTransform``, else ``duration_key`` or ``"duration"``, if the env has it; without
             one each step is a base step.
         worker_memory (str): ``"reset"`` (default), so that a recurrent worker begins each option
-            with zeros and the state of the macro env is that of the env alone, or ``"keep"``, so
-            that it begins where the option before ended; the env must then hand its memory on, by
-            a ``TensorDictPrimer`` before this transform.
+            with what its primer says, zeros without one, and the state of the macro env is that of
+            the env alone, or ``"keep"``, so that it begins where the option before ended; the env
+            must then hand its memory on, by a ``TensorDictPrimer`` before this transform.
+        skills (Tensor, optional): ``[num_options, D]``, the vector that the worker is told for each
+            option, e.g. of :func:`~torchrl_hmcts.modules.spread_skills`. Default: the option's
+            number.
 
     Raises:
         ValueError: if a number is out of range; when attached to an env: if the worker reads an
@@ -130,6 +134,7 @@ class OptionTransform(HasOptions):
         trajectory_keys: Sequence[NestedKey] | None = None,
         base_duration_key: NestedKey | None = None,
         worker_memory: Literal["reset", "keep"] = "reset",
+        skills: Tensor | None = None,
     ) -> None:
         for name, part in (("worker", worker), ("termination", termination)):
             if not callable(part) and (part is not None or name == "worker"):
@@ -156,6 +161,7 @@ class OptionTransform(HasOptions):
         self.worker_memory = one_of(
             "OptionTransform", "worker_memory", worker_memory, ("reset", "keep")
         )
+        self.register_buffer("skills", check_skill_table(skills, self.num_options))
         self.trajectory = None
         if trajectory_keys is not None:
             instance("OptionTransform", "trajectory_keys", trajectory_keys, list, tuple)
@@ -177,7 +183,8 @@ class OptionTransform(HasOptions):
         private = [key for key in tensordict.keys() if str(key).startswith(_ROOT)]
         inner = rollout.masks.show(tensordict).exclude("_step", "next", *private)
         inner = inner.copy()  # groups too: a transform below may rename what is in them
-        inner.set(self.skill_key, self._skill(option, rollout.option_shape, tensordict.batch_size))
+        option = self._index(option, rollout.option_shape, tensordict.batch_size)
+        inner.set(self.skill_key, self.told(option))
         if self.worker_memory == "reset":
             rollout.begin_memory(inner)
         with torch.no_grad():
@@ -232,8 +239,8 @@ class OptionTransform(HasOptions):
             tensordict_reset.set(OptionTrajectory.KEY, empty.data)
         return tensordict_reset
 
-    def _skill(self, option: Tensor, shape: torch.Size, batch_size: torch.Size) -> Tensor:
-        """Return the option as the worker is told it, if there is such an option."""
+    def _index(self, option: Tensor, shape: torch.Size, batch_size: torch.Size) -> Tensor:
+        """Return the number of an option, int64, if there is such an option."""
         shape = batch_size + shape[len(self.parent.batch_size) :]
         if self.one_hot:
             shape = torch.Size((*shape, self.num_options))

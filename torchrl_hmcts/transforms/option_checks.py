@@ -11,11 +11,13 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs import (
     AutoResetTransform,
     Compose,
     EnvBase,
     FrameSkipTransform,
+    TensorDictPrimer,
     TransformedEnv,
     VecGymEnvTransform,
 )
@@ -50,6 +52,25 @@ class HasOptions(EnvTransform):
     skill_key: NestedKey
     duration_key: NestedKey
     base_duration_key: NestedKey | None
+    skills: Tensor | None
+
+    def told(self, option: Tensor) -> Tensor:
+        """Return what the worker is told of options, int64 ``[*B]``: themselves or vectors."""
+        return option if self.skills is None else self.skills.to(option.device)[option]
+
+
+def check_skill_table(skills: Tensor | None, num_options: int) -> Tensor | None:
+    """Return a copy of a table of skills, if it has a vector for each option."""
+    if skills is None:
+        return None
+    good = isinstance(skills, Tensor) and skills.ndim == 2 and skills.is_floating_point()
+    if not good or len(skills) != num_options or not skills.isfinite().all():
+        got = f"{skills.dtype} {list(skills.shape)}" if isinstance(skills, Tensor) else skills
+        raise ValueError(
+            f"OptionTransform needs for skills a table of finite floats, a vector for each of the "
+            f"{num_options} options: [{num_options}, D]; got {got!r}."
+        )
+    return skills.detach().clone()
 
 
 def transforms_before(transform: Transform) -> list[Transform]:
@@ -182,8 +203,8 @@ class Trial(NamedTuple):
     """Entries of a root after the worker has acted."""
     writes: list[NestedKey]
     """What it wrote into the root."""
-    memory: dict[NestedKey, tuple[torch.Size, torch.dtype]]
-    """Shapes and types of what it wrote under ``"next"``: a recurrent worker's memory."""
+    memory: dict[NestedKey, Tensor]
+    """The memory of a recurrent worker, written under ``"next"``: its beginning, of one element."""
     unannounced: list[NestedKey]
     """What of its memory the env does not announce."""
 
@@ -196,7 +217,8 @@ def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
     skill = torch.zeros(
         group_shape(env, transform.option_key), dtype=torch.int64, device=env.device
     )
-    td.set(transform.skill_key, skill)
+    td.set(transform.skill_key, transform.told(skill))
+    _check_skills(name, transform)
     known = getattr(worker, "num_skills", None)
     if isinstance(known, int) and known < transform.num_options:
         raise ValueError(
@@ -210,13 +232,16 @@ def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
             raise ValueError(
                 f"{name} reads {key!r}, which {base} does not have: it has "
                 f"{sorted(map(str, td.keys(True, True)))}. Change the worker's in_keys, or add a "
-                f"transform that writes {key!r} before OptionTransform."
+                f"transform that writes {key!r} before OptionTransform; if it is the option, pass "
+                f"skill_key={key!r}."
             )
     before = {key: id(value) for key, value in td.items(True, True)}
     with torch.no_grad(), torch.random.fork_rng(devices=[]):  # the check draws no numbers
         try:
             worker(td)
-        except KeyError as error:
+        except (KeyError, AttributeError) as error:
+            if isinstance(error, AttributeError) and not hasattr(worker, "make_tensordict_primer"):
+                raise
             raise ValueError(
                 f"{name} reads an entry that {base} does not have: {error}. If it is the worker's "
                 "memory, append its make_tensordict_primer() before OptionTransform."
@@ -239,6 +264,27 @@ def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
     return Trial(td, writes, memory, lost)
 
 
+def _check_skills(name: str, transform: HasOptions) -> None:
+    """Refuse a worker that is told numbers and knows vectors, or the other way round."""
+    spec, table = getattr(transform.worker, "skill_spec", None), transform.skills
+    decisions = getattr(transform.worker, "decision_spec", None)  # of TorchRL's LowLevelController
+    if isinstance(decisions, Composite):
+        spec = decisions.get(parts(transform.skill_key)[-1], None)
+    if not isinstance(spec, TensorSpec) or spec.shape == (() if table is None else table.shape[1:]):
+        return
+    told = "their numbers" if table is None else f"vectors of {table.shape[-1]} numbers"
+    known = "numbers" if not spec.ndim else f"vectors of {spec.shape[-1]} numbers"
+    raise ValueError(
+        f"{name} knows skills as {known} and is told options by {told}. Pass OptionTransform "
+        + (
+            f"skills=, a table [{transform.num_options}, {spec.shape[-1]}], e.g. "
+            f"spread_skills(spec, {transform.num_options})."
+            if spec.ndim
+            else "no skills=, so that it tells the options' numbers."
+        )
+    )
+
+
 def _check_actions(name: str, env: EnvBase, td: TensorDictBase) -> None:
     for key in env.action_keys:
         action, spec = td.get(key, None), env.full_action_spec[key]
@@ -255,17 +301,26 @@ def _check_actions(name: str, env: EnvBase, td: TensorDictBase) -> None:
             )
 
 
-def _find_memory(
-    env: EnvBase, td: TensorDictBase
-) -> dict[NestedKey, tuple[torch.Size, torch.dtype]]:
-    """Return what the worker wrote under "next", and see that the root has it from the start."""
+def _find_memory(env: EnvBase, td: TensorDictBase) -> dict[NestedKey, Tensor]:
+    """Return with what the memory that the worker wrote under "next" begins; the root has it.
+
+    That is what the env's primers write at a reset, or zeros.
+    """
     kept, ndim = td.get("next", None), len(env.batch_size)
     below = set(map(unravel_key, innermost(env).full_observation_spec.keys(True, True)))
+    wrote = {} if kept is None else {unravel_key(k): v for k, v in kept.items(True, True)}
+    wrote = {key: value for key, value in wrote.items() if key not in below}
+    fresh = env.fake_tensordict().exclude("next", *wrote) if wrote else td
+    primers = flat_transforms(env) if wrote and isinstance(env, TransformedEnv) else []
+    with torch.random.fork_rng(devices=[]):
+        for primer in primers:
+            if isinstance(primer, TensorDictPrimer) and not primer.random:
+                fresh = primer._reset(fresh, fresh)
     memory = {}
-    for key, value in () if kept is None else kept.items(True, True):
-        if unravel_key(key) not in below:
-            memory[unravel_key(key)] = (value.shape[ndim:], value.dtype)
-    for key, (event, dtype) in memory.items():
+    for key, value in wrote.items():
+        begins = fresh.get(key, None)
+        begins = torch.zeros_like(value) if begins is None else begins
+        memory[key] = begins.reshape(-1, *value.shape[ndim:])[0].clone()
         if td.get(key, None) is None:
-            td.set(key, torch.zeros((*env.batch_size, *event), dtype=dtype))
+            td.set(key, begins)
     return memory

@@ -91,10 +91,10 @@ class OptionRollout:
         return min(self._options.max_steps * most, torch.iinfo(torch.int64).max)
 
     def begin_memory(self, root: TensorDictBase) -> None:
-        """Write the zeros with which a recurrent worker begins."""
-        for key, (event, dtype) in self.memory.items():
-            shape = (*root.batch_size, *event)
-            root.set(key, torch.zeros(shape, dtype=dtype, device=root.device))
+        """Write that with which a recurrent worker begins."""
+        for key, first in self.memory.items():
+            first = first if root.device is None else first.to(root.device)
+            root.set(key, first.expand((*root.batch_size, *first.shape)).clone())
 
     def act(self, root: TensorDictBase) -> None:
         """Let the worker write its action; a plain network is called on its tensors."""
@@ -141,7 +141,7 @@ class OptionRollout:
                 self._planning._env = with_constant_specs(self._env)
         planning = self._planning
         root = planning.masks.show(set_states(planning._env, state).update(state))
-        root.set(self._options.skill_key, option)
+        root.set(self._options.skill_key, self._options.told(option))
         planning.act(root)
         return planning._run_alone(root, planning._step(root))
 

@@ -8,10 +8,17 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite
+from torchrl.data import Bounded, Composite
 
 from torchrl_hmcts.checks import nested_key, whole_number
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
+from torchrl_hmcts.modules.skill_spec import (
+    Skills,
+    as_skill_spec,
+    draw_vectors,
+    no_prior,
+    number_of,
+)
 from torchrl_hmcts.nesting import given
 from torchrl_hmcts.transforms.env_transform import EnvTransform, count_spec, zero_count
 
@@ -21,10 +28,11 @@ class SkillTransform(EnvTransform):
 
     .. math:: z \sim p(z) \quad \text{at reset and whenever } k \text{ steps were taken with it}
 
-    Writes two entries: the skill, int64 ``[*B]``, and ``skill_step``, int64 ``[*B, 1]``, the base
-    steps taken with it so far. Each batch element has its own mini-episodes. On the last transition
-    of one, ``("next", "skill")`` is still the old skill, so that values are bootstrapped with the
-    skill that acted; the next root holds the new one. Episodes continue: nothing is done.
+    Writes two entries: the skill, int64 ``[*B]``, or a vector ``[*B, D]``, and ``skill_step``,
+    int64 ``[*B, 1]``, the base steps taken with it so far. Each batch element has its own
+    mini-episodes. On the last transition of one, ``("next", "skill")`` is still the old skill, so
+    that values are bootstrapped with the skill that acted; the next root holds the new one.
+    Episodes continue: nothing is done.
 
     A reset draws new skills where it resets. To choose the skill, reset with it: a reset
     tensordict that holds a skill and no ``"_reset"`` mask keeps its skill (and ``skill_step``).
@@ -35,16 +43,19 @@ class SkillTransform(EnvTransform):
     ``SerialEnv`` and ``ParallelEnv``.
 
     Args:
-        num_skills (int): number of skills ``Z``.
+        num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one skill that is a
+            vector: a :class:`~torchrl_hmcts.modules.UnitSphere` (``D``), ``Bounded(low, high,
+            shape=(D,))`` (even between the bounds) or ``Unbounded(shape=(D,))`` (normal).
         max_skill_steps (int, optional): base steps per mini-episode. Default ``None``: one skill
             per episode.
         skill_key (NestedKey): entry of the skill. Default ``"skill"``.
         skill_step_key (NestedKey): entry of the steps taken. Default ``"skill_step"``.
         prior (sequence of float, Tensor or SkillPrior, optional): probabilities ``[Z]`` of the
-            skills, normalised. Default ``None``: uniform. Numbers are kept as the buffer ``prior``.
-            A :class:`~torchrl_hmcts.modules.SkillPrior` is asked at every draw, so that what it has
-            become by then counts, and once a step whether the skill in use was switched off, which
-            ends its mini-episode; it stays its owner's, and is no sub-module of the transform.
+            skills, normalised. Default ``None``: uniform, or as the spec of vectors says. Numbers
+            are kept as the buffer ``prior``. A :class:`~torchrl_hmcts.modules.SkillPrior` is asked
+            at every draw, so that what it has become by then counts, and once a step whether the
+            skill in use was switched off, which ends its mini-episode; it stays its owner's, and is
+            no sub-module of the transform.
         seed (int, optional): seed of an own generator, whose state is saved in the state dict.
             Default ``None``: torch's global generator.
 
@@ -68,7 +79,7 @@ class SkillTransform(EnvTransform):
 
     def __init__(
         self,
-        num_skills: int,
+        num_skills: Skills,
         max_skill_steps: int | None = None,
         *,
         skill_key: NestedKey = "skill",
@@ -76,7 +87,10 @@ class SkillTransform(EnvTransform):
         prior: SkillPrior | Sequence[float] | Tensor | None = None,
         seed: int | None = None,
     ) -> None:
-        self.num_skills = whole_number("SkillTransform", "num_skills", num_skills, least=1)
+        self.skill_spec = as_skill_spec("SkillTransform", num_skills)
+        self.num_skills = number_of(self.skill_spec)
+        if self.num_skills is None and prior is not None:
+            raise ValueError(no_prior("SkillTransform", self.skill_spec))
         self.max_skill_steps: int | None = None
         if max_skill_steps is not None:
             self.max_skill_steps = whole_number(
@@ -86,7 +100,9 @@ class SkillTransform(EnvTransform):
         self.skill_step_key = nested_key("SkillTransform", "skill_step_key", skill_step_key)
         super().__init__(in_keys=[], out_keys=[self.skill_key, self.skill_step_key])
         live = isinstance(prior, SkillPrior)
-        made = None if prior is None else as_skill_prior("SkillTransform", prior, self.num_skills)
+        made = None
+        if prior is not None and self.num_skills is not None:
+            made = as_skill_prior("SkillTransform", prior, self.num_skills)
         # Past nn.Module.__setattr__: a sub-module would be saved and moved with the env.
         self.__dict__["skill_prior"] = made if live else None
         self.register_buffer("prior", None if live or made is None else made.probs())
@@ -100,7 +116,10 @@ class SkillTransform(EnvTransform):
         self.generator.manual_seed(seed)
 
     def sample(self, shape: Sequence[int], device: torch.device | None = None) -> Tensor:
-        """Returns skills drawn from p(z), int64 of the given shape."""
+        """Returns skills drawn from p(z), int64 of the given shape; vectors of ``[*shape, D]``."""
+        if self.num_skills is None:
+            vectors = draw_vectors(self.skill_spec, shape, self.generator)
+            return vectors if device is None else vectors.to(device)
         prior = self.prior
         if self.skill_prior is not None:
             prior = self.skill_prior.probs().detach()
@@ -147,15 +166,16 @@ class SkillTransform(EnvTransform):
             ended = ended | off[skill].unsqueeze(-1)
         if ended.any():
             # New tensors: the old ones are also the ("next", ...) entries of the transition.
-            fresh = self.sample(skill.shape, skill.device)
-            tensordict_.set(self.skill_key, torch.where(ended.squeeze(-1), fresh, skill))
+            fresh = self.sample(step.shape[:-1], skill.device)
+            began = ended if self.num_skills is None else ended.squeeze(-1)
+            tensordict_.set(self.skill_key, torch.where(began, fresh, skill))
             tensordict_.set(self.skill_step_key, step.masked_fill(ended, 0))
         return tensordict, tensordict_
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         shape, device = state_spec.shape, state_spec.device
-        state_spec[self.skill_key] = Categorical(
-            self.num_skills, shape=shape, dtype=torch.int64, device=device
+        state_spec[self.skill_key] = self.skill_spec.expand(*shape, *self.skill_spec.shape).to(
+            device
         )
         state_spec[self.skill_step_key] = count_spec(state_spec)
         if self.max_skill_steps is not None:

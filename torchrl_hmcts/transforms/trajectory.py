@@ -36,7 +36,7 @@ class OptionTrajectory:
         self,
         env: EnvBase,
         root: TensorDictBase,
-        memory: Mapping[NestedKey, tuple[torch.Size, torch.dtype]],
+        memory: Mapping[NestedKey, Tensor],
     ) -> Composite:
         """Return the spec of the block, ``[*B, T]``, of the env's and the worker's entries."""
         after = env.full_observation_spec.clone()
@@ -46,7 +46,8 @@ class OptionTrajectory:
         known = {unravel_key(k): (v.shape[ndim:], v.dtype) for k, v in root.items(True, True)}
         for key, leaf in after.items(True, True):
             known[unravel_key(("next", key))] = (leaf.shape[ndim:], leaf.dtype)
-        known.update({unravel_key(("next", key)): entry for key, entry in memory.items()})
+        for key, first in memory.items():
+            known[unravel_key(("next", key))] = (first.shape, first.dtype)
         spec = Composite(shape=shape, device=env.device)
         for key in self.keys:
             if key not in known:

@@ -43,6 +43,13 @@ def parse_config(
     chosen = [w for w in words if w.partition("=")[0].replace("/", ".").split(".")[0] in names]
     rest = [word for word in words if word not in chosen]
     config = parse_overrides(experiment.config_class, rest, base=base, others=others)
+    made = [word for word in chosen if word.startswith("make.")]
+    if made:
+        from omegaconf import OmegaConf
+
+        keywords = OmegaConf.to_container(OmegaConf.from_dotlist(made))["make"]  # type: ignore[call-overload, index]
+        config = replace(config, make={**config.make, **keywords})
+        chosen = [word for word in chosen if word not in made]
     if not chosen:
         return config
     first = [word for word in chosen if word.startswith("objective")]

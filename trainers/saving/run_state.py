@@ -16,8 +16,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
+from torchrl.envs import GymLikeEnv
 from torchrl.trainers import Trainer
 
+from torchrl_hmcts.nesting import innermost
 from torchrl_hmcts.trainers.saving.checkpoints import PlainStateAdapter
 
 Generator = torch.Generator | np.random.Generator | random.Random
@@ -93,7 +95,8 @@ class RunningEpisodes:
         if self.new_episodes or (self.new_episodes is None and not self.complete):
             if self.new_episodes is None:
                 words = "keeps state of its own, so the episodes that were under way are left out"
-                print(f"{type(env).__name__} {words}; new ones begin.", file=sys.stderr)
+                hint = " A SettableGymEnv continues them." if isinstance(env, GymLikeEnv) else ""
+                print(f"{type(env).__name__} {words}; new ones begin.{hint}", file=sys.stderr)
             return  # a collector that has not collected yet stands at the beginning of some
         if not self.complete:
             raise ValueError(
@@ -113,9 +116,13 @@ class RunningEpisodes:
             next_id = state_dict["traj_pool"]["traj_id"] - self.collector.n_env
             pool = {"traj_pool": {"traj_id": next_id}}
             self.collector.load_state_dict({**self.collector.state_dict(), **pool}, strict=False)
-        self.collector._carrier = TensorDict(
-            dict(state_dict["entries"]), batch_size=saved, device=old.device
-        )
+        carrier = TensorDict(dict(state_dict["entries"]), batch_size=saved, device=old.device)
+        base = innermost(self.collector.env)
+        if base.batch_locked:  # it steps from the state that it was set to
+            with torch.random.fork_rng(devices=[]):
+                state = carrier.select(*base.full_state_spec.keys(True, True))
+                base.reset(state, set_state=True)
+        self.collector._carrier = carrier
 
 
 class GeneratorStates:
@@ -146,12 +153,18 @@ class GeneratorStates:
 
     def __init__(self, **owners: Any) -> None:
         self.owners = owners
+        self._known: dict[str, Generator] = {}
+        self.generators()
 
     def generators(self) -> dict[str, Generator]:
-        """Return the generators by their path, e.g. ``"env._generator"``."""
+        """Return the generators by their path, e.g. ``"env._generator"``.
+
+        Those of an env that was closed since, as a ``SerialEnv`` is when a collector ends, too.
+        """
         seen: set[int] = set()
-        owners = self.owners.items()
-        return dict(found for name, owner in owners for found in _find(name, owner, seen, True))
+        for name, owner in self.owners.items():
+            self._known.update(_find(name, owner, seen, True))
+        return dict(self._known)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of every generator, by the path to it."""

@@ -12,21 +12,28 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymWrapper, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv, SkillWorker
+from torchrl_hmcts.envs import (
+    OptionPool,
+    RepeatActions,
+    SettableGymEnv,
+    SkillWorker,
+    StatelessSimulator,
+)
 from torchrl_hmcts.envs.gym.features import WithFeatures
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner
+from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, extract_plans
 from torchrl_hmcts.trainers.evaluation import Results, spread
 from torchrl_hmcts.trainers.experiments.kits import Kit, Trial
+from torchrl_hmcts.trainers.experiments.kits.film import Film
 from torchrl_hmcts.trainers.experiments.settings import GymConfig
-from torchrl_hmcts.transforms import DisplacementTransform, OptionTransform, SkillTransform
+from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 _PLAYED = 1_000_003  # added to the seed of envs to act in
 _WORKER_KEYS = ("achieved_goal", "desired_goal", "features", "snapshot")
@@ -71,6 +78,8 @@ class GymKit(Kit):
 
     def __init__(self, config: GymConfig, env: Any = None) -> None:
         super().__init__(config)
+        if env is None:
+            config.check_inputs()
         self._env = config.id if env is None else env
         look = look_at(self._env, gamma=config.gamma, **config.make)
         if config.task != "auto":
@@ -134,27 +143,30 @@ class GymKit(Kit):
     def make_options(
         self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
     ) -> EnvBase:
-        if trajectory_keys is None:
-            return self.make_pool(worker, real=True)
-        steps = self.config.option_steps
-        number = self.config.num_skills
-        options = OptionTransform(worker, number, steps, 1.0, trajectory_keys=trajectory_keys)
-        return TransformedEnv(env, Compose(DoubleToFloat(), options))
+        return self.make_pool(worker, real=True)
 
     def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
         return self.make_pool(worker)
 
-    def make_pool(self, worker: TensorDictModuleBase, *, real: bool = False) -> OptionPool:
+    def make_pool(
+        self, worker: TensorDictModuleBase, *, real: bool = False, film: Film | None = None
+    ) -> OptionPool:
         """Return a pool of options.
 
         Args:
             worker: executes them.
             real: to act in, rather than to plan in: rewards are the env's own, not discounted.
+            film: records what happens.
         """
-        config, make = self.config, partial(make_task, self._env, self.look, real, self.config.make)
+        config, keywords = self.config, dict(self.config.make)
+        if film is not None and film.render:
+            keywords["render_mode"] = "rgb_array"
+        make: Any = partial(make_task, self._env, self.look, real, keywords)
         acts: Any = self._fixed
         if isinstance(worker, SkillPolicy):
             acts = SkillWorker(worker.actor, deterministic=worker.deterministic)
+        if film is not None:
+            make, acts = film.of(make, acts)
         return OptionPool(
             make,
             acts,
@@ -215,6 +227,11 @@ class GymKit(Kit):
                 }
         return part
 
+    def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
+        planner = super().make_planner(simulator, **budget)
+        planner.simulator.keep([self.place_key])  # for pictures
+        return planner
+
     @property
     def replans(self) -> bool:
         """Whether it plans again after every option, rather than execute one plan."""
@@ -252,9 +269,49 @@ class GymKit(Kit):
             episode_steps=np.array([int(episode["next", "duration"].sum())]),
             rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
             plan_seconds=np.array([time.perf_counter() - begin]),
+            plans=[extract_plans(planner.last_search)[0]] if planner.last_search else [],
         )
 
     # ------------------------------------------------------- figures
+
+    def map(self, env: EnvBase) -> Any:
+        if self.look.discrete:
+            return None
+        from torchrl_hmcts.trainers.figures.maps import FeatureMap
+
+        return FeatureMap(StatelessSimulator(env), key="features")
+
+    def film(
+        self,
+        worker: TensorDictModuleBase,
+        planner: MCTSPlanner,
+        start: TensorDictBase,
+        *,
+        render: bool = False,
+    ) -> tuple[Results, Film]:
+        """Act in one episode and keep its base steps.
+
+        Args:
+            worker: executes the options.
+            planner: over the worker's options.
+            start: state ``[1]``.
+            render: whether pictures are kept.
+        """
+        film = Film(self.look.features, render)
+        real = self.make_pool(worker, real=True, film=film)
+        film.clear()
+        film.points.append(start["features"][0].numpy())
+        episode = self.act(planner, real, start)
+        points = torch.from_numpy(np.array(film.points))
+        episode.states = [TensorDict({"features": points}, [len(points)])]
+        episode.options = [torch.tensor(film.options, dtype=torch.int64)]
+        return episode, film
+
+    def replay(self, worker: TensorDictModuleBase, trial: Trial) -> tuple[int, Results, Any]:
+        solved = np.flatnonzero(trial.results.solved)
+        shown = int(solved[0]) if len(solved) else 0
+        episode, _ = self.film(worker, trial.planner, trial.starts[shown : shown + 1])
+        return shown, episode, trial.planner.last_search
 
     def figures(self, trial: Trial) -> dict[str, Any]:
         results = trial.results
