@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
@@ -16,6 +17,7 @@ from tqdm import tqdm
 
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
+from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import skills
 from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, make_kit
 from torchrl_hmcts.trainers.experiments.kits.gym import GymKit
@@ -88,15 +90,17 @@ class HMCTS:
         seed: int = 0,
         **keys: Any,
     ) -> None:
-        if isinstance(env, SkillsConfig):
-            self.kit: Kit = make_kit(env)
-        else:
+        config = env
+        if not isinstance(config, SkillsConfig):
             keys = {"options": "directions", "num_skills": num_skills, "seed": seed, **keys}
-            name = env if isinstance(env, str) else ""
-            self.kit = GymKit(GymConfig(id=name, **keys), env=env)
+            config = GymConfig(id=env if isinstance(env, str) else "", **keys)
+        self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
+        self.kit = self._make_kit(config)
         self.learned: LearnedSkills | None = None
-        self._num_skills = self.config.num_skills  # given options may be more or fewer
         self._worker = self.kit.given_worker()
+
+    def _make_kit(self, config: Any) -> Kit:
+        return GymKit(config, self._env) if isinstance(config, GymConfig) else make_kit(config)
 
     # ------------------------------------------------------------ parts
 
@@ -144,11 +148,10 @@ class HMCTS:
             progress: show a bar.
             save_dir: folder of checkpoints. Default: none.
         """
-        changes: dict[str, Any] = {"options": "learned", "num_skills": self._num_skills}
-        changes["train_base_steps"] = base_steps
-        names = {f.name for f in dataclasses.fields(self.config)}
-        changes = {key: value for key, value in changes.items() if key in names}
-        self.kit.config = dataclasses.replace(self.config, **changes)
+        changes = {"options": "learned", "train_base_steps": base_steps}
+        names = {field.name for field in dataclasses.fields(self._asked)}
+        known = {key: value for key, value in changes.items() if key in names}
+        self.kit = self._make_kit(dataclasses.replace(self._asked, **known))
 
         def bar(total: int) -> Any:
             return tqdm(total=total, desc="learn", unit="step", disable=not progress)
@@ -170,18 +173,30 @@ class HMCTS:
         Args:
             seed: of the start.
         """
+        return _solution(self.kit.act(self.planner, self.real_env, self._start(seed)))
+
+    def play(
+        self, seed: int = 0, *, render: bool = True, out: str | Path | None = None
+    ) -> Solution:
+        """Act in one episode that is shown.
+
+        Args:
+            seed: of the start.
+            render: show a window, as Gymnasium's ``render_mode="human"`` does.
+            out: GIF to write instead, with a video (``.mp4``) beside it: the env's own pictures
+                where it draws any, else its features.
+        """
+        start = self._start(seed)
+        if out is None:
+            mode = "human" if render else ""
+            return _solution(self.kit.film(self.worker, self.planner, start, render=mode))
+        episode = self.kit.film(self.worker, self.planner, start, render="rgb_array")
+        self.kit.write_film(episode, Path(out).with_suffix(".gif"))
+        return _solution(episode)
+
+    def _start(self, seed: int) -> TensorDictBase:
         self.kit.config = dataclasses.replace(self.config, seed=seed)
-        start = self.kit.starts("test", 1)
-        results = self.kit.act(self.planner, self.real_env, start)
-        return Solution(
-            bool(results.solved[0]),
-            float(results.rewards[0]),
-            int(results.episode_steps[0]),
-            int(results.plan_options[0]),
-            int(results.simulated_steps[0]),
-            float(results.plan_seconds[0]),
-            results.plans[0] if results.plans else None,
-        )
+        return self.kit.starts("test", 1)
 
     # ------------------------------------------------------------ files
 
@@ -235,6 +250,18 @@ class HMCTS:
         return (
             f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
         )
+
+
+def _solution(results: Results) -> Solution:
+    return Solution(
+        bool(results.solved[0]),
+        float(results.rewards[0]),
+        int(results.episode_steps[0]),
+        int(results.plan_options[0]),
+        int(results.simulated_steps[0]),
+        float(results.plan_seconds[0]),
+        results.plans[0] if results.plans else None,
+    )
 
 
 def _load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:

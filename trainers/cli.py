@@ -60,6 +60,17 @@ writes  evaluation.json into that folder, one entry per choice of keys, and its 
 Keys are those of the run's experiment (hmcts list NAME); those not given are as in the run.
   {LOG_LEVEL_HELP}"""
 
+_PLAY = f"""\
+Show an agent acting: one episode, planned and executed in an env of its own.
+
+    hmcts play run=runs/gym            in a window; without a display on a page in runs/gym/play
+    hmcts play run=runs/gym seed=3 out=episode.mp4
+
+needs   a folder that `hmcts train kit=...`, `hmcts demo` or HMCTS.save() wrote
+writes  nothing, or play/ in that folder, or the film (FILE.mp4 and FILE.gif)
+
+  {LOG_LEVEL_HELP}"""
+
 _REPORT = f"""\
 Write a page: of one run, of several runs compared, or a figure of the dissertation.
 
@@ -107,6 +118,7 @@ _VERBS = {
     "demo": ("learn four skills and solve random mazes (about a minute)", _DEMO, "train:demo"),
     "train": ("run an experiment, or continue one", _TRAIN, "train:train"),
     "evaluate": ("test a run again with other settings", _EVALUATE, "evaluate:evaluate"),
+    "play": ("show an agent acting", _PLAY, "play:play"),
     "report": ("write the page of runs, or draw a figure", _REPORT, "report:report"),
     "sweep": ("search for good values of an experiment's keys", _SWEEP, "sweep:sweep"),
     "list": ("list experiments, their keys, or figures", _LIST, "listing:show"),

@@ -148,6 +148,7 @@ class Results:
     plans: list[Plan] = field(default_factory=list)
     states: list[TensorDictBase] = field(default_factory=list)
     options: list[Tensor] = field(default_factory=list)
+    frames: list[np.ndarray] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
         """Return counts, and mean, median and 95th percentile of each cost.

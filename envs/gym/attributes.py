@@ -58,7 +58,7 @@ class AttributeSnapshot(Snapshot):
     """
 
     skipped_attributes: ClassVar[frozenset[str]] = frozenset(
-        {"spec", "metadata", "_previous_data"}
+        {"spec", "metadata", "_previous_data", "render_mode"}
         | {"_saved_kwargs", "_ezpickle_args", "_ezpickle_kwargs"}  # how the env was made
     )
     plain_types: ClassVar[frozenset[type]] = _ATOMS

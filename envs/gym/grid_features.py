@@ -28,7 +28,7 @@ class GridFeatures:
 
     int64 ``[F]``, and 0 where there is nothing of the kind. Width-1 novelty over them keeps "here
     with the key" apart from "here without it". All MiniGrid and BabyAI envs have the same columns,
-    so that the vector fits whatever an episode brings:
+    so that the vector fits each episode:
 
     ======== =======================================================================================
     columns  variable

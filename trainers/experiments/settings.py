@@ -422,6 +422,8 @@ class GymConfig(SkillsConfig):
     """Base steps of worker training."""
     expansions: int = 20_000
     """Nodes that a search may expand before it gives up, where there is a goal."""
+    improve_expansions: int = 2_000
+    """Nodes that it expands after the first plan to find a shorter one, where every step costs."""
     search_steps: int = 2_000
     """Base steps that each search may simulate, where rewards are collected."""
     processes: int = 0

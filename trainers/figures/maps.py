@@ -177,6 +177,7 @@ class FeatureMap:
         limits: ``(least, largest)`` of each, for the pictures of a GIF. Default: those of its
             paths.
         names: of the features.
+        is_place: whether both are lengths, drawn to one scale.
         milliseconds: for which a base step is shown in a GIF.
     """
 
@@ -185,10 +186,13 @@ class FeatureMap:
     features: tuple[int, int] = (0, 1)
     limits: tuple[tuple[float, float], tuple[float, float]] | None = None
     names: tuple[str, str] = ("", "")
+    is_place: bool = False
     milliseconds: float = 40.0
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
         """Draw a grid with the names of the features."""
+        if self.is_place:
+            axes.set_aspect("equal")
         axes.set(xlabel=self.names[0], ylabel=self.names[1])
         axes.grid(alpha=0.25)
         if self.limits is not None:

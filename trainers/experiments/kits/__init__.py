@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -340,15 +341,11 @@ class Kit:
         """Draw the pictures of a run: an episode, its search, the skills, their training."""
         config, captions = self.config, self.captions
         shown, episode, search = self.replay(learned.worker, trial)
-        states, options = episode.states[0], episode.options[0].tolist()
-        plan, env = episode.plans[0], self.make_env("test")
-        drawing = self.map(env)
+        drawing = self.map(self.make_env("test"))
         if drawing is not None:
             words = captions["episode.gif" if episode.solved[0] else "unsolved"]
             with pictures.one("episode.gif", words) as path:
-                from torchrl_hmcts.trainers.figures.maps import write_episode_gif
-
-                write_episode_gif(drawing, list(states.unbind(0)), options, plan, path)
+                self.write_film(episode, path)
             with pictures.one("search.png", captions["search.png"]) as path:
                 from torchrl_hmcts.trainers.figures.maps import plot_search
 
@@ -382,10 +379,48 @@ class Kit:
         among = solved if len(solved) else np.arange(len(trial.starts))
         by_length = among[np.argsort(self.path_lengths(trial.starts)[among], kind="stable")]
         shown = int(by_length[int(0.85 * (len(by_length) - 1))])
-        real = self.make_options(self.make_env("test"), worker, list(self.state_keys))
-        start = trial.starts[shown : shown + 1]
-        episode = self.act(trial.planner, real, start, list(self.state_keys))
+        episode = self.film(worker, trial.planner, trial.starts[shown : shown + 1])
         return shown, episode, trial.planner.last_search
+
+    def film(
+        self,
+        worker: TensorDictModuleBase,
+        planner: MCTSPlanner,
+        start: TensorDictBase,
+        *,
+        render: str = "",
+    ) -> Results:
+        """Act in one episode and keep its states and options, base step by base step.
+
+        Args:
+            worker: executes the options.
+            planner: over the worker's options.
+            start: state ``[1]``.
+            render: ``"human"`` shows it in a window, ``"rgb_array"`` keeps the env's own pictures;
+                of an env that draws any. Default: neither.
+        """
+        if render == "human":
+            raise ValueError(f"{self.title}: no window. Leave render out, or write a film: out=.")
+        keys = list(self.state_keys)
+        real = self.make_options(self.make_env("test"), worker, keys)
+        return self.act(planner, real, start, keys)
+
+    def write_film(self, episode: Results, path: str | Path) -> None:
+        """Write an episode as a GIF, and as a video beside it.
+
+        Args:
+            episode: of :meth:`film`.
+            path: of the GIF.
+        """
+        from torchrl_hmcts.trainers.figures import animation, maps
+
+        drawing = None if episode.frames else self.map(self.make_env("test"))
+        if drawing is None:
+            animation.write_gif(episode.frames, path, milliseconds=40.0)
+            return
+        options = episode.options[0].tolist()
+        states = list(episode.states[0].unbind(0))
+        maps.write_episode_gif(drawing, states, options, episode.plans[0], path)
 
     def table(self, metrics: Mapping[str, Any]) -> str:
         """Return what is printed at the end of a run."""

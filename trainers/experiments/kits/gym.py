@@ -18,13 +18,15 @@ from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymWrapper, StepCounte
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_hmcts.envs import (
+    GridMoves,
+    GridView,
     OptionPool,
     RepeatActions,
     SettableGymEnv,
     SkillWorker,
-    StatelessSimulator,
 )
-from torchrl_hmcts.envs.gym.features import WithFeatures
+from torchrl_hmcts.envs.gym.features import WithFeatures, achieved_goal, root_place
+from torchrl_hmcts.envs.gym.minigrid import MiniGridSnapshot
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
 from torchrl_hmcts.modules import SkillPolicy
@@ -39,18 +41,44 @@ _PLAYED = 1_000_003  # added to the seed of envs to act in
 _WORKER_KEYS = ("achieved_goal", "desired_goal", "features", "snapshot")
 
 
-def make_task(name: Any, look: Look, real: bool, keywords: Mapping[str, Any]) -> gymnasium.Env:
-    """Make an env as the task that a look found, in any process.
+def make_seen(name: Any, given: bool, **keywords: Any) -> gymnasium.Env:
+    """Make an env as options see it: MiniGrid without pictures, if no skill is to be learned.
 
     Args:
         name: id, or a function that makes the env.
+        given: whether the options are given.
+        **keywords: of ``gymnasium.make``.
+    """
+    env: gymnasium.Env = make_gym(name, **keywords)
+    return GridView(env) if given and MiniGridSnapshot.fits(env) else env
+
+
+def make_task(make: Any, look: Look, real: bool, keywords: Mapping[str, Any]) -> gymnasium.Env:
+    """Make an env as the task that a look found, in any process.
+
+    Args:
+        make: makes the env.
         look: of :func:`look_at`.
         real: pay what the env itself pays, and call only a success terminal.
         keywords: of ``gymnasium.make``.
     """
-    task = look.task(make_gym(name, **keywords))
+    task = look.task(make(**keywords))
     task.is_real = real
     return task
+
+
+class _Rows:
+    """Steps the states of a batch one after the other, for pictures of skills."""
+
+    def __init__(self, env: EnvBase) -> None:
+        self.env, self.reset = env, env.reset
+
+    def step(self, td: TensorDictBase) -> TensorDictBase:
+        rows = []
+        for row in td.unbind(0):
+            self.env.reset(row, set_state=True)
+            rows.append(self.env.step(row))
+        return torch.stack(rows)
 
 
 class GymKit(Kit):
@@ -80,26 +108,27 @@ class GymKit(Kit):
         super().__init__(config)
         if env is None:
             config.check_inputs()
-        self._env = config.id if env is None else env
+        given = config.options != "learned"
+        self._env = partial(make_seen, config.id if env is None else env, given)
         look = look_at(self._env, gamma=config.gamma, **config.make)
         if config.task != "auto":
             look = dataclasses.replace(look, kind=config.task)
         self.look = look
-        steps = config.option_steps or look.option_steps
+        self._moves = isinstance(self.gym_env, GridView)
+        steps = config.option_steps or (3 if self._moves else look.option_steps)
         self.config = dataclasses.replace(
             config,
             option_steps=steps,
             skill_steps=config.skill_steps or 2 * steps,
             novelty_radius=config.novelty_radius or look.novelty_radius,
         )
-        self._fixed: RepeatActions | None = None
+        self._fixed: Any = None  # worker of a pool whose options are given
         self._radius = config.novelty_radius  # 0: half of how far the options reach
 
     @cached_property
     def gym_env(self) -> gymnasium.Env:
         """Return the env as Gymnasium makes it, for what it says of itself."""
-        made: gymnasium.Env = make_gym(self._env, **self.config.make)
-        return made
+        return self._env(**self.config.make)
 
     # ------------------------------------------------------- envs
 
@@ -118,7 +147,7 @@ class GymKit(Kit):
         config = self.config
 
         def make() -> gymnasium.Env:
-            return WithFeatures(make_gym(self._env, **config.make), self.look.features)
+            return WithFeatures(self._env(**config.make), self.look.features)
 
         envs = SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
         return TransformedEnv(
@@ -149,7 +178,12 @@ class GymKit(Kit):
         return self.make_pool(worker)
 
     def make_pool(
-        self, worker: TensorDictModuleBase, *, real: bool = False, film: Film | None = None
+        self,
+        worker: TensorDictModuleBase,
+        *,
+        real: bool = False,
+        film: Film | None = None,
+        render: str = "",
     ) -> OptionPool:
         """Return a pool of options.
 
@@ -157,10 +191,11 @@ class GymKit(Kit):
             worker: executes them.
             real: to act in, rather than to plan in: rewards are the env's own, not discounted.
             film: records what happens.
+            render: mode in which the env draws itself.
         """
         config, keywords = self.config, dict(self.config.make)
-        if film is not None and film.render:
-            keywords["render_mode"] = "rgb_array"
+        if render:
+            keywords["render_mode"] = render
         make: Any = partial(make_task, self._env, self.look, real, keywords)
         acts: Any = self._fixed
         if isinstance(worker, SkillPolicy):
@@ -181,6 +216,11 @@ class GymKit(Kit):
     def given_worker(self) -> TensorDictModuleBase | None:
         if self.config.options == "learned":
             return None
+        if self._moves:
+            space: Any = self.gym_env.action_space
+            self._fixed = GridMoves(int(space.n))
+            self.config = dataclasses.replace(self.config, num_skills=self._fixed.num_options)
+            return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         actions = fixed_actions(self.gym_env.action_space)
         self._fixed = RepeatActions(actions)
         self.config = dataclasses.replace(self.config, num_skills=len(actions))
@@ -205,26 +245,35 @@ class GymKit(Kit):
 
     def planner_part(self) -> dict[str, Any]:
         config, part = self.config, super().planner_part()
-        if self.look.stochastic:
-            part |= {
-                "chance": {"_component_": "torchrl_hmcts.planners.ProgressiveWidening"},
-                "novelty": None,
-                "leaves_per_wave": 1,
-                "expand": "one",
-            }
-        if self.look.kind == "return" or self.look.stochastic:
-            part["budget"] |= {
-                "expansions": None,
+        if self.look.discrete:
+            stages = getattr(self.look.features, "stages", ())
+            name = "torchrl_hmcts.planners.WidthNovelty"
+            part["novelty"] = {"_component_": name, "key": self.place_key, "stages": stages}
+            part["leaves_per_wave"] = 32
+        elif self.look.step_reward < 0.0:  # shorter plans pay more
+            part["novelty"]["shorter_paths"] = True
+            part["budget"]["improve_expansions"] = config.improve_expansions
+        if not self.replans:
+            return part
+        planners = "torchrl_hmcts.planners"
+        part |= {
+            "novelty": None,
+            "expand": "one",
+            "rollout": {"_component_": f"{planners}.TreeRollout", "max_options": 20},
+            "leaves_per_wave": 1,
+            "budget": {
+                "_component_": f"{planners}.SearchBudget",
                 "base_steps": config.search_steps,
                 "until_plan": False,
-            }
+            },
+        }
         if self.look.kind == "return":
-            part |= {"novelty": None}
-            if not self.look.stochastic:
-                part |= {
-                    "backup": "max",
-                    "final_choice": {"_component_": "torchrl_hmcts.planners.HighestValue"},
-                }
+            part |= {
+                "backup": "max",
+                "final_choice": {"_component_": f"{planners}.HighestValue"},
+            }
+        else:
+            part["chance"] = {"_component_": f"{planners}.ProgressiveWidening"}
         return part
 
     def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
@@ -279,7 +328,22 @@ class GymKit(Kit):
             return None
         from torchrl_hmcts.trainers.figures.maps import FeatureMap
 
-        return FeatureMap(StatelessSimulator(env), key="features")
+        is_place = self.look.features in (achieved_goal, root_place)
+        names = ("x", "y") if is_place else ("feature 0", "feature 1")
+        return FeatureMap(_Rows(env), "features", names=names, is_place=is_place)  # type: ignore[arg-type]
+
+    @cached_property
+    def _draws_itself(self) -> bool:
+        """Whether the env can draw here; what hinders it is printed."""
+        try:
+            env = self._env(**{**self.config.make, "render_mode": "rgb_array"})
+            env.reset(seed=0)
+            picture = env.render()
+            env.close()
+        except Exception as error:
+            print(f"{self.gym_env} cannot draw itself here ({error}): its features are drawn.")
+            return False
+        return isinstance(picture, np.ndarray)
 
     def film(
         self,
@@ -287,31 +351,21 @@ class GymKit(Kit):
         planner: MCTSPlanner,
         start: TensorDictBase,
         *,
-        render: bool = False,
-    ) -> tuple[Results, Film]:
-        """Act in one episode and keep its base steps.
-
-        Args:
-            worker: executes the options.
-            planner: over the worker's options.
-            start: state ``[1]``.
-            render: whether pictures are kept.
-        """
-        film = Film(self.look.features, render)
-        real = self.make_pool(worker, real=True, film=film)
+        render: str = "",
+    ) -> Results:
+        if render == "rgb_array" and not self._draws_itself:
+            render = ""
+        film = Film(self.look.features, render == "rgb_array")
+        real = self.make_pool(worker, real=True, film=film, render=render)
         film.clear()
         film.points.append(start["features"][0].numpy())
         episode = self.act(planner, real, start)
+        real.close()
         points = torch.from_numpy(np.array(film.points))
         episode.states = [TensorDict({"features": points}, [len(points)])]
         episode.options = [torch.tensor(film.options, dtype=torch.int64)]
-        return episode, film
-
-    def replay(self, worker: TensorDictModuleBase, trial: Trial) -> tuple[int, Results, Any]:
-        solved = np.flatnonzero(trial.results.solved)
-        shown = int(solved[0]) if len(solved) else 0
-        episode, _ = self.film(worker, trial.planner, trial.starts[shown : shown + 1])
-        return shown, episode, trial.planner.last_search
+        episode.frames = film.frames
+        return episode
 
     def figures(self, trial: Trial) -> dict[str, Any]:
         results = trial.results

@@ -1,0 +1,183 @@
+"""Any Gymnasium env as a task: what a short look finds, the kit over it, and the agent."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv
+from torchrl_hmcts.envs.gym.features import WithFeatures
+from torchrl_hmcts.envs.gym.task import TaskEnv, fixed_actions, look_at
+from torchrl_hmcts.planners import HierarchicalPolicy, HighestValue, MCTSPlanner, SearchBudget
+from torchrl_hmcts.testing import ChainEnv
+from torchrl_hmcts.trainers import HMCTS, load_worker
+from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.saving.run_folder import read_run
+
+
+class Line(gymnasium.Env):
+    """A walk on whole places 0 to 9, or with ``noise`` one that slips; 9 ends it."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Box(0.0, 9.0, (1,))
+
+    def __init__(self, reward: str = "sparse", noise: bool = False) -> None:
+        self.reward, self.noise, self.place = reward, noise, 0
+
+    def _shown(self) -> np.ndarray:
+        return np.array([self.place], np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.place = 0
+        return self._shown(), {}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        slips = self.noise and self.np_random.random() < 0.3
+        self.place = max(0, self.place + (1 if bool(action) != slips else -1))
+        over = self.place == 9
+        paid = {"sparse": float(over), "cost": -1.0, "dense": float(self.place)}[self.reward]
+        return self._shown(), paid, over, False, {}
+
+
+def test_rewards_on_the_way_make_a_task_of_returns_and_costs_one_of_a_goal() -> None:
+    looks = {reward: look_at(lambda r=reward: Line(r)) for reward in ("sparse", "cost", "dense")}
+    assert {reward: look.kind for reward, look in looks.items()} == {
+        "sparse": "goal",
+        "cost": "goal",
+        "dense": "return",
+    }
+    assert not any(look.stochastic for look in looks.values())
+    assert look_at(lambda: Line(noise=True)).stochastic
+
+
+def test_an_option_moves_the_features_by_a_tenth_of_what_they_span() -> None:
+    look = look_at(lambda: Line())
+    env = Line()
+    points = [look.features(env, np.array([place], np.float32)) for place in (0.0, 1.0)]
+    step = float(abs(points[1] - points[0]).item())  # of one base step
+    assert look.novelty_radius == pytest.approx(look.option_steps * step / 2)
+    assert look.option_steps * step >= 0.1 > (look.option_steps - 1) * step
+
+
+@pytest.mark.parametrize(
+    ("reward", "terminated", "info", "solved"),
+    [
+        (1.0, True, {}, True),
+        (0.0, True, {}, False),
+        (-1.0, True, {}, True),  # every step costs 1, and this one ended it
+        (-9.0, True, {}, False),
+        (1.0, False, {}, False),
+        (0.0, False, {"success": True}, True),
+        (5.0, True, {"is_success": False}, False),
+    ],
+)
+def test_what_counts_as_a_success(
+    reward: float, terminated: bool, info: dict[str, Any], solved: bool
+) -> None:
+    step_reward = -1.0 if reward < 0.0 else 0.0
+    task = TaskEnv(Line(), step_reward=step_reward)
+    assert task.is_success(reward, terminated, info) is solved
+
+
+def test_actions_to_repeat() -> None:
+    assert fixed_actions(spaces.Discrete(3, start=1)) == [1, 2, 3]
+    eight = np.array(fixed_actions(spaces.Box(-2.0, 2.0, (2,))))
+    assert eight.shape == (8, 2)
+    assert np.allclose(np.linalg.norm(eight, axis=1), 2.0)
+    ends = np.array(fixed_actions(spaces.Box(np.array([0, 0, 0]), np.array([2, 4, 6]))))
+    assert ends[[0, 3]].tolist() == [[2.0, 2.0, 3.0], [0.0, 2.0, 3.0]]
+    assert len(fixed_actions(spaces.MultiDiscrete([2, 3]))) == 6
+    with pytest.raises(ValueError, match="Learn skills"):
+        fixed_actions(spaces.MultiDiscrete([9, 9]))
+
+
+def test_pools_and_settable_envs_write_the_same_features() -> None:
+    def features(env: gymnasium.Env, observation: np.ndarray) -> np.ndarray:
+        return np.array([observation[0], 2 * env.unwrapped.place], np.int64)  # type: ignore[attr-defined]
+
+    pool = OptionPool(Line, RepeatActions(2), max_steps=3, num_processes=0, features=features)
+    after = pool.step(pool.reset().set("option", torch.tensor(1)))["next"]
+    assert after["features"].tolist() == [3, 6]
+    env = SettableGymEnv(Line, features=features)
+    assert env.rollout(1, lambda td: td.set("action", torch.tensor(1)))["next", "features"][
+        0
+    ].tolist() == [1, 2]
+    shown, _ = WithFeatures(Line(), features).reset()
+    assert shown["features"].tolist() == [0, 0]
+
+
+def test_a_search_before_every_option_takes_the_final_choice() -> None:
+    class Left:
+        def choose(self, search: Any) -> np.ndarray:
+            return np.zeros(search.num_roots, np.int64)
+
+    planner = MCTSPlanner(ChainEnv(length=4), final_choice=Left())
+    policy = HierarchicalPolicy(planner, replan_every=1)
+    assert policy(ChainEnv(length=4).reset())["action"].item() == 0  # the plan says 1
+
+
+def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
+    agent = HMCTS("MountainCar-v0", option_steps=14, novelty_radius=0.06, expansions=300)
+    solution = agent.solve(seed=3)
+    assert solution.solved
+    assert solution.reward == -solution.base_steps
+    assert int(solution.plan.durations) == solution.base_steps  # type: ignore[union-attr]
+    again = HMCTS.load(agent.save(tmp_path / "given"))
+    assert repr(again) == repr(agent) == "HMCTS(MountainCar-v0, 3 actions, each for 14 base steps)"
+    assert again.solve(seed=3) == solution
+    agent.learn(640, progress=False)
+    assert agent.config.num_skills == 8
+    assert agent.loss is not None
+    again = HMCTS.load(agent.save(tmp_path / "learned"))
+    assert again.solve(seed=3) == agent.solve(seed=3)
+    td = again.kit.make_training_env(2).reset()
+    assert torch.equal(
+        load_worker(tmp_path / "learned")(td.clone())["action"], agent.worker(td)["action"]
+    )
+
+
+def test_rewards_are_collected_with_a_search_before_every_option() -> None:
+    agent = HMCTS(lambda: Line("dense"), option_steps=1, search_steps=60, gamma=0.9)
+    solution = agent.solve()
+    assert isinstance(agent.planner.final_choice, HighestValue)
+    assert agent.planner.budget == SearchBudget(base_steps=60, until_plan=False)
+    assert (solution.base_steps, solution.reward) == (9, 45.0)  # 1 + 2 + ... + 9
+    with pytest.raises(ValueError, match=r"gymnasium\.register"):
+        agent.save("nowhere")
+
+
+def test_the_kit_from_the_command_line(tmp_path: Path) -> None:
+    words = ["kit=gym", "env.id=MountainCar-v0", "make.max_episode_steps=150", "toy=true"]
+    assert main(["train", *words, f"out={tmp_path}", "train_base_steps=640"]) == 0
+    run = read_run(tmp_path)
+    assert run.config["make"] == {"max_episode_steps": 150}
+    assert {"episode.gif", "search.png", "skills.png"} <= set(run.pictures)
+    assert json.loads((tmp_path / "metrics.json").read_text())["test"]["starts"] == 2
+    assert HMCTS.load(tmp_path).config.num_skills == 8
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "say which env: env.id=NAME"),
+        (["env.id=MountainCa-v0"], "MountainCar-v0"),
+        (["env.id=MountainCar-v0", "options=fly"], "options is one of"),
+    ],
+)
+def test_wrong_words_say_what_to_write(words: list[str], message: str, capsys: Any) -> None:
+    assert main(["train", "kit=gym", *words, "out=nowhere"]) in (1, 2)
+    assert message in capsys.readouterr().err
+    assert not Path("nowhere").exists()
+
+
+def test_no_skills_no_worker() -> None:
+    with pytest.raises(RuntimeError, match=r"Call learn\(\) first"):
+        HMCTS("MountainCar-v0", options="learned").solve()

@@ -1,0 +1,91 @@
+"""``hmcts play run=DIR``."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
+from torchrl_hmcts.trainers.command_line.words import split_words
+from torchrl_hmcts.trainers.runs.config import home, read_value, unknown_key
+
+if TYPE_CHECKING:
+    from torchrl_hmcts.trainers.agent import HMCTS, Solution
+
+_KEYS = ("run", "seed", "out")
+
+
+def play(words: Sequence[str]) -> int:
+    """Show an agent acting: in a window, on a page of its own, or in a film."""
+    with told("play", *WRONG_WORDS):
+        own, rest = split_words(words, _KEYS)
+        if rest:
+            raise ValueError(unknown_key(rest[0].partition("=")[0], [*_KEYS, "log_level"]))
+        if "run" not in own:
+            raise ValueError("say which agent: run=DIR, the folder of a run or of HMCTS.save().")
+        seed = read_value("seed", own.get("seed", "0"), "int")
+        out = home(own["out"]) if "out" in own else ""
+        if out and Path(out).suffix not in (".gif", ".mp4"):
+            raise ValueError(f"out is a film: FILE.mp4 or FILE.gif; got {out!r}.")
+    with told("play", ValueError, FileNotFoundError), printing(own.get("log_level", "info")):
+        from torchrl_hmcts.trainers.agent import HMCTS
+
+        agent = HMCTS.load(home(own["run"]))
+        print(agent)
+        if out:
+            print(agent.play(seed, out=out))
+            print(f"Film: {out}")
+        elif _has_display() and hasattr(agent.config, "id"):
+            print(agent.play(seed))
+        else:
+            folder = Path(home(own["run"])) / "play"
+            solution = agent.play(seed, out=_made(folder) / "play.gif")
+            print(solution)
+            print(f"Page: {_write_page(agent, solution, folder, seed)}")
+    return 0
+
+
+def _has_display() -> bool:
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def _write_page(agent: HMCTS, solution: Solution, folder: Path, seed: int) -> Path:
+    """Write the page of an episode: the film, the search, the figures."""
+    from torchrl_hmcts.trainers.figures.maps import plot_search
+    from torchrl_hmcts.trainers.figures.pages import Section, Table, picture, write_sections
+    from torchrl_hmcts.trainers.figures.pictures import Pictures
+
+    pictures = Pictures(folder)
+    pictures.captions["play.gif"] = "The episode."
+    drawing, search = agent.kit.map(agent.kit.make_env("test")), agent.planner.last_search
+    if drawing is not None and search is not None:
+        with pictures.one("search.png", agent.kit.captions["search.png"]) as path:
+            plot_search(drawing, search, path)
+    rows = [
+        ("solved", solution.solved),
+        ("reward", solution.reward),
+        ("base steps", solution.base_steps),
+        ("options", solution.num_options),
+        ("simulated base steps", solution.simulated_steps),
+        ("seconds of planning", round(solution.plan_seconds, 2)),
+    ]
+    shown = [
+        picture(folder / name, words, embed=False) for name, words in pictures.captions.items()
+    ]
+    sections = [
+        Section(words=[repr(agent)], pictures=shown),
+        Section("Figures", tables=[Table(rows)]),
+    ]
+    file = folder / "index.html"
+    write_sections(file, f"An episode, seed {seed}", sections)
+    return file
