@@ -21,6 +21,7 @@ ALLOWED = {
 OTHERS = {  # of other packages
     *("_enabled", "_impl", "_load_data"),  # numba's cache: compiling.py
     *("_exit", "_replace"),  # os._exit; a NamedTuple's
+    *("_max_episode_steps", "_destroy"),  # of Gymnasium's TimeLimit, and its Box2D envs
 }
 # What is there today: names go, and none comes.
 KNOWN = {

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
+from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
 NUM_TEST_MAZES = 342  # of Waterworld's test split
 BATCH_STEPS = 64  # base steps of a batch of DIAYN's training
@@ -453,8 +453,8 @@ class GymConfig(SkillsConfig):
         """Check that there is an id.
 
         Raises:
-            ValueError: if there is none.
+            ExperimentError: if there is none.
         """
         super().check_inputs()
         if not self.id:
-            raise ValueError("say which env: env.id=NAME, e.g. env.id=PointMaze_Large-v3.")
+            raise ExperimentError("say which env: env.id=NAME, e.g. env.id=PointMaze_Large-v3.")

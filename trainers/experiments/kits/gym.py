@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
@@ -15,7 +14,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymWrapper, StepCounter, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_hmcts.envs import (
     GridMoves,
@@ -282,6 +280,13 @@ class GymKit(Kit):
         return planner
 
     @property
+    def manager_keys(self) -> Sequence[Any]:
+        if self._moves:  # the view of the grid has too little
+            return []
+        keys = self.make_env("train").observation_spec.keys(True, True)
+        return [key for key in keys if key not in ("features", "snapshot")]
+
+    @property
     def replans(self) -> bool:
         """Whether it plans again after every option, rather than execute one plan."""
         return self.look.stochastic or self.look.kind == "return"
@@ -295,31 +300,18 @@ class GymKit(Kit):
     ) -> Results:
         if not self.replans:
             return super().act(planner, real, starts, keys)
-        return Results.concatenate([self._play(planner, real, one, keys) for one in starts])
+        return Results.concatenate([self._play(planner, real, one) for one in starts.split(1)])
 
-    def _play(
-        self, planner: MCTSPlanner, real: EnvBase, start: TensorDictBase, keys: Sequence[Any]
-    ) -> Results:
+    def _play(self, planner: MCTSPlanner, real: EnvBase, start: TensorDictBase) -> Results:
         """Act in one episode, with a search before every option."""
         policy = HierarchicalPolicy(planner, replan_every=1, reuse=not self.look.stochastic)
         pool: Any = planner.simulator.given_env
-        before, begin = pool.num_steps, time.perf_counter()
-        limit = getattr(self.gym_env.spec, "max_episode_steps", None) or 10_000
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            episode = real.rollout(limit, policy, auto_reset=False, tensordict=start.clone())
-        last = episode[-1]["next"]
-        return Results(
-            found=np.array([True]),
-            solved=last["terminated"].numpy().reshape(1),
-            simulated_steps=np.array([pool.num_steps - before]),
-            expansions=np.array([0]),
-            simulations=np.array([0]),
-            plan_options=np.array([len(episode)]),
-            episode_steps=np.array([int(episode["next", "duration"].sum())]),
-            rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
-            plan_seconds=np.array([time.perf_counter() - begin]),
-            plans=[extract_plans(planner.last_search)[0]] if planner.last_search else [],
-        )
+        before = pool.num_steps
+        results = self.act_by(policy, real, start)
+        results.simulated_steps = np.array([pool.num_steps - before])
+        if planner.last_search is not None:
+            results.plans = [extract_plans(planner.last_search)[0]]
+        return results
 
     # ------------------------------------------------------- figures
 
