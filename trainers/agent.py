@@ -169,7 +169,7 @@ class HMCTS:
         """
         changes = {"options": "learned", "train_base_steps": base_steps}
         names = {field.name for field in dataclasses.fields(self._asked)}
-        known = {key: value for key, value in changes.items() if key in names}
+        known: dict[str, Any] = {key: value for key, value in changes.items() if key in names}
         self.kit = self._make_kit(dataclasses.replace(self._asked, **known))
 
         def bar(total: int) -> Any:

@@ -40,6 +40,8 @@ class ManagerNet(nn.Module):
     ) -> None:
         super().__init__()
         self.num_options, self.bounded = num_options, bounded
+        self.mean: Tensor
+        self.std: Tensor
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float().clamp_min(1e-6))
         self.mlp = MLP(len(mean), num_options + 1, num_cells=list(hidden))

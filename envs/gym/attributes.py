@@ -151,12 +151,12 @@ class AttributeSnapshot(Snapshot):
                 f"has {len(row):,}. Pass cap={2 * (begin + len(content)):,} or more."
             )
         clocks = [clock._elapsed_steps or 0 for clock in self._clocks]
-        self._head.pack_into(row, 0, len(content), *clocks)
-        memoryview(row)[begin : begin + len(content)] = content
+        self._head.pack_into(row.data, 0, len(content), *clocks)
+        row.data[begin : begin + len(content)] = content
 
     def _load(self, row: np.ndarray) -> None:
         begin = self._head.size
-        length, *clocks = self._head.unpack_from(row)
+        length, *clocks = self._head.unpack_from(row.data)
         for clock, steps in zip(self._clocks, clocks, strict=True):
             clock._elapsed_steps = steps
         self._load_content(row[begin : begin + length].tobytes())
@@ -266,7 +266,10 @@ class AttributeSnapshot(Snapshot):
 
     def _look(self, number: int, own: dict[str, Any]) -> _Seen:
         kinds = self._kinds[number]
-        atoms, arrays, others, names = [], [], [], []  # type: tuple[list[Any], ...]
+        atoms: list[Any] = []
+        arrays: list[Any] = []
+        others: list[Any] = []
+        names: list[Any] = []
         for name, value in own.items():
             kind = kinds.get((name, type(value)))
             if kind is None:

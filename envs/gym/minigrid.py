@@ -91,13 +91,13 @@ class MiniGridSnapshot(AttributeSnapshot):
                 f"The state of {self.env} has grown to {begin + len(whole):,} bytes, and a row has "
                 f"{len(row):,}. Pass cap={2 * (begin + len(whole)):,} or more."
             )
-        self._head.pack_into(row, 0, *sizes, *self._agent(), *clocks)
-        memoryview(row)[begin : begin + len(whole)] = whole
+        self._head.pack_into(row.data, 0, *sizes, *self._agent(), *clocks)
+        row.data[begin : begin + len(whole)] = whole
         return row
 
     def restore(self, row: np.ndarray) -> None:
         begin = self._head.size
-        first, second, third, *agent = self._head.unpack_from(row)
+        first, second, third, *agent = self._head.unpack_from(row.data)
         whole = row[begin : begin + first + second + third].tobytes()
         reference, changes, content = (
             whole[:first],
@@ -118,7 +118,8 @@ class MiniGridSnapshot(AttributeSnapshot):
 
     def _agent(self) -> tuple[int, ...]:
         """Where the agent is and looks, the steps it has taken, and the types of these numbers."""
-        place, direction, steps = map(vars(self.env.unwrapped).get, _AGENT)
+        own: Any = vars(self.env.unwrapped)
+        place, direction, steps = map(own.get, _AGENT)
         numbers = *place, direction
         try:
             kinds = [_NUMBERS.index(type(number)) for number in numbers]

@@ -63,7 +63,8 @@ class TaskEnv(gymnasium.Wrapper):
             over = truncated or (terminated and not solved)
             return observation, reward, solved, over, info
         if self.kind == "return":
-            return observation, (reward + self.shift) * self.scale, terminated, truncated, info
+            paid = (float(reward) + self.shift) * self.scale
+            return observation, paid, terminated, truncated, info
         return observation, float(solved), terminated or solved, truncated, info
 
     def is_success(self, reward: Any, terminated: bool, info: dict[str, Any]) -> bool:

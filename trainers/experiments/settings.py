@@ -81,7 +81,7 @@ class SkillsConfig(RunConfig):
         "num_skills",
     )
     LEAST = {"curve_points": 0}
-    ABOVE_ZERO = ("novelty_radius", "updates_per_step")
+    ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("novelty_radius", "updates_per_step")
     CHOICES = {
         "options": ("learned", "actions"),
         "algorithm": ("diayn", "hmcts"),
@@ -437,7 +437,7 @@ class GymConfig(SkillsConfig):
     TOY = {"train_base_steps": 1_280, "mazes": 2, "expansions": 200, "search_steps": 200}
     KEPT = (*SkillsConfig.KEPT, "id", "make", "option_steps", "skill_steps")
     LEAST = {"curve_points": 0, "option_steps": 0, "skill_steps": 0, "processes": 0}
-    ABOVE_ZERO = ("updates_per_step",)
+    ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("updates_per_step",)
     CHOICES = SkillsConfig.CHOICES | {
         "options": ("learned", "actions", "directions"),
         "task": ("auto", "goal", "return"),

@@ -110,7 +110,7 @@ class GymKit(Kit):
         self._env = partial(make_seen, config.id if env is None else env, given)
         look = look_at(self._env, gamma=config.gamma, **config.make)
         if config.task != "auto":
-            look = dataclasses.replace(look, kind=config.task)
+            look = dataclasses.replace(look, kind=config.task)  # type: ignore[arg-type]
         self.look = look
         self._moves = isinstance(self.gym_env, GridView)
         steps = config.option_steps or (3 if self._moves else look.option_steps)
@@ -161,11 +161,11 @@ class GymKit(Kit):
     def starts(self, split: str, num_starts: int) -> TensorDictBase:
         env = self.make_env(split)
         tasks = getattr(self.gym_env.unwrapped, "num_tasks", 0)
-        found = []
+        found: list[TensorDictBase] = []
         for number in range(num_starts):
             options = {"options": {"task_id": number % tasks + 1}} if tasks else {}
             found.append(env.reset(**options))
-        return torch.stack(found).exclude("done", "terminated", "truncated")
+        return torch.stack(found).exclude("done", "terminated", "truncated")  # type: ignore[attr-defined]
 
     def make_options(
         self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
