@@ -101,5 +101,5 @@ $(DEV_STAMP): pyproject.toml $(VENV)/pyvenv.cfg $(call stale,$(DEV_STAMP))
 	@echo '$(HERE)' > $(TRAIN_STAMP)
 
 $(DOCS_STAMP): pyproject.toml $(VENV)/pyvenv.cfg $(call stale,$(DOCS_STAMP))
-	$(BIN)/python -m pip install --disable-pip-version-check -e '.[train,atari,docs]'
+	$(BIN)/python -m pip install --disable-pip-version-check -e '.[train,atari,gym,docs]'
 	@echo '$(HERE)' > $@

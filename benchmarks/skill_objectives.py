@@ -1,10 +1,14 @@
 """Skill objectives side by side: what a planner achieves with the skills each of them teaches.
 
-Each objective trains the demo's worker (same env, networks, 40,000 base steps, trainer); only the
-objective is swapped. Then the reference planner solves the test mazes with the skills.
+Each objective trains the demo's worker (same env, trainer, 40,000 base steps); only the objective
+is swapped, and the skills, which are four or vectors. Then the reference planner solves the test
+mazes with the skills; of vectors, with eight that are spread out.
 
     python benchmarks/skill_objectives.py --seeds 0 1 2 \\
         --out docs/results/skills/skill_objectives.json
+    python benchmarks/skill_objectives.py --seeds 0 1 2 \\
+        --objectives "METRA, vectors" "LSD, vectors" \\
+        --out docs/results/skills/skill_vectors.json
     python benchmarks/skill_objectives.py --quick
 """
 
@@ -22,8 +26,11 @@ import torch
 from mazes import greedy, solve
 from table import markdown, read_arguments, write
 from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec, Unbounded
+from torchrl.envs import TransformedEnv
 
-from torchrl_hmcts.envs import maze_pool
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import (
     SkillActor,
     SkillCritic,
@@ -32,6 +39,8 @@ from torchrl_hmcts.modules import (
     SkillEncoder,
     SkillPolicy,
     SpectralLinear,
+    UnitSphere,
+    spread_skills,
 )
 from torchrl_hmcts.objectives import (
     DiscreteSkillSACLoss,
@@ -43,9 +52,10 @@ from torchrl_hmcts.objectives import (
 )
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
-from torchrl_hmcts.transforms import SkillReward
+from torchrl_hmcts.transforms import OptionTransform, SkillReward
 
 SKILLS = 4
+VECTORS = 8  # options, of skills that are vectors
 
 
 @dataclass
@@ -55,7 +65,15 @@ class Recipe:
     make: Callable[[], SkillObjective]
     coeff: float = 1.0  # of the reward, which is weighed against alpha times the entropy
     critic_keys: tuple[str, ...] = ("velocity",)  # and what the reward is a function of
+    skills: Any = SKILLS  # or the spec of a vector
 
+    def options(self) -> Tensor | None:
+        """Return the vectors that are the options, ``[Z, D]``; None: all skills are."""
+        return spread_skills(self.skills, VECTORS) if isinstance(self.skills, TensorSpec) else None
+
+
+# As in the papers.
+SPHERE, NORMAL, BOX = UnitSphere(2), Unbounded(shape=(2,)), Bounded(-1.0, 1.0, shape=(2,))
 
 RECIPES = {
     "DIAYN": Recipe(
@@ -65,16 +83,21 @@ RECIPES = {
     "METRA": Recipe(lambda: METRAEncoderLoss(SkillEncoder(2, SKILLS)), 3.0),
     "LSD": Recipe(lambda: LSDEncoderLoss(SkillEncoder(2, SKILLS, linear=SpectralLinear)), 10.0),
     "DADS": Recipe(lambda: SkillDynamicsLoss(SkillDynamics(2, 2, SKILLS)), 0.5),
+    "METRA, vectors": Recipe(lambda: METRAEncoderLoss(SkillEncoder(2, SPHERE)), 3.0, skills=SPHERE),
+    "LSD, vectors": Recipe(
+        lambda: LSDEncoderLoss(SkillEncoder(2, NORMAL, linear=SpectralLinear)), 10.0, skills=NORMAL
+    ),
+    "DADS, vectors": Recipe(lambda: SkillDynamicsLoss(SkillDynamics(2, 2, BOX)), 0.5, skills=BOX),
 }
 
 
 def train(recipe: Recipe, seed: int, base_steps: int) -> tuple[DiscreteSkillSACLoss, float]:
     """Train the demo's worker with an objective; return its loss and the seconds it took."""
-    env = make_training_env(num_skills=SKILLS)
+    env = make_training_env(num_skills=recipe.skills)
     torch.manual_seed(seed)
     loss = DiscreteSkillSACLoss(
-        SkillActor(2, env.action_spec_unbatched, SKILLS, in_keys=["velocity"]),
-        SkillCritic(2 * len(recipe.critic_keys), 4, SKILLS, in_keys=recipe.critic_keys),
+        SkillActor(2, env.action_spec_unbatched, recipe.skills, in_keys=["velocity"]),
+        SkillCritic(2 * len(recipe.critic_keys), 4, recipe.skills, in_keys=recipe.critic_keys),
         recipe.make(),
         action_space=env.action_spec_unbatched,
     )
@@ -85,15 +108,23 @@ def train(recipe: Recipe, seed: int, base_steps: int) -> tuple[DiscreteSkillSACL
 
 
 @torch.no_grad()
-def mean_displacements(worker: SkillPolicy, per_skill: int = 256) -> np.ndarray:
-    """Return where skills lead in 50 base steps, on average over mazes, ``[Z, 2]`` (tiles)."""
-    copies = SKILLS * per_skill
-    env = make_training_env(maze_pool("test"), num_skills=SKILLS, copies=copies)
+def mean_displacements(worker: SkillPolicy, recipe: Recipe, per_skill: int = 256) -> np.ndarray:
+    """Return where options lead in 50 base steps, on average over mazes, ``[Z, 2]`` (tiles)."""
+    vectors = recipe.options()
+    told = torch.arange(SKILLS) if vectors is None else vectors
+    copies = len(told) * per_skill
+    env = make_training_env(maze_pool("test"), num_skills=recipe.skills, copies=copies)
     env.set_seed(7)
-    skill = torch.arange(SKILLS).repeat_interleave(per_skill)
+    skill = told.repeat_interleave(per_skill, 0)
     td = env.reset(TensorDict(skill=skill, batch_size=[copies]))
     end = env.rollout(50, worker, auto_reset=False, tensordict=td, break_when_any_done=False)
-    return end[:, -1]["next", "displacement"].view(SKILLS, per_skill, 2).mean(1).numpy()
+    return end[:, -1]["next", "displacement"].view(-1, per_skill, 2).mean(1).numpy()
+
+
+def make_vector_env(worker: SkillPolicy, mazes: Tensor, *, skills: Tensor) -> TransformedEnv:
+    """Build a Waterworld whose options are vectors of the worker's skills."""
+    options = OptionTransform(worker, len(skills), 25, skills=skills)
+    return TransformedEnv(WaterworldMazeEnv(mazes, observation=False), options)
 
 
 def angles(moved: np.ndarray) -> list[float]:
@@ -107,7 +138,8 @@ def measure(name: str, seed: int, base_steps: int, num_mazes: int) -> dict[str, 
     """Train with an objective, plan over the skills in test mazes and execute the plans."""
     loss, seconds = train(RECIPES[name], seed, base_steps)
     worker = greedy(loss)
-    moved = mean_displacements(worker)
+    moved, vectors = mean_displacements(worker, RECIPES[name]), RECIPES[name].options()
+    made = {} if vectors is None else {"make_env": make_vector_env, "skills": vectors}
     lengths = np.linalg.norm(moved, axis=-1)
     return {
         "objective": name,
@@ -115,7 +147,7 @@ def measure(name: str, seed: int, base_steps: int, num_mazes: int) -> dict[str, 
         "train_base_steps": base_steps,
         "train_seconds": round(seconds, 1),
         "reward_scale": RECIPES[name].coeff,
-        **solve(worker, num_mazes, seed).summary(),
+        **solve(worker, num_mazes, seed, **made).summary(),
         "mean_displacements": moved.round(3).tolist(),
         "mean_displacement_length": round(float(lengths.mean()), 3),
         "smallest_length": round(float(lengths.min()), 3),
@@ -141,7 +173,7 @@ COLUMNS = {
 
 def main() -> None:
     quick = {"seeds": [0], "mazes": 60}
-    names = list(RECIPES)
+    names = [name for name in RECIPES if not name.endswith("vectors")]
     args = read_arguments(__doc__, quick, seeds=[0], mazes=342, base_steps=40_000, objectives=names)
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in args.objectives}
     for name in args.objectives:

@@ -302,6 +302,7 @@ EXCLUDED = {  # why public names are not fuzzed here
     "belongs to an Atari game": "ByteGoal FollowGoals JoinedWorkers OccasionalAction AtariAgent "
     "AtariKit TrainedSource",
     "the arguments of TorchRL's ValueEstimatorBase": "NStepReturn",
+    "the arguments of TorchRL's Unbounded": "UnitSphere",
     "an exception": "CollectorError FolderInUse LearnerError SnapshotError",
     "takes other parts, whose types it checks": "GeneratorStates RunningEpisodes "
     "SearchCoverage TilePlanner",

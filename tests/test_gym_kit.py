@@ -125,7 +125,7 @@ def test_a_search_before_every_option_takes_the_final_choice() -> None:
 
 
 def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
-    agent = HMCTS("MountainCar-v0", option_steps=14, novelty_radius=0.06)
+    agent = HMCTS("MountainCar-v0", option_steps=14, novelty_radius=0.06, expansions=300)
     solution = agent.solve(seed=3)
     assert solution.solved
     assert solution.reward == -solution.base_steps
@@ -145,11 +145,15 @@ def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
 
 
 def test_rewards_are_collected_with_a_search_before_every_option() -> None:
-    agent = HMCTS(lambda: Line("dense"), option_steps=1, search_steps=60, gamma=0.9)
+    def make() -> gymnasium.Env:
+        return gymnasium.wrappers.TimeLimit(Line("dense"), 12)
+
+    agent = HMCTS(make, option_steps=1, search_steps=200, gamma=0.9)
     solution = agent.solve()
     assert isinstance(agent.planner.final_choice, HighestValue)
-    assert agent.planner.budget == SearchBudget(base_steps=60, until_plan=False)
-    assert (solution.base_steps, solution.reward) == (9, 45.0)  # 1 + 2 + ... + 9
+    assert agent.planner.budget == SearchBudget(base_steps=200, until_plan=False)
+    assert solution.base_steps == 12  # to the right and to the end would take 9
+    assert 1 + 2 + 3 + 4 + 5 + 6 + 7 + 8 + 9 < solution.reward <= 36 + 7 + 8 + 7 + 8
     with pytest.raises(ValueError, match=r"gymnasium\.register"):
         agent.save("nowhere")
 
@@ -172,12 +176,28 @@ def test_the_kit_from_the_command_line(tmp_path: Path) -> None:
         (["env.id=MountainCar-v0", "options=fly"], "options is one of"),
     ],
 )
-def test_wrong_words_say_what_to_write(words: list[str], message: str, capsys: Any) -> None:
-    assert main(["train", "kit=gym", *words, "out=nowhere"]) in (1, 2)
+def test_wrong_words_say_what_to_write(
+    words: list[str], message: str, capsys: Any, tmp_path: Path
+) -> None:
+    assert main(["train", "kit=gym", *words, f"out={tmp_path / 'run'}"]) in (1, 2)
     assert message in capsys.readouterr().err
-    assert not Path("nowhere").exists()
+    assert not (tmp_path / "run").exists()
 
 
 def test_no_skills_no_worker() -> None:
     with pytest.raises(RuntimeError, match=r"Call learn\(\) first"):
         HMCTS("MountainCar-v0", options="learned").solve()
+
+
+def test_a_distilled_manager_guides_the_search_and_acts_alone(tmp_path: Path) -> None:
+    gymnasium.register("TestLine-v0", Line)
+    agent = HMCTS("TestLine-v0", option_steps=1, gamma=0.9)
+    with pytest.raises(RuntimeError, match=r"Call distill\(\) first"):
+        agent.solve(search=False)
+    agent.distill(2, iterations=2, updates=80, progress=False)
+    alone = agent.solve(search=False)
+    assert (alone.solved, alone.base_steps, alone.simulated_steps) == (True, 9, 0)
+    again = HMCTS.load(agent.save(tmp_path))
+    assert again.solve(search=False) == alone
+    assert again.solve() == agent.solve()
+    gymnasium.registry.pop("TestLine-v0")

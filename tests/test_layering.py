@@ -18,7 +18,8 @@ FOLDERS = {TOP: TOP, "envs": f"{TOP}.envs", "trainers": f"{TOP}.trainers"}
 # with all below these. Packages that export their parts are rooms of their own.
 PARTS = ["testing", "planners", "transforms"]
 ROOMS: dict[str, tuple[str, list[str]]] = {
-    "command line": (r"trainers\.(command_line|cli|configs|__main__)", ["experiments"]),
+    "command line": (r"trainers\.(command_line|cli|configs|__main__)", ["agent"]),
+    "agent": (r"trainers\.agent", ["experiments"]),
     "experiments": (r"trainers\.experiments", ["runs", "all envs"]),
     "runs": (r"trainers\.runs", ["figures", "algorithms"]),
     "figures": (r"trainers\.figures", ["saving", "all envs", *PARTS]),

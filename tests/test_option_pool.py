@@ -117,6 +117,13 @@ def test_a_state_that_is_reached_by_replaying_gives_the_same_outcome() -> None:
     assert again["observation"].equal(states[0]["observation"])
 
 
+def test_an_option_ends_at_the_time_limit_of_its_episode() -> None:
+    pool = local(max_episode_steps=7)
+    td = pool.rollout(2, policy=lambda td: td.set("option", torch.tensor(0)))
+    assert td["next", "duration"].flatten().tolist() == [5, 2]
+    assert td["next", "truncated"].flatten().tolist() == [False, True]
+
+
 def test_it_keeps_the_contract_of_a_macro_env() -> None:
     check_macro_env(local(max_steps=3), num_steps=5)
 
@@ -149,7 +156,10 @@ def test_a_search_is_the_same_on_processes_that_die_and_without(
         search = planner.search(local(worker).reset(), seed=1)
         if killing:
             timer.join()
-            pool.step(every_option(pool))  # notices one that was killed after the last wave
+            for _ in range(1000):  # notices one that was killed after the last wave
+                pool.step(every_option(pool))
+                if pool.num_restarts:
+                    break
         count = int(search.tree.num_nodes[0])
         assert count > 30
         trees.append(search.tree.nodes[0, :count].tobytes())

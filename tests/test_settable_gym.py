@@ -15,6 +15,11 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import AttributeSnapshot, ReplaySnapshot, SettableGymEnv, SnapshotError
 from torchrl_hmcts.envs.gym.families import snapshot_of
+from torchrl_hmcts.envs.gym.generators import (
+    generator_memory,
+    generator_state,
+    set_generator_state,
+)
 from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ContractError, check_settable
@@ -33,6 +38,7 @@ FAMILIES = [
     ("Taxi-v4", "ToyTextSnapshot", None, {}),
     ("Blackjack-v1", "ToyTextSnapshot", None, {}),  # observes a tuple
     ("LunarLander-v3", "Box2DSnapshot", "Box2D", {}),
+    ("BipedalWalker-v3", "Box2DSnapshot", "Box2D", {}),  # keeps one world for all its episodes
     ("MiniGrid-KeyCorridorS3R3-v0", "MiniGridSnapshot", "minigrid", {}),
     ("MiniGrid-Dynamic-Obstacles-6x6-v0", "MiniGridSnapshot", "minigrid", {}),
     ("BabyAI-GoToLocal-v0", "MiniGridSnapshot", "minigrid", {}),
@@ -279,3 +285,72 @@ def test_a_mujoco_row_follows_every_change_of_an_attribute():
         snapshot.note_step(None)
         snapshot.restore(changed)
         assert repr(vars(inner)[name]) == repr(value)
+
+
+def test_attributes_that_are_changed_in_place_are_noticed_and_restored() -> None:
+    class Held:
+        def __init__(self) -> None:
+            self.counts = {"left": [0, 0.0], "grid": np.zeros((2, 2))}
+
+    class Changing(Drifting):
+        def __init__(self) -> None:
+            super().__init__()
+            self.held, self.shared = Held(), [np.arange(3)]
+            self.again = self.shared[0]
+
+    env = Changing()
+    snapshot = AttributeSnapshot(env)
+    row = snapshot.read()
+    counts = env.held.counts
+    for change in (
+        lambda: counts["left"].__setitem__(1, -0.0),
+        lambda: counts["left"].__setitem__(0, False),
+        lambda: counts["grid"].__setitem__((0, 1), 2.0),
+        lambda: env.shared.__setitem__(0, np.arange(3)),  # no longer the one of ``again``
+        lambda: env.reset(seed=5),  # another state of the generator
+        lambda: env.np_random.random(),
+    ):
+        snapshot.note_step(None)
+        before = snapshot.read()
+        change()
+        snapshot.note_step(None)
+        assert (snapshot.read() != before).any()
+    snapshot.restore(row)
+    assert repr(env.held.counts) == repr({"left": [0, 0.0], "grid": np.zeros((2, 2))})
+    assert env.shared[0] is env.again
+    snapshot.note_step(None)
+    assert (snapshot.read() == row).all()
+
+
+def test_the_memory_of_a_generator_is_its_state() -> None:
+    one, other = (np.random.default_rng(seed) for seed in (1, 2))
+    memory = generator_memory(other)
+    if memory is None:  # a NumPy that keeps it elsewhere
+        return
+    one.integers(3, dtype=np.int32)  # half a number is left
+    state = generator_state(one)
+    memory[0][:], memory[1][:] = state[:32], state[32:]
+    assert (one.integers(9, size=9) == other.integers(9, size=9)).all()
+    set_generator_state(other, state)
+    assert bytes(memory[0]) + bytes(memory[1]) == state
+    assert generator_memory(np.random.Generator(np.random.MT19937(0))) is None
+
+
+@pytest.mark.parametrize("kind", [tuple, np.array])
+def test_minigrid_keeps_the_types_of_the_agents_place(kind: Any) -> None:
+    pytest.importorskip("minigrid")
+    env = make_gym("MiniGrid-Empty-5x5-v0")
+    snapshot = snapshot_of(env)
+    snapshot.note_reset(0)
+    env.reset(seed=0)
+    inner = env.unwrapped
+    inner.agent_pos = kind((np.int64(2), 3))
+    row = snapshot.read()
+    inner.agent_pos, inner.agent_dir, inner.step_count = (1, 1), 2, 7
+    snapshot.note_step(None)
+    snapshot.restore(row)
+    assert repr(inner.agent_pos) == repr(kind((np.int64(2), 3)))
+    assert (inner.agent_dir, inner.step_count) == (0, 0)
+    inner.agent_pos = (1.5, 1)
+    with pytest.raises(SnapshotError, match=r"\(1\.5, 1\).*no whole numbers"):
+        snapshot.read()

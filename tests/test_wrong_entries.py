@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Categorical
 
-from torchrl_hmcts.modules import ConcatSkillMLP, SkillActor, SkillDiscriminator, SkillPolicy
+from torchrl_hmcts.modules import (
+    ConcatSkillMLP,
+    SkillActor,
+    SkillDiscriminator,
+    SkillMLP,
+    SkillPolicy,
+)
 from torchrl_hmcts.objectives import SkillDiscriminatorLoss
 from torchrl_hmcts.transforms import SkillReward
 
@@ -44,6 +51,15 @@ def test_a_skill_that_is_missing_is_named_with_what_writes_it(name: str) -> None
     message = rf"{name.split()[0]} reads \W*skill\W*, which is missing.*SkillTransform"
     with pytest.raises(KeyError, match=message):
         READERS[name]()(transitions(None))
+
+
+@pytest.mark.parametrize("network", [SkillMLP, ConcatSkillMLP])
+@pytest.mark.parametrize("skill", [-1, 3])
+def test_a_skill_that_does_not_exist_is_named(network: Any, skill: int) -> None:
+    run = network(2, 1, num_skills=3)
+    message = f"Skill {skill} does not exist: a network of num_skills=3 knows 0 to 2"
+    with pytest.raises(ValueError, match=message):
+        run(torch.zeros(2, 2), torch.tensor([0, skill]))
 
 
 def test_a_feature_that_is_missing_is_named_with_what_there_is() -> None:

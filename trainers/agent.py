@@ -10,12 +10,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from tqdm import tqdm
 
 from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import MCTSPlanner, Plan
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import skills
@@ -23,8 +24,13 @@ from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, make_kit
 from torchrl_hmcts.trainers.experiments.kits.gym import GymKit
 from torchrl_hmcts.trainers.experiments.registry import load_config
 from torchrl_hmcts.trainers.experiments.settings import GymConfig, SkillsConfig
+from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer
+from torchrl_hmcts.trainers.manager import ManagerNet, ManagerPolicy, make_manager
+from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
 from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run, start_record
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
+
+_MANAGER = "manager.torchrl"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +44,12 @@ class Solution:
         num_options (int): that were executed.
         simulated_steps (int): base steps of all searches.
         plan_seconds (float): of all searches.
-        plan (Plan, optional): that was executed; None where every option had a search of its own.
+        plan (Plan, optional): that was executed, or the last one where every option had a search of
+            its own; options ``[L]``.
+
+    Example:
+        >>> Solution(True, 1.0, 40, 4, 900, 0.1).solved
+        True
     """
 
     solved: bool
@@ -75,7 +86,7 @@ class HMCTS:
 
     Example:
         >>> from torchrl_hmcts.trainers import HMCTS
-        >>> agent = HMCTS("MountainCar-v0")
+        >>> agent = HMCTS("MountainCar-v0", option_steps=14)
         >>> agent
         HMCTS(MountainCar-v0, 3 actions, each for 14 base steps)
         >>> agent.solve(seed=0).solved
@@ -90,15 +101,18 @@ class HMCTS:
         seed: int = 0,
         **keys: Any,
     ) -> None:
-        if isinstance(env, SkillsConfig):
-            self.kit: Kit = make_kit(env)
-        else:
+        config = env
+        if not isinstance(config, SkillsConfig):
             keys = {"options": "directions", "num_skills": num_skills, "seed": seed, **keys}
-            name = env if isinstance(env, str) else ""
-            self.kit = GymKit(GymConfig(id=name, **keys), env=env)
+            config = GymConfig(id=env if isinstance(env, str) else "", **keys)
+        self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
+        self.kit = self._make_kit(config)
         self.learned: LearnedSkills | None = None
-        self._num_skills = self.config.num_skills  # given options may be more or fewer
+        self.manager: TensorDictModule | None = None
         self._worker = self.kit.given_worker()
+
+    def _make_kit(self, config: Any) -> Kit:
+        return GymKit(config, self._env) if isinstance(config, GymConfig) else make_kit(config)
 
     # ------------------------------------------------------------ parts
 
@@ -134,6 +148,13 @@ class HMCTS:
         """The macro environment in which the agent acts, another instance."""
         return self.kit.make_options(self.kit.make_env("test"), self.worker)
 
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The manager without a search; :meth:`distill` trains it."""
+        if self.manager is None:
+            raise RuntimeError("No policy has been distilled from searches. Call distill() first.")
+        return ManagerPolicy(self.manager)
+
     # ------------------------------------------------------------ what it does
 
     def learn(
@@ -146,11 +167,10 @@ class HMCTS:
             progress: show a bar.
             save_dir: folder of checkpoints. Default: none.
         """
-        changes: dict[str, Any] = {"options": "learned", "num_skills": self._num_skills}
-        changes["train_base_steps"] = base_steps
-        names = {f.name for f in dataclasses.fields(self.config)}
-        changes = {key: value for key, value in changes.items() if key in names}
-        self.kit.config = dataclasses.replace(self.config, **changes)
+        changes = {"options": "learned", "train_base_steps": base_steps}
+        names = {field.name for field in dataclasses.fields(self._asked)}
+        known: dict[str, Any] = {key: value for key, value in changes.items() if key in names}
+        self.kit = self._make_kit(dataclasses.replace(self._asked, **known))
 
         def bar(total: int) -> Any:
             return tqdm(total=total, desc="learn", unit="step", disable=not progress)
@@ -166,13 +186,78 @@ class HMCTS:
                 part.close()
         self.kit.prepare(learned.worker)
 
-    def solve(self, seed: int = 0) -> Solution:
+    def distill(
+        self, searches: int = 100, *, iterations: int = 2, updates: int = 400, progress: bool = True
+    ) -> HMCTS:
+        """Train a policy that needs no search, and with it the planner's prior and value.
+
+        Searches from fresh starts are its examples; after the first iteration the network guides
+        them. :attr:`planner` is guided from then on, :attr:`policy` acts alone.
+
+        Args:
+            searches: of each iteration.
+            iterations: Default 2.
+            updates: of the network, in each iteration.
+            progress: show a bar.
+
+        Returns:
+            The agent.
+
+        Raises:
+            ValueError: if the planner sees nothing but a snapshot of the state.
+
+        Reference:
+            Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search",
+            2017, arXiv 1705.08439.
+        """
+        keys = self.kit.manager_keys
+        if not keys:
+            raise ValueError(
+                f"{self} plans over features of which no network can learn. Distil from an env "
+                "whose observation shows its state."
+            )
+        goal = not getattr(self.kit, "replans", False)
+        starts = self.kit.starts("train", 16)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.config.seed)
+            network = make_manager(self.planner, keys, starts, bounded=goal)
+        guided = self.kit.guide(self.kit.make_planner(self.env), network)
+
+        def bar(total: int) -> Any:
+            return tqdm(total=total, desc="distil", unit="update", disable=not progress)
+
+        loss = ExpertIterationLoss(network, value_loss="log" if goal else "smooth_l1")
+        ExpertIterationTrainer(
+            self.env,
+            network,
+            self.planner,
+            planner=guided,
+            loss_module=loss,
+            iterations=iterations,
+            searches_per_iteration=searches,
+            updates_per_iteration=updates,
+            example_kwargs={"roots": not goal},
+            progress=bar,
+            seed=self.config.seed,
+        ).train()
+        self._guide(network)
+        return self
+
+    def _guide(self, network: TensorDictModule) -> None:
+        self.manager = network.eval()
+        self.__dict__["planner"] = self.kit.guide(self.kit.make_planner(self.env), network)
+
+    def solve(self, seed: int = 0, *, search: bool = True) -> Solution:
         """Plan from a start and act in an env of its own.
 
         Args:
             seed: of the start.
+            search: False: act by :attr:`policy` alone.
         """
-        return _solution(self.kit.act(self.planner, self.real_env, self._start(seed)))
+        start = self._start(seed)
+        if not search:
+            return _solution(self.kit.act_by(self.policy, self.real_env, start))
+        return _solution(self.kit.act(self.planner, self.real_env, start))
 
     def play(
         self, seed: int = 0, *, render: bool = True, out: str | Path | None = None
@@ -220,6 +305,8 @@ class HMCTS:
         start_record(config.EXPERIMENT, config, [], {})
         if self.learned is not None and self.learned.loss is not None:
             save_worker(folder, self.learned.loss, self.learned.worker_step)
+        if self.manager is not None:
+            plain_checkpoint(manager=self.manager).save(Path(folder) / _MANAGER)
         end_record(folder, "finished")
         return Path(folder)
 
@@ -240,6 +327,14 @@ class HMCTS:
         agent = cls(config)
         if config.options == "learned":
             agent._take(_load_skills(agent.kit, folder))
+        if (Path(folder) / _MANAGER).is_file():
+            keys, spec = agent.kit.manager_keys, agent.env.full_observation_spec
+            zeros = torch.zeros(sum(spec[key].shape.numel() for key in keys))
+            goal = not getattr(agent.kit, "replans", False)
+            net = ManagerNet(zeros, zeros, agent.planner.num_options, bounded=goal)
+            network = TensorDictModule(net, list(keys), ["logits", "state_value"])
+            plain_checkpoint(manager=network).load(Path(folder) / _MANAGER)
+            agent._guide(network)
         return agent
 
     def __repr__(self) -> str:
@@ -282,6 +377,15 @@ def load_worker(folder: str | Path) -> SkillPolicy:
 
     Raises:
         FileNotFoundError: if there is none, or it has no networks yet.
+        ValueError: if its options are given, not learned.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_hmcts.trainers import HMCTS, load_worker
+        >>> folder = tempfile.mkdtemp()
+        >>> agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
+        >>> load_worker(agent.save(folder)).in_keys
+        ['observation', 'skill']
     """
     agent = HMCTS.load(folder)
     worker = agent.worker

@@ -386,6 +386,7 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
         ),
         Section("How much training the worker needs", "skills/worker.json", worker),
         Section("Skill objectives", "skills/skill_objectives.json", objectives),
+        Section("Skills that are vectors", "skills/skill_vectors.json", objectives),
         Section(
             "Algorithm 3: learning from the searches",
             "skills/hmcts_rounds.json",

@@ -5,15 +5,28 @@ from __future__ import annotations
 import io
 import marshal
 import pickle
+import struct
 import types
 from itertools import compress
-from typing import Any, ClassVar
+from operator import is_
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
-from gymnasium.wrappers import TimeLimit
 
-from torchrl_hmcts.envs.gym.snapshots import DEFAULT_CAP, Snapshot, SnapshotError, env_layers
+from torchrl_hmcts.envs.gym.generators import (
+    generator_memory,
+    generator_state,
+    set_generator_state,
+)
+from torchrl_hmcts.envs.gym.snapshots import (
+    DEFAULT_CAP,
+    KNOWN_WRAPPERS,
+    Snapshot,
+    SnapshotError,
+    env_layers,
+    time_limits,
+)
 
 _FIXED_TYPES = (
     gymnasium.Env,
@@ -28,6 +41,18 @@ _FIXED_TYPES = (
 _ATOMS: frozenset[type] = frozenset({int, float, str, bool, bytes, type(None)})
 _NO_OBJECTS = frozenset({*_ATOMS, list, dict, tuple, np.ndarray, np.dtype})
 _FIXED, _PLAIN, _OTHER = range(3)
+
+
+class _Seen(NamedTuple):
+    """The attributes of a layer at the last look."""
+
+    names: tuple[str, ...]
+    read: list[bool]
+    values: list[Any]  # of those that are read
+    atoms: bytes  # names and values of those that nobody can change in place
+    arrays: list[np.ndarray]  # of numbers
+    others: list[Any]
+    memory: tuple[memoryview, ...] | None  # of the generator
 
 
 class AttributeSnapshot(Snapshot):
@@ -62,6 +87,7 @@ class AttributeSnapshot(Snapshot):
         | {"_saved_kwargs", "_ezpickle_args", "_ezpickle_kwargs"}  # how the env was made
     )
     plain_types: ClassVar[frozenset[type]] = _ATOMS
+    head: ClassVar[int] = 1  # numbers before the clocks
     drawing_modules: ClassVar[tuple[str, ...]] = ("pygame", "matplotlib", "PIL", "cv2", "moviepy")
 
     @classmethod
@@ -71,18 +97,19 @@ class AttributeSnapshot(Snapshot):
     def __init__(self, env: gymnasium.Env, *, cap: int = DEFAULT_CAP) -> None:
         self.env = env
         env.reset(seed=0)
-        self._layers = env_layers(env)
-        self._fixed: list[Any] = list(self._layers)  # referred to by their index, never stored
+        layers = env_layers(env)
+        self._clocks = time_limits(env)
+        self._head = struct.Struct(f"{self.head}q{len(self._clocks)}q")
+        self._layers = [layer for layer in layers if type(layer) not in KNOWN_WRAPPERS]
+        self._fixed: list[Any] = layers  # referred to by their index, never stored
         self._index = {id(item): i for i, item in enumerate(self._fixed)}
         self._cap = cap
-        modules = {kind.__module__ for layer in self._layers for kind in type(layer).__mro__}
+        modules = {kind.__module__ for layer in layers for kind in type(layer).__mro__}
         self._packages = frozenset(name.partition(".")[0] for name in modules) - _LIBRARIES
         self._kinds: list[dict[tuple[str, type], int]] = [{} for _ in self._layers]
-        self._clocks = [vars(layer) for layer in self._layers if type(layer) is TimeLimit]
         self._unchanged: bytes | None = None  # attributes of the env, if it took no step since
-        self._known: tuple[bytes | None, bytes] = None, b""  # a mark, and what it stands for
-        self._plans: list[Any] = [None] * len(self._layers)
-        self._num_plans = 0
+        self._known: tuple[Any, bytes] = None, b""  # a mark, and what it stands for
+        self._seen = [_Seen((), [], [], b"", [], [], ())] * len(self._layers)
         content = self._pickled(learning=True)
         self._unpickled(content)  # a class that is not read is named now, not in a search
         self.width = _room_for(len(content), cap, env)
@@ -117,22 +144,25 @@ class AttributeSnapshot(Snapshot):
     def _write(self, row: np.ndarray) -> None:
         """Writes clocks, generators and attributes into a row, or the end of one."""
         self._unchanged = content = self._pickled()
-        begin = 8 + 8 * len(self._clocks)
+        begin = self._head.size
         if begin + len(content) > len(row):
             raise SnapshotError(
                 f"The state of {self.env} has grown to {begin + len(content):,} bytes, and a row "
                 f"has {len(row):,}. Pass cap={2 * (begin + len(content)):,} or more."
             )
-        clocks = [clock["_elapsed_steps"] or 0 for clock in self._clocks]
-        row[:begin].view(np.int64)[:] = len(content), *clocks
-        row[begin : begin + len(content)] = np.frombuffer(content, np.uint8)
+        clocks = [clock._elapsed_steps or 0 for clock in self._clocks]
+        self._head.pack_into(row.data, 0, len(content), *clocks)
+        row.data[begin : begin + len(content)] = content
 
     def _load(self, row: np.ndarray) -> None:
-        begin = 8 + 8 * len(self._clocks)
-        length, *clocks = row[:begin].view(np.int64).tolist()
+        begin = self._head.size
+        length, *clocks = self._head.unpack_from(row.data)
         for clock, steps in zip(self._clocks, clocks, strict=True):
-            clock["_elapsed_steps"] = steps
-        content = row[begin : begin + length].tobytes()
+            clock._elapsed_steps = steps
+        self._load_content(row[begin : begin + length].tobytes())
+
+    def _load_content(self, content: bytes) -> None:
+        """Sets the attributes, unless they are so already."""
         if content != self._unchanged:
             mark, known = self._known
             if content != known or mark is None or self._mark() != mark:
@@ -165,10 +195,7 @@ class AttributeSnapshot(Snapshot):
 
     def _kind(self, layer: int, name: str, value: Any) -> int:
         """Whether an attribute is no state, a plain value, or anything else."""
-        apart = name == "_np_random" or (
-            name == "_elapsed_steps" and type(self._layers[layer]) is TimeLimit
-        )
-        if apart or name in self.skipped_attributes or self.is_fixed(value):
+        if name == "_np_random" or name in self.skipped_attributes or self.is_fixed(value):
             kind = _FIXED
         else:
             kind = _PLAIN if type(value) in self.plain_types else _OTHER
@@ -198,7 +225,7 @@ class AttributeSnapshot(Snapshot):
                     with_others = True
             values.append(plain)
             others.append(other)
-            generators.append(_generator_state(layer))
+            generators.append(generator_state(vars(layer).get("_np_random")))
         stream = io.BytesIO()
         pickle.dump((values, generators, with_others), stream, protocol=5)
         if with_others:
@@ -209,40 +236,80 @@ class AttributeSnapshot(Snapshot):
         self._known = mark, stream.getvalue()
         return self._known[1]
 
-    def _mark(self) -> bytes | None:
-        """Bytes that are equal only if all attributes are, much cheaper than pickling them.
+    def _mark(self) -> Any:
+        """What is equal only if all attributes are, much cheaper than pickling them.
 
-        None where some are neither plain values nor arrays of numbers.
+        None where some are objects of which nothing is known.
         """
-        parts: list[Any] = []
-        arrays: list[np.ndarray] = []
-        for number, layer in enumerate(self._layers):
-            own = vars(layer)
-            form = tuple(own), tuple(map(type, own.values()))
-            if self._plans[number] is None or self._plans[number][0] != form:
-                self._plans[number] = self._plan(number, own, form)
-            _, version, atoms, of_arrays = self._plans[number]
-            generator = _generator_state(layer)
-            if atoms is None or not (generator is None or isinstance(generator, bytes)):
-                return None
-            parts += [version, generator, *compress(own.values(), atoms)]
-            arrays += compress(own.values(), of_arrays)
-        known = [id(array) for array in arrays]
-        for array in arrays:  # two names of one array are not two arrays
-            if array.dtype.kind in "OV":
-                return None
-            parts += [known.index(id(array)), array.dtype.str, array.shape, array.tobytes()]
-        return marshal.dumps(parts, 2)  # the newest version that does not depend on references
+        marks: list[Any] = []
+        shared: dict[int, int] = {}
+        try:
+            for number, layer in enumerate(self._layers):
+                own, seen = vars(layer), self._seen[number]
+                values = compress(own.values(), seen.read)
+                if tuple(own) != seen.names or not all(map(is_, values, seen.values)):
+                    seen = self._seen[number] = self._look(number, own)
+                marks.append(seen.atoms)
+                if seen.memory is None:
+                    marks.append(marshal.dumps(generator_state(own.get("_np_random")), 2))
+                else:
+                    marks += map(bytes, seen.memory)
+                for array in seen.arrays:
+                    marks += shared.setdefault(id(array), len(shared)), array.tobytes()
+                    marks += array.shape, array.dtype.char
+                if seen.others:  # the newest version that does not depend on references
+                    digests = [self._digest(value, shared) for value in seen.others]
+                    marks.append(marshal.dumps(digests, 2))
+        except (TypeError, ValueError):
+            return None
+        return marks
 
-    def _plan(self, number: int, own: dict[str, Any], form: Any) -> tuple[Any, ...]:
-        """Which attributes of a layer a mark reads, as long as their names and types stay."""
-        kinds = [self._kind(number, name, value) for name, value in own.items()]
-        plain = [kind == _PLAIN for kind in kinds]
-        arrays = [p and t is np.ndarray for p, t in zip(plain, form[1], strict=True)]
-        atoms = [p and t in _ATOMS for p, t in zip(plain, form[1], strict=True)]
-        self._num_plans += 1
-        readable = plain == [a or b for a, b in zip(atoms, arrays, strict=True)]
-        return form, self._num_plans, atoms if readable and _OTHER not in kinds else None, arrays
+    def _look(self, number: int, own: dict[str, Any]) -> _Seen:
+        kinds = self._kinds[number]
+        atoms: list[Any] = []
+        arrays: list[Any] = []
+        others: list[Any] = []
+        names: list[Any] = []
+        for name, value in own.items():
+            kind = kinds.get((name, type(value)))
+            if kind is None:
+                kind = self._kind(number, name, value)
+            if kind == _FIXED:
+                continue
+            if type(value) in _ATOMS:
+                atoms.append((name, value))
+                continue
+            plain = type(value) is np.ndarray and value.dtype.kind not in "OV"
+            (arrays if plain else others).append(value)
+            names.append((name, plain))
+        mark = marshal.dumps([atoms, names], 2)
+        read = [name not in self.skipped_attributes for name in own]
+        values = [*compress(own.values(), read)]
+        generator = own.get("_np_random")
+        memory = () if generator is None else generator_memory(generator)
+        return _Seen(tuple(own), read, values, mark, arrays, others, memory)
+
+    def _digest(self, value: Any, shared: dict[int, int]) -> Any:
+        """Stands for a value that may be changed in place; two names of one are not two."""
+        kind = type(value)
+        if kind in _ATOMS:
+            return value
+        number = self._index.get(id(value))
+        if number is not None:
+            return "fixed", number
+        number = shared.setdefault(id(value), len(shared))
+        if number < len(shared) - 1:
+            return "shared", number
+        if kind is np.ndarray or isinstance(value, np.generic):
+            if value.dtype.kind not in "OV":
+                return kind is np.ndarray, value.dtype.str, value.shape, value.tobytes()
+        elif kind is dict:
+            return ["dict", *[self._digest(x, shared) for item in value.items() for x in item]]
+        elif kind in (list, tuple):
+            return [kind.__name__, *[self._digest(x, shared) for x in value]]
+        elif kind.__module__.partition(".")[0] in self._packages and _is_open(kind):
+            return [kind.__qualname__, self._digest(vars(value), shared)]
+        raise TypeError
 
     def _refusal(self, values: list[dict[str, Any]], error: Exception) -> str:
         """Names the attribute that cannot be pickled."""
@@ -264,6 +331,16 @@ _NUMPY = frozenset(
     "__randomstate_ctor PCG64 MT19937 Philox SFC64 PCG64DXSM SeedSequence "
     "__pyx_unpickle_SeedSequence".split()
 )
+
+
+def _is_open(kind: Any) -> bool:
+    """Whether objects of a class have nothing but attributes by name."""
+    sizes = (kind.__basicsize__, kind.__dictoffset__)
+    return sizes == (_Open.__basicsize__, _Open.__dictoffset__)  # type: ignore[attr-defined]
+
+
+class _Open:
+    pass
 
 
 class _Kept:
@@ -363,21 +440,6 @@ def _room_for(needed: int, cap: int, env: gymnasium.Env) -> int:
     return min(width, max(cap, 64))
 
 
-def _generator_state(layer: gymnasium.Env) -> bytes | Any:
-    """The state of an env's own generator: 40 bytes for NumPy's default one."""
-    generator = vars(layer).get("_np_random")
-    if generator is None or type(generator.bit_generator) is not np.random.PCG64:
-        return generator
-    state = generator.bit_generator.state
-    inner = state["state"]
-    return (
-        inner["state"].to_bytes(16, "little")
-        + inner["inc"].to_bytes(16, "little")
-        + state["has_uint32"].to_bytes(4, "little")
-        + state["uinteger"].to_bytes(4, "little")
-    )
-
-
 def _set_generator(layer: gymnasium.Env, stored: bytes | Any) -> None:
     if not isinstance(stored, bytes):
         if "_np_random" in vars(layer) or stored is not None:
@@ -386,10 +448,4 @@ def _set_generator(layer: gymnasium.Env, stored: bytes | Any) -> None:
     generator = vars(layer).get("_np_random")
     if generator is None or type(generator.bit_generator) is not np.random.PCG64:
         generator = layer._np_random = np.random.Generator(np.random.PCG64(0))
-    number = [int.from_bytes(stored[a:b], "little") for a, b in ((0, 16), (16, 32))]
-    generator.bit_generator.state = {
-        "bit_generator": "PCG64",
-        "state": {"state": number[0], "inc": number[1]},
-        "has_uint32": int.from_bytes(stored[32:36], "little"),
-        "uinteger": int.from_bytes(stored[36:40], "little"),
-    }
+    set_generator_state(generator, stored)

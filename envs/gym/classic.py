@@ -7,9 +7,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import TimeLimit
 
-from torchrl_hmcts.envs.gym.snapshots import Snapshot, env_layers
+from torchrl_hmcts.envs.gym.snapshots import KNOWN_WRAPPERS, Snapshot, env_layers, time_limits
 
 _ROW = struct.Struct("<6d4q")  # state, its type, its length, the clock, steps after the end
 _TYPES = (tuple, np.dtype(np.float64), np.dtype(np.float32))
@@ -28,19 +28,16 @@ class ClassicSnapshot(Snapshot):
         env.reset(seed=0)
         self._own: Any = env.unwrapped
         self._counts = hasattr(self._own, "steps_beyond_terminated")
-        clocks = [vars(layer) for layer in env_layers(env) if type(layer) is TimeLimit]
-        self._clock: dict[str, Any] = clocks[0] if clocks else {}
+        self._clocks = time_limits(env)
 
     @classmethod
     def fits(cls, env: gymnasium.Env) -> bool:
         *wrappers, inner = env_layers(env)
-        known = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
-        single = sum(type(layer) is TimeLimit for layer in wrappers) <= 1
         return (
-            single
-            and all(type(layer) in known for layer in wrappers)
+            sum(type(layer) is TimeLimit for layer in wrappers) <= 1
+            and all(type(layer) in KNOWN_WRAPPERS for layer in wrappers)
             and type(inner).__module__.startswith("gymnasium.envs.classic_control")
-            and "state" in vars(inner)
+            and hasattr(inner, "state")
         )
 
     def read(self) -> np.ndarray:
@@ -56,7 +53,7 @@ class ClassicSnapshot(Snapshot):
             *(0.0,) * (6 - len(values)),
             kind,
             len(values),
-            self._clock.get("_elapsed_steps") or 0,
+            (self._clocks[0]._elapsed_steps or 0) if self._clocks else 0,
             -1 if beyond is None else beyond,
         )
         return np.frombuffer(row, np.uint8)
@@ -67,4 +64,5 @@ class ClassicSnapshot(Snapshot):
         self._own.state = values if kind == 0 else np.array(values, _TYPES[kind])
         if self._counts:
             self._own.steps_beyond_terminated = None if beyond < 0 else beyond
-        self._clock["_elapsed_steps"] = steps
+        for clock in self._clocks:
+            clock._elapsed_steps = steps

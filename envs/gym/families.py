@@ -32,11 +32,27 @@ class ToyTextSnapshot(AttributeSnapshot):
 
 
 class Box2DSnapshot(ReplaySnapshot):
-    """Replays the episode: no other way of restoring a Box2D world is exact."""
+    """Replays the episode, each in a new world.
+
+    No other way is exact: the impulses of contacts, from which the next step begins, cannot be set.
+    A world that has seen an episode keeps an order of its bodies, so that the next one differs.
+    """
 
     @classmethod
     def fits(cls, env: gymnasium.Env) -> bool:
-        return any(type(value).__name__ == "b2World" for value in vars(env.unwrapped).values())
+        return bool(_worlds(env))
+
+    def note_reset(self, seed: int | None) -> None:
+        super().note_reset(seed)
+        inner: Any = self.env.unwrapped
+        for name, world in _worlds(inner):
+            inner._destroy()  # while its bodies have their world
+            setattr(inner, name, type(world)(gravity=world.gravity))
+
+
+def _worlds(env: gymnasium.Env) -> list[tuple[str, Any]]:
+    own = vars(env.unwrapped).items()
+    return [(name, value) for name, value in own if type(value).__name__ == "b2World"]
 
 
 KINDS: tuple[Any, ...] = (

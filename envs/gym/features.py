@@ -32,10 +32,13 @@ def root_place(env: gymnasium.Env, observation: Any) -> np.ndarray:
 
 
 def whole_observation(env: gymnasium.Env, observation: Any, *, scale: Any = 1.0) -> np.ndarray:
-    """Return the observation, each number times its scale, float32 ``[F]``."""
+    """Return the observation, each number times its scale, float32 ``[F]``; int64 without one."""
     parts = observation.values() if isinstance(observation, dict) else [observation]
-    flat = [np.asarray(part, np.float32).reshape(-1) for part in parts]
-    return np.concatenate(flat) * np.float32(scale)
+    flat = [np.asarray(part).reshape(-1) for part in parts]
+    whole = flat[0] if len(flat) == 1 else np.concatenate(flat)
+    if scale is None:
+        return whole.astype(np.int64)
+    return whole.astype(np.float32) * np.float32(scale)
 
 
 def features_of(env: gymnasium.Env) -> Features:

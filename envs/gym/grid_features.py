@@ -26,9 +26,9 @@ class GridFeatures:
 
     .. math:: \phi_f = p + P\,v_f, \qquad f < F = 51
 
-    int64 ``[F]``, and 0 where there is nothing of the kind. Width-1 novelty over them keeps "here with the key"
-    apart from "here without it". All MiniGrid and BabyAI envs have the same columns, so that the
-    vector fits whatever an episode brings:
+    int64 ``[F]``, and 0 where there is nothing of the kind. Width-1 novelty over them keeps "here
+    with the key" apart from "here without it". All MiniGrid and BabyAI envs have the same columns,
+    so that the vector fits each episode:
 
     ======== =======================================================================================
     columns  variable

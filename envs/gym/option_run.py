@@ -6,23 +6,32 @@ Letters: S slots, T ``max_steps``.
 from __future__ import annotations
 
 import hashlib
+import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from torchrl.data.utils import CloudpickleWrapper
 
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
+from torchrl_hmcts.envs.gym.generators import generator_memory, set_generator_state
 from torchrl_hmcts.envs.gym.settable import make_gym
-from torchrl_hmcts.envs.gym.snapshots import SNAPSHOT_KEY, Snapshot, env_layers, redraw
+from torchrl_hmcts.envs.gym.snapshots import (
+    SNAPSHOT_KEY,
+    Snapshot,
+    env_layers,
+    redraw,
+    time_limits,
+)
 
 Shape = tuple[tuple[int, ...], Any]
 """Shape and dtype of an entry."""
+_JOB = struct.Struct("<qi")  # seed and option
 _ROW_BEFORE, _ROW_AFTER = f"before {SNAPSHOT_KEY}", f"after {SNAPSHOT_KEY}"
 _FEATURES = f"after {FEATURES_KEY}"
 
@@ -69,11 +78,13 @@ class OptionRun(ABC):
         outputs: shape and dtype of the entries that a state and an outcome have.
         work: memory of one int64, counted up while options run.
         step: takes a step as an env of Gymnasium does.
+        clock: a time limit that :meth:`run` keeps, since ``step`` goes past it.
     """
 
     state_keys: list[Any]
     outputs: dict[Any, Shape]
     step: Callable[[Any], tuple[Any, Any, Any, Any, Any]]
+    clock: Any = None
 
     def __init__(self, worker: OptionWorker, max_steps: int, gamma: float) -> None:
         self.worker, self.max_steps, self.gamma = worker, max_steps, gamma
@@ -111,15 +122,20 @@ class OptionRun(ABC):
         option = int(slots["option"][index])
         observation, generator = self.begin(slots, index)
         act, ends, take, gamma = self.worker.act, self.ends, self.step, self.gamma
-        reward, discount, work = 0.0, 1.0, self.work
+        reward, discount, work, clock = 0.0, 1.0, self.work, self.clock
+        left = clock._max_episode_steps - clock._elapsed_steps if clock is not None else np.inf
         for step in range(1, self.max_steps + 1):
             action = act(observation, option, generator)
             observation, gained, terminated, truncated, _ = take(action)
             work[0] += 1
             reward += discount * gained
             discount *= gamma
+            if step >= left:
+                truncated = True
             if terminated or truncated or (ends is not None and ends(observation, option, step)):
                 break
+        if clock is not None:
+            clock._elapsed_steps += step
         slots["reward"][index] = reward
         slots["duration"][index] = step
         slots["terminated"][index], slots["truncated"][index] = terminated, truncated
@@ -135,8 +151,7 @@ class OptionRun(ABC):
 
         The mark must be the same in every process.
         """
-        numbers = int(slots["seed"][index]).to_bytes(8, "little")
-        numbers += int(slots["option"][index]).to_bytes(4, "little")
+        numbers = _JOB.pack(slots["seed"][index], slots["option"][index])
         digest = hashlib.blake2b(numbers + mark, digest_size=8).digest()
         return int.from_bytes(digest, "little")
 
@@ -211,15 +226,23 @@ class GymRun(OptionRun):
         self.arguments = (env, keywords, snapshot, cap, *parts)
         self.env: gymnasium.Env = make_gym(env, **keywords)
         self.snapshot: Snapshot = snapshot_of(self.env, snapshot, cap=cap)
-        self._layers = env_layers(self.env)
-        self._clocks = [vars(layer) for layer in self._layers if type(layer) is TimeLimit]
+        self._layers, self._clocks = env_layers(self.env), time_limits(self.env)
         self._redrawing = redrawing
-        self._bits: Any = np.random.PCG64(0)
-        self._draws = np.random.Generator(self._bits)
+        self._draws = np.random.Generator(np.random.PCG64(0))
+        self._memory = generator_memory(self._draws)
         noting = type(self.snapshot).note_step
         unread = (Snapshot.note_step, AttributeSnapshot.note_step)
         self._notes_actions = noting not in unread
-        self.step = self._noted_step if self._notes_actions else self.env.step
+        inner = self.env
+        for layer in self._layers:  # which says that a reset comes first, as it does here
+            while type(getattr(layer, "env", None)) is OrderEnforcing:
+                layer.env = layer.env.env  # type: ignore[attr-defined]
+        if type(inner) is OrderEnforcing:
+            inner = inner.env
+        if type(inner) is TimeLimit and not self._notes_actions:
+            self.clock, inner = inner, inner.env
+        self._take = inner.step
+        self.step = self._noted_step if self._notes_actions else self._take
         observation = self.first_observation()
         self._paths = _paths(observation)
         self._single = self._paths == [()]
@@ -251,16 +274,15 @@ class GymRun(OptionRun):
         # Rows of equal states may differ: objects may have been pickled in another order.
         mark = b"".join([value.tobytes() for value in values])
         for clock in self._clocks:
-            mark += b"%d " % (clock["_elapsed_steps"] or 0)
+            mark += b"%d " % (clock._elapsed_steps or 0)
         seed = self.seed_of(slots, index, mark)
         if self._redrawing:
             redraw(self._layers, seed)
-        self._bits.state = {
-            "bit_generator": "PCG64",
-            "state": {"state": seed << 64 | seed, "inc": seed << 1 | 1},
-            "has_uint32": 0,
-            "uinteger": 0,
-        }
+        start = (seed << 64 | seed).to_bytes(16, "little") + (seed << 1 | 1).to_bytes(16, "little")
+        if self._memory is None:
+            set_generator_state(self._draws, start + bytes(8))
+        else:
+            self._memory[0][:], self._memory[1][:] = start, bytes(8)
         values = [
             value.copy() if kind is None else kind(value)
             for value, kind in zip(values, self._kinds, strict=True)
@@ -271,7 +293,7 @@ class GymRun(OptionRun):
 
     def _noted_step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         self.snapshot.note_step(action)
-        return self.env.step(action)
+        return self._take(action)
 
     def write(self, slots: dict[str, np.ndarray], index: int, observation: Any) -> None:
         slots[_ROW_AFTER][index] = self.snapshot.read()

@@ -1,7 +1,7 @@
 """Processes that run options, an env in each, fed through shared memory.
 
 Jobs are slots of a shared array: a state, an option and a seed go in, the outcome comes back in the
-same slot. What goes through pipes are the numbers of slots, up to eight in a message: all processes
+same slot. What goes through pipes are the numbers of slots, up to 32 in a message: all processes
 read from one pipe, so that whoever is free takes the next. The messages of a batch get shorter
 towards its end, so that all processes end at about the same time.
 """
@@ -36,8 +36,8 @@ from torchrl_hmcts.processes import (
 NUM_SLOTS = 512
 """Options that can be under way at once; larger batches are run in several goes."""
 
-_MESSAGE = struct.Struct("<8i")  # numbers of slots, then -1
-_MOST = 8
+_MESSAGE = struct.Struct("<32h")  # numbers of slots, then -1
+_MOST = 32
 _MAX_ERROR = 4000  # of an error; what a pipe takes at once
 _DEATHS_IN_A_ROW = 5
 _SILENCES_IN_A_ROW = 2

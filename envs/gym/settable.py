@@ -134,13 +134,13 @@ def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
         near = difflib.get_close_matches(name, list(gymnasium.registry), n=3, cutoff=0.5)
         hint = f"Nearest: {', '.join(near)}." if near else "gymnasium.pprint_registry() lists all."
         raise ValueError(
-            f"No env has the id {name!r}. {hint} MuJoCo's robots, MiniGrid and OGBench come with "
-            "pip install 'torchrl_hmcts[gym]', Atari with 'torchrl_hmcts[atari]'."
+            f"No env has the id {name!r}. {hint} Box2D, MuJoCo's robots, MiniGrid and OGBench come "
+            "with pip install 'torchrl_hmcts[gym]', Atari with 'torchrl_hmcts[atari]'."
         ) from None
     except gymnasium.error.DependencyNotInstalled as error:
         raise ImportError(
-            f"{name} needs a package that is not installed ({error}). MuJoCo's, MiniGrid's and "
-            "OGBench's come with pip install 'torchrl_hmcts[gym]', Atari's with "
+            f"{name} needs a package that is not installed ({error}). Box2D's, MuJoCo's, "
+            "MiniGrid's and OGBench's come with pip install 'torchrl_hmcts[gym]', Atari's with "
             "'torchrl_hmcts[atari]'."
         ) from error
 

@@ -19,6 +19,7 @@ from torchrl_hmcts.envs.gym.snapshots import env_layers, redraw
 
 _LENGTHS = (1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56)  # base steps of an option that are tried
 _REACH = 0.1  # how far an option should move the features, as a share of what they span
+_CELLS = 2_000  # of a novelty radius that should fill the features' span
 _EPISODES, _STEPS = 6, 200
 _MAX_OPTIONS = 64
 _SUCCESS = ("success", "is_success")
@@ -62,7 +63,8 @@ class TaskEnv(gymnasium.Wrapper):
             over = truncated or (terminated and not solved)
             return observation, reward, solved, over, info
         if self.kind == "return":
-            return observation, (reward + self.shift) * self.scale, terminated, truncated, info
+            paid = (float(reward) + self.shift) * self.scale
+            return observation, paid, terminated, truncated, info
         return observation, float(solved), terminated or solved, truncated, info
 
     def is_success(self, reward: Any, terminated: bool, info: dict[str, Any]) -> bool:
@@ -130,7 +132,8 @@ class Look:
         discrete: whether the features are numbers of kinds, not of degree.
         option_steps: base steps after which a quarter of the options has moved the features by a
             tenth of what they span, or nearly as far as any option does.
-        novelty_radius: half of how far that is.
+        novelty_radius: half of how far that is; more where there are many features, so that some
+            thousand states fill their span.
         step_reward: least reward of a step that does not end an episode.
         shift, scale: of the rewards of a task of kind ``"return"``.
         steps: base steps that the look took.
@@ -161,9 +164,8 @@ class Look:
         task = "reach a goal" if self.kind == "goal" else "collect rewards"
         chance = ", with chance" if self.stochastic else ""
         return (
-            f"task: {task}{chance}; options of {self.option_steps} base steps move the features "
-            f"about {2 * self.novelty_radius:.3g}; novelty radius {self.novelty_radius:.3g} "
-            f"(found in {self.steps:,} steps)"
+            f"task: {task}{chance}; options of {self.option_steps} base steps; "
+            f"novelty radius {self.novelty_radius:.3g} (found in {self.steps:,} steps)"
         )
 
 
@@ -198,7 +200,9 @@ def look_at(
     points = np.array(walk.points, np.float64)
     discrete = np.array(walk.points).dtype.kind in "iu" or _counts(made.observation_space, chosen)
     span = np.ptp(points, 0)
-    if chosen is whole_observation and not discrete:
+    if chosen is whole_observation and discrete:
+        chosen = partial(whole_observation, scale=None)
+    elif chosen is whole_observation:
         scale = np.divide(1.0, span, out=np.zeros_like(span), where=span > 1e-6)
         chosen = partial(whole_observation, scale=scale.astype(np.float32))
         span = np.sign(scale)
@@ -211,10 +215,12 @@ def look_at(
     option_steps, radius = 1, 0.5
     if not discrete:
         moved = _moves(made, chosen, draws, walk)
-        whole = float(np.linalg.norm(span) if goal else span.max())
-        wanted = min(_REACH * whole, 0.9 * float(moved.max()))
+        wide = span[span > 0.0]
+        whole = float(np.linalg.norm(wide) if goal else span.max())
+        least = float(np.exp(np.log(wide).mean())) * _CELLS ** (-1 / len(wide)) if len(wide) else 0
+        wanted = min(max(_REACH * whole, 1.6 * least * goal), 0.9 * float(moved.max()))
         best = int(np.argmax(moved >= wanted))
-        option_steps, radius = _LENGTHS[best], max(float(moved[best]) / 2, 1e-6)
+        option_steps, radius = _LENGTHS[best], max(float(moved[best]) / 2, least, 1e-6)
     shift = -float(steady.min()) if not walk.ended and steady.min() < 0.0 else 0.0
     size = max((abs(value) for value in walk.returns), default=1.0)
     return Look(

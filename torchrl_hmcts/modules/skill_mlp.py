@@ -104,7 +104,13 @@ class SkillMLP(nn.Module):
         check_skill(skill, features[0], self.skill_size)
         y = self._all_skills(weights, features)  # [*B, Z, O], of stacked weights [N, *B, Z, O]
         index = skill.unsqueeze(-1).unsqueeze(-1).expand(*y.shape[:-2], 1, self.out_features)
-        return y.gather(-2, index).squeeze(-2)
+        if torch.compiler.is_compiling():
+            return y.gather(-2, index).squeeze(-2)
+        try:
+            return y.gather(-2, index).squeeze(-2)
+        except RuntimeError:
+            refuse_unknown(skill, self.num_skills)
+            raise
 
     def all_skills(self, *features: Tensor) -> Tensor:
         """Returns the outputs for every skill, ``[*B, Z, O]``."""
@@ -170,6 +176,8 @@ class ConcatSkillMLP(SkillMLP):
         *features, skill = inputs
         check_skill(skill, features[0], self.skill_size)
         if self.num_skills is not None:
+            if skill.device.type == "cpu" and not torch.compiler.is_compiling():
+                refuse_unknown(skill, self.num_skills)  # its one-hot would be zeros
             skill = self._one_hot(skill, features[0])
         return run_layers(self.trunk, weights, torch.cat((*features, skill), -1))
 
@@ -341,6 +349,19 @@ def check_skill(skill: Tensor, features: Tensor, size: int | None) -> None:
             f"Skills must be indices, int64 {list(features.shape[:-1])} for features "
             f"{list(features.shape)}; got {skill.dtype} {list(skill.shape)}. One-hot skills become "
             f"indices by skill.long().argmax(-1)."
+        )
+
+
+def refuse_unknown(skill: Tensor, num_skills: int | None) -> None:
+    """Raises ValueError if there is a skill that does not exist."""
+    if num_skills is None or not skill.numel():
+        return
+    low, high = map(int, torch.aminmax(skill))
+    if low < 0 or high >= num_skills:
+        raise ValueError(
+            f"Skill {low if low < 0 else high} does not exist: a network of "
+            f"num_skills={num_skills} knows 0 to {num_skills - 1}. Give the "
+            f"SkillTransform or OptionTransform as many."
         )
 
 

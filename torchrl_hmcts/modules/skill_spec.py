@@ -139,14 +139,9 @@ def require_known(owner: str, reader: object, known: TensorSpec, drawn: TensorSp
     if not fits:
         raise ValueError(
             f"{owner} finds an env that draws {described(drawn)}, and a {type(reader).__name__} "
-            f"that knows {described(known)}. Give both the same, e.g. SkillTransform("
-            f"{reader_spec(known)})."
+            f"that knows {described(known)}. Give both the same: "
+            + ("one spec." if most is None else f"SkillTransform({most}).")
         )
-
-
-def reader_spec(spec: TensorSpec) -> str:
-    """Returns what to write for a spec, in an error."""
-    return str(number_of(spec) or f"{type(spec).__name__}({spec.shape[-1]})")
 
 
 def no_prior(owner: str, spec: TensorSpec) -> str:

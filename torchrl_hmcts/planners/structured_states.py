@@ -71,8 +71,8 @@ def _structured(roots: Any) -> tuple[Any, Callable[..., Any]]:
     as_tensor, arrays = kinds.pop(), {path: _array(leaf) for path, leaf in leaves.items()}
     number = {len(array) if array.ndim else None for array in arrays.values()}
     if len(number) != 1 or None in number:
-        got = {path: list(array.shape) for path, array in arrays.items()}
-        raise ValueError(f"All arrays of a structure need one row for each root; got {got}.")
+        shapes = {path: list(array.shape) for path, array in arrays.items()}
+        raise ValueError(f"All arrays of a structure need one row for each root; got {shapes}.")
     events = {path: (array.dtype, array.shape[1:]) for path, array in arrays.items()}
 
     def pack(arrays: Mapping[str, np.ndarray]) -> Any:

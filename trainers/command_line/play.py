@@ -79,7 +79,9 @@ def _write_page(agent: HMCTS, solution: Solution, folder: Path, seed: int) -> Pa
         ("simulated base steps", solution.simulated_steps),
         ("seconds of planning", round(solution.plan_seconds, 2)),
     ]
-    shown = [picture(folder / name, words, embed=False) for name, words in pictures.captions.items()]
+    shown = [
+        picture(folder / name, words, embed=False) for name, words in pictures.captions.items()
+    ]
     sections = [
         Section(words=[repr(agent)], pictures=shown),
         Section("Figures", tables=[Table(rows)]),

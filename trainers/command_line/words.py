@@ -47,8 +47,8 @@ def parse_config(
     if made:
         from omegaconf import OmegaConf
 
-        keywords = OmegaConf.to_container(OmegaConf.from_dotlist(made))["make"]  # type: ignore[call-overload, index]
-        config = replace(config, make={**config.make, **keywords})
+        keywords: Any = OmegaConf.to_container(OmegaConf.from_dotlist(made))
+        config = replace(config, make={**config.make, **keywords["make"]})
         chosen = [word for word in chosen if word not in made]
     if not chosen:
         return config

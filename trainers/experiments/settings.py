@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
+from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
 NUM_TEST_MAZES = 342  # of Waterworld's test split
 BATCH_STEPS = 64  # base steps of a batch of DIAYN's training
@@ -81,7 +81,7 @@ class SkillsConfig(RunConfig):
         "num_skills",
     )
     LEAST = {"curve_points": 0}
-    ABOVE_ZERO = ("novelty_radius", "updates_per_step")
+    ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("novelty_radius", "updates_per_step")
     CHOICES = {
         "options": ("learned", "actions"),
         "algorithm": ("diayn", "hmcts"),
@@ -422,6 +422,8 @@ class GymConfig(SkillsConfig):
     """Base steps of worker training."""
     expansions: int = 20_000
     """Nodes that a search may expand before it gives up, where there is a goal."""
+    improve_expansions: int = 2_000
+    """Nodes that it expands after the first plan to find a shorter one, where every step costs."""
     search_steps: int = 2_000
     """Base steps that each search may simulate, where rewards are collected."""
     processes: int = 0
@@ -435,7 +437,7 @@ class GymConfig(SkillsConfig):
     TOY = {"train_base_steps": 1_280, "mazes": 2, "expansions": 200, "search_steps": 200}
     KEPT = (*SkillsConfig.KEPT, "id", "make", "option_steps", "skill_steps")
     LEAST = {"curve_points": 0, "option_steps": 0, "skill_steps": 0, "processes": 0}
-    ABOVE_ZERO = ("updates_per_step",)
+    ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("updates_per_step",)
     CHOICES = SkillsConfig.CHOICES | {
         "options": ("learned", "actions", "directions"),
         "task": ("auto", "goal", "return"),
@@ -448,11 +450,18 @@ class GymConfig(SkillsConfig):
         return max(BATCH_STEPS, self.train_base_steps // BATCH_STEPS * BATCH_STEPS)
 
     def check_inputs(self) -> None:
-        """Check that there is an id.
+        """Check that there is such an env.
 
         Raises:
-            ValueError: if there is none.
+            ExperimentError: if there is no id, or none like it.
+            ImportError: if the env needs a package that is not installed.
         """
         super().check_inputs()
         if not self.id:
-            raise ValueError("say which env: env.id=NAME, e.g. env.id=PointMaze_Large-v3.")
+            raise ExperimentError("say which env: env.id=NAME, e.g. env.id=PointMaze_Large-v3.")
+        from torchrl_hmcts.envs.gym.settable import make_gym  # here: it loads torch
+
+        try:
+            make_gym(self.id, **self.make).close()
+        except ValueError as error:
+            raise ExperimentError(str(error)) from None

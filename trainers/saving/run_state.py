@@ -16,10 +16,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.envs import GymLikeEnv
+from torchrl.envs import GymLikeEnv, TransformedEnv
 from torchrl.trainers import Trainer
 
-from torchrl_hmcts.nesting import innermost
 from torchrl_hmcts.trainers.saving.checkpoints import PlainStateAdapter
 
 Generator = torch.Generator | np.random.Generator | random.Random
@@ -117,7 +116,9 @@ class RunningEpisodes:
             pool = {"traj_pool": {"traj_id": next_id}}
             self.collector.load_state_dict({**self.collector.state_dict(), **pool}, strict=False)
         carrier = TensorDict(dict(state_dict["entries"]), batch_size=saved, device=old.device)
-        base = innermost(self.collector.env)
+        base = self.collector.env
+        while isinstance(base, TransformedEnv):
+            base = base.base_env
         if base.batch_locked:  # it steps from the state that it was set to
             with torch.random.fork_rng(devices=[]):
                 state = carrier.select(*base.full_state_spec.keys(True, True))

@@ -9,6 +9,7 @@ own is a subclass of :class:`Kit` with the first four methods.
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,10 +21,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.planners import MCTSPlanner
+from torchrl_hmcts.planners import PUCT, MCTSPlanner, PolicyValueEvaluator
 from torchrl_hmcts.trainers.diayn import worker_losses
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
@@ -261,6 +263,11 @@ class Kit:
         planner: MCTSPlanner = build(**part, env=simulator)
         return planner
 
+    @property
+    def manager_keys(self) -> Sequence[NestedKey]:
+        """Entries of the states of which a network for the manager can learn; none: none."""
+        return ()
+
     def make_round_planner(self, simulator: EnvBase, **own: Any) -> MCTSPlanner:
         """Return the planner of Algorithm 3's training rounds: bare, with the keys of ``planner``.
 
@@ -281,6 +288,49 @@ class Kit:
     def second_try(self) -> Kit | None:
         """Return the kit with which starts are searched again that have no plan; None for none."""
         return None
+
+    def guide(self, planner: MCTSPlanner, network: TensorDictModuleBase) -> MCTSPlanner:
+        """Return a planner with the prior and the values of a network.
+
+        Args:
+            planner: of :meth:`make_planner`.
+            network: writes ``"logits"`` and ``"state_value"``.
+        """
+        guide = PolicyValueEvaluator(network, uniform_share=0.05)
+        return MCTSPlanner(
+            planner.simulator.given_env,
+            tree_policy=PUCT(c=0.3),
+            leaf_evaluator=guide,
+            backup="max",
+            novelty=planner.novelty,
+            expand="one",
+            budget=planner.budget,
+        )
+
+    def act_by(self, policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase) -> Results:
+        """Act in one episode by a policy over the options, without a search.
+
+        Args:
+            policy: reads the states of ``real``, writes the option.
+            real: the macro env to act in.
+            start: state ``[1]``.
+        """
+        begin = time.perf_counter()
+        limit = self.config.max_frames
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            episode = real.rollout(limit, policy, auto_reset=False, tensordict=start[0].clone())
+        none = np.zeros(1, np.int64)
+        return Results(
+            found=np.array([True]),
+            solved=episode[-1]["next", "terminated"].numpy().reshape(1),
+            simulated_steps=none,
+            expansions=none,
+            simulations=none,
+            plan_options=np.array([len(episode)]),
+            episode_steps=np.array([int(episode["next", "duration"].sum())]),
+            rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
+            plan_seconds=np.array([time.perf_counter() - begin]),
+        )
 
     def act(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
@@ -15,15 +14,17 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymWrapper, StepCounter, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_hmcts.envs import (
+    GridMoves,
+    GridView,
     OptionPool,
     RepeatActions,
     SettableGymEnv,
     SkillWorker,
 )
 from torchrl_hmcts.envs.gym.features import WithFeatures, achieved_goal, root_place
+from torchrl_hmcts.envs.gym.minigrid import MiniGridSnapshot
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
 from torchrl_hmcts.modules import SkillPolicy
@@ -38,16 +39,28 @@ _PLAYED = 1_000_003  # added to the seed of envs to act in
 _WORKER_KEYS = ("achieved_goal", "desired_goal", "features", "snapshot")
 
 
-def make_task(name: Any, look: Look, real: bool, keywords: Mapping[str, Any]) -> gymnasium.Env:
-    """Make an env as the task that a look found, in any process.
+def make_seen(name: Any, given: bool, **keywords: Any) -> gymnasium.Env:
+    """Make an env as options see it: MiniGrid without pictures, if no skill is to be learned.
 
     Args:
         name: id, or a function that makes the env.
+        given: whether the options are given.
+        **keywords: of ``gymnasium.make``.
+    """
+    env: gymnasium.Env = make_gym(name, **keywords)
+    return GridView(env) if given and MiniGridSnapshot.fits(env) else env
+
+
+def make_task(make: Any, look: Look, real: bool, keywords: Mapping[str, Any]) -> gymnasium.Env:
+    """Make an env as the task that a look found, in any process.
+
+    Args:
+        make: makes the env.
         look: of :func:`look_at`.
         real: pay what the env itself pays, and call only a success terminal.
         keywords: of ``gymnasium.make``.
     """
-    task = look.task(make_gym(name, **keywords))
+    task = look.task(make(**keywords))
     task.is_real = real
     return task
 
@@ -80,7 +93,7 @@ class GymKit(Kit):
         >>> from torchrl_hmcts.trainers.experiments.settings import GymConfig
         >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
         >>> kit.look.kind, kit.config.option_steps
-        ('goal', 14)
+        ('goal', 20)
     """
 
     place_key = "features"
@@ -93,26 +106,27 @@ class GymKit(Kit):
         super().__init__(config)
         if env is None:
             config.check_inputs()
-        self._env = config.id if env is None else env
+        given = config.options != "learned"
+        self._env = partial(make_seen, config.id if env is None else env, given)
         look = look_at(self._env, gamma=config.gamma, **config.make)
         if config.task != "auto":
-            look = dataclasses.replace(look, kind=config.task)
+            look = dataclasses.replace(look, kind=config.task)  # type: ignore[arg-type]
         self.look = look
-        steps = config.option_steps or look.option_steps
+        self._moves = isinstance(self.gym_env, GridView)
+        steps = config.option_steps or (3 if self._moves else look.option_steps)
         self.config = dataclasses.replace(
             config,
             option_steps=steps,
             skill_steps=config.skill_steps or 2 * steps,
             novelty_radius=config.novelty_radius or look.novelty_radius,
         )
-        self._fixed: RepeatActions | None = None
+        self._fixed: Any = None  # worker of a pool whose options are given
         self._radius = config.novelty_radius  # 0: half of how far the options reach
 
     @cached_property
     def gym_env(self) -> gymnasium.Env:
         """Return the env as Gymnasium makes it, for what it says of itself."""
-        made: gymnasium.Env = make_gym(self._env, **self.config.make)
-        return made
+        return self._env(**self.config.make)
 
     # ------------------------------------------------------- envs
 
@@ -131,7 +145,7 @@ class GymKit(Kit):
         config = self.config
 
         def make() -> gymnasium.Env:
-            return WithFeatures(make_gym(self._env, **config.make), self.look.features)
+            return WithFeatures(self._env(**config.make), self.look.features)
 
         envs = SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
         return TransformedEnv(
@@ -147,11 +161,11 @@ class GymKit(Kit):
     def starts(self, split: str, num_starts: int) -> TensorDictBase:
         env = self.make_env(split)
         tasks = getattr(self.gym_env.unwrapped, "num_tasks", 0)
-        found = []
+        found: list[TensorDictBase] = []
         for number in range(num_starts):
             options = {"options": {"task_id": number % tasks + 1}} if tasks else {}
             found.append(env.reset(**options))
-        return torch.stack(found).exclude("done", "terminated", "truncated")
+        return torch.stack(found).exclude("done", "terminated", "truncated")  # type: ignore[attr-defined]
 
     def make_options(
         self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
@@ -200,6 +214,11 @@ class GymKit(Kit):
     def given_worker(self) -> TensorDictModuleBase | None:
         if self.config.options == "learned":
             return None
+        if self._moves:
+            space: Any = self.gym_env.action_space
+            self._fixed = GridMoves(int(space.n))
+            self.config = dataclasses.replace(self.config, num_skills=self._fixed.num_options)
+            return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         actions = fixed_actions(self.gym_env.action_space)
         self._fixed = RepeatActions(actions)
         self.config = dataclasses.replace(self.config, num_skills=len(actions))
@@ -224,32 +243,48 @@ class GymKit(Kit):
 
     def planner_part(self) -> dict[str, Any]:
         config, part = self.config, super().planner_part()
-        if self.look.stochastic:
-            part |= {
-                "chance": {"_component_": "torchrl_hmcts.planners.ProgressiveWidening"},
-                "novelty": None,
-                "leaves_per_wave": 1,
-                "expand": "one",
-            }
-        if self.look.kind == "return" or self.look.stochastic:
-            part["budget"] |= {
-                "expansions": None,
+        if self.look.discrete:
+            stages = getattr(self.look.features, "stages", ())
+            name = "torchrl_hmcts.planners.WidthNovelty"
+            part["novelty"] = {"_component_": name, "key": self.place_key, "stages": stages}
+            part["leaves_per_wave"] = 32
+        elif self.look.step_reward < 0.0:  # shorter plans pay more
+            part["novelty"]["shorter_paths"] = True
+            part["budget"]["improve_expansions"] = config.improve_expansions
+        if not self.replans:
+            return part
+        planners = "torchrl_hmcts.planners"
+        part |= {
+            "novelty": None,
+            "expand": "one",
+            "rollout": {"_component_": f"{planners}.TreeRollout", "max_options": 20},
+            "leaves_per_wave": 1,
+            "budget": {
+                "_component_": f"{planners}.SearchBudget",
                 "base_steps": config.search_steps,
                 "until_plan": False,
-            }
+            },
+        }
         if self.look.kind == "return":
-            part |= {"novelty": None}
-            if not self.look.stochastic:
-                part |= {
-                    "backup": "max",
-                    "final_choice": {"_component_": "torchrl_hmcts.planners.HighestValue"},
-                }
+            part |= {
+                "backup": "max",
+                "final_choice": {"_component_": f"{planners}.HighestValue"},
+            }
+        else:
+            part["chance"] = {"_component_": f"{planners}.ProgressiveWidening"}
         return part
 
     def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
         planner = super().make_planner(simulator, **budget)
         planner.simulator.keep([self.place_key])  # for pictures
         return planner
+
+    @property
+    def manager_keys(self) -> Sequence[Any]:
+        if self._moves:  # the view of the grid has too little
+            return []
+        keys = self.make_env("train").observation_spec.keys(True, True)
+        return [key for key in keys if key not in ("features", "snapshot")]
 
     @property
     def replans(self) -> bool:
@@ -265,31 +300,18 @@ class GymKit(Kit):
     ) -> Results:
         if not self.replans:
             return super().act(planner, real, starts, keys)
-        return Results.concatenate([self._play(planner, real, one, keys) for one in starts])
+        return Results.concatenate([self._play(planner, real, one) for one in starts.split(1)])
 
-    def _play(
-        self, planner: MCTSPlanner, real: EnvBase, start: TensorDictBase, keys: Sequence[Any]
-    ) -> Results:
+    def _play(self, planner: MCTSPlanner, real: EnvBase, start: TensorDictBase) -> Results:
         """Act in one episode, with a search before every option."""
         policy = HierarchicalPolicy(planner, replan_every=1, reuse=not self.look.stochastic)
         pool: Any = planner.simulator.given_env
-        before, begin = pool.num_steps, time.perf_counter()
-        limit = getattr(self.gym_env.spec, "max_episode_steps", None) or 10_000
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            episode = real.rollout(limit, policy, auto_reset=False, tensordict=start.clone())
-        last = episode[-1]["next"]
-        return Results(
-            found=np.array([True]),
-            solved=last["terminated"].numpy().reshape(1),
-            simulated_steps=np.array([pool.num_steps - before]),
-            expansions=np.array([0]),
-            simulations=np.array([0]),
-            plan_options=np.array([len(episode)]),
-            episode_steps=np.array([int(episode["next", "duration"].sum())]),
-            rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
-            plan_seconds=np.array([time.perf_counter() - begin]),
-            plans=[extract_plans(planner.last_search)[0]] if planner.last_search else [],
-        )
+        before = pool.num_steps
+        results = self.act_by(policy, real, start)
+        results.simulated_steps = np.array([pool.num_steps - before])
+        if planner.last_search is not None:
+            results.plans = [extract_plans(planner.last_search)[0]]
+        return results
 
     # ------------------------------------------------------- figures
 
@@ -306,7 +328,7 @@ class GymKit(Kit):
     def _draws_itself(self) -> bool:
         """Whether the env can draw here; what hinders it is printed."""
         try:
-            env = make_gym(self._env, **{**self.config.make, "render_mode": "rgb_array"})
+            env = self._env(**{**self.config.make, "render_mode": "rgb_array"})
             env.reset(seed=0)
             picture = env.render()
             env.close()
