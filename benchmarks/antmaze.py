@@ -1,6 +1,7 @@
 """AntMaze: an ant learns to walk without a reward, and a planner takes it to goals.
 
-    python benchmarks/antmaze.py learn antmaze-large-v0 AntMaze_Large-v5 --seeds 0
+    python benchmarks/antmaze.py learn antmaze-large-v0 --seeds 0
+    python benchmarks/antmaze.py learn AntMaze_Large-v5 --seeds 0 --frames 75000 --width 128
     python benchmarks/antmaze.py solve antmaze-medium-v0 antmaze-large-v0 antmaze-giant-v0 \\
         AntMaze_Medium-v5 AntMaze_Large-v5 --seeds 0
     python benchmarks/antmaze.py draw
