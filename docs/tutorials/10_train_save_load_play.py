@@ -15,7 +15,7 @@ from pathlib import Path
 from torchrl_hmcts.trainers import HMCTS, load_worker
 
 folder = Path(tempfile.mkdtemp()) / "car"
-agent = HMCTS("MountainCar-v0", num_skills=4, expansions=2_000).learn(2_560, progress=False)
+agent = HMCTS("MountainCar-v0", num_skills=4).learn(6_400, progress=False)
 agent.save(folder)
 print(sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()))
 

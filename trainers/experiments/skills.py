@@ -71,6 +71,8 @@ def run_skills(config: SkillsConfig) -> dict[str, Any]:
 def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
     kit = make_kit(config)
+    if found := kit.describe():
+        print(found)
     begin = time.perf_counter()
     logger = make_logger(config)
     learned = learn(

@@ -307,6 +307,10 @@ class Kit:
             budget=planner.budget,
         )
 
+    def describe(self) -> str:
+        """Return what the kit has found out of the env by itself, for the beginning of a run."""
+        return ""
+
     def act_by(self, policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase) -> Results:
         """Act in one episode by a policy over the options, without a search.
 

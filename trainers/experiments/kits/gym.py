@@ -211,6 +211,9 @@ class GymKit(Kit):
             seed=config.seed + (_PLAYED if real else 0),
         )
 
+    def describe(self) -> str:
+        return f"{self.config.id}: {self.look}."
+
     def given_worker(self) -> TensorDictModuleBase | None:
         if self.config.options == "learned":
             return None
