@@ -289,12 +289,12 @@ COSTLY = {  # milliseconds each; the others take microseconds
 }
 EXCLUDED = {  # why public names are not fuzzed here
     "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
-    "Evaluation GoalEpisodes GoalTrack Options Controllability",
+    "Evaluation GoalEpisodes GoalTrack Options Controllability Solution MujocoTask",
     "a protocol": "NoveltyTest PlansGoals OptionWorker",
     "a base class": "SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
-    "SkillWorker GridView "
+    "SkillWorker GridView MujocoBatch HMCTS "
     "AttributeSnapshot ReplaySnapshot SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",
     "hands its arguments to SkillReward": "SkillRewardHook",

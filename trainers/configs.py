@@ -89,6 +89,7 @@ _PACKAGES: Mapping[str, Mapping[str, str]] = {
     },
     "torchrl_hmcts.envs": {
         "env": "atari_ram=AtariRAMEnv gridworld=GridworldMazeEnv labmaze=LabMazeEnv "
+        "mujoco_batch=MujocoBatch "
         "settable_gym=SettableGymEnv stateless=StatelessSimulator waterworld=WaterworldMazeEnv",
     },
     "torchrl_hmcts.trainers": {
