@@ -4,8 +4,8 @@
 
 ``HMCTS(id, num_skills=4).learn(STEPS)`` at its defaults, the same in every maze: DIAYN's skills,
 without reward; one plan from each start; its options executed in another instance of the env. In
-OGBench start number i is of task i modulo 5, with the env's own noise on start and goal. CPU-seconds
-of a plan are those of the search, in one process (``time.process_time``).
+OGBench start number i is of task i modulo 5, with the env's own noise on start and goal.
+CPU-seconds of a plan are those of the search, in one process (``time.process_time``).
 
 Beside it, at the option length and novelty radius of the learned agent: eight fixed directions, and
 skills after 64 base steps of training. Their searches end at LIMIT base steps.
@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ import torch
 from torchrl_hmcts.trainers import HMCTS
 
 ENVS = ["PointMaze_Large-v3", "pointmaze-medium-v0", "pointmaze-large-v0", "pointmaze-giant-v0"]
-SKILLS, STEPS, LIMIT = 4, 30_000, 60_000
+SKILLS, STEPS, LIMIT = 4, 30_000, 30_000
 COMMAND = (
     "python benchmarks/point_mazes.py --seeds 0 1 2 --out docs/results/settable/point_mazes.json"
 )
@@ -63,24 +64,33 @@ def solve(agent: HMCTS, num_starts: int) -> dict[str, Any]:
     }
 
 
-def run(name: str, seed: int, starts: int, ablation_starts: int) -> dict[str, Any]:
-    """Learn and plan in one env, and beside it the ablations."""
+def run(
+    name: str, seed: int, starts: int, ablation_starts: int
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Learn and plan in one env, and beside it the ablations; give each as it is done."""
     begin = time.process_time()
     agent = HMCTS(name, num_skills=SKILLS, seed=seed).learn(STEPS, progress=False)
     seconds = round(time.process_time() - begin, 1)
     found = {
         key: getattr(agent.config, key) for key in ("option_steps", "skill_steps", "novelty_radius")
     }
-    learned = {"training_cpu_seconds": seconds, **found, **solve(agent, starts)}
-    rows: dict[str, Any] = {"learned": learned}
-    print(name, seed, rows, flush=True)
+    yield "learned", {"training_cpu_seconds": seconds, **found, **solve(agent, starts)}
     if ablation_starts:
         same = {**found, "planner": {"budget": {"base_steps": LIMIT}}}
         fixed = HMCTS(name, seed=seed, **same)
-        rows["eight fixed directions"] = solve(fixed, ablation_starts)
+        yield "eight fixed directions", solve(fixed, ablation_starts)
         untrained = HMCTS(name, num_skills=SKILLS, seed=seed, **same).learn(64, progress=False)
-        rows["untrained"] = solve(untrained, ablation_starts)
-    return rows
+        yield "untrained", solve(untrained, ablation_starts)
+
+
+def add(out: Path, name: str, seed: int, way: str, row: dict[str, Any]) -> None:
+    """Add a row to the file, which other processes may have begun."""
+    told: dict[str, Any] = {"command": COMMAND, "skills": SKILLS, "training_steps": STEPS}
+    if out.is_file():
+        told = json.loads(out.read_text())
+    runs = told.setdefault("runs", {}).setdefault(name, {})
+    runs.setdefault(str(seed), {})[way] = row
+    out.write_text(json.dumps(told, indent=1, sort_keys=True) + "\n")
 
 
 def main() -> None:
@@ -95,13 +105,9 @@ def main() -> None:
     for seed in arguments.seeds:
         for name in arguments.envs:
             others = arguments.ablation_starts if seed == arguments.seeds[0] else 0
-            rows = run(name, seed, arguments.starts, others)
-            print(name, seed, rows, flush=True)
-            told = {"command": COMMAND, "skills": SKILLS, "training_steps": STEPS, "runs": {}}
-            if arguments.out.is_file():  # runs of other processes
-                told = json.loads(arguments.out.read_text())
-            told["runs"].setdefault(name, {})[str(seed)] = rows
-            arguments.out.write_text(json.dumps(told, indent=1, sort_keys=True) + "\n")
+            for way, row in run(name, seed, arguments.starts, others):
+                print(name, seed, way, row, flush=True)
+                add(arguments.out, name, seed, way, row)
 
 
 if __name__ == "__main__":

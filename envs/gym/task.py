@@ -130,7 +130,7 @@ class Look:
         features: what says where the env is.
         discrete: whether the features are numbers of kinds, not of degree.
         option_steps: base steps after which a quarter of the options has moved the features by a
-            twelfth of what they span, or by 0.7 of the farthest that options of any length do.
+            twelfth of what they span, or by three quarters of the farthest that any length does.
         novelty_radius: half of how far that is; more where there are many features, so that some
             thousand states fill their span.
         step_reward: least reward of a step that does not end an episode.
@@ -217,7 +217,7 @@ def look_at(
         wide = span[span > 0.0]
         whole = float(np.linalg.norm(wide) if goal else span.max())
         least = float(np.exp(np.log(wide).mean())) * _CELLS ** (-1 / len(wide)) if len(wide) else 0
-        wanted = min(max(_REACH * whole, 1.6 * least * goal), 0.7 * float(moved.max()))
+        wanted = min(max(_REACH * whole, 1.6 * least * goal), 0.75 * float(moved.max()))
         best = int(np.argmax(moved >= wanted))
         option_steps, radius = _LENGTHS[best], max(float(moved[best]) / 2, least, 1e-6)
     shift = -float(steady.min()) if not walk.ended and steady.min() < 0.0 else 0.0
