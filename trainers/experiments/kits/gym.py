@@ -95,7 +95,7 @@ class GymKit(Kit):
         >>> from torchrl_hmcts.trainers.experiments.settings import GymConfig
         >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
         >>> kit.look.kind, kit.config.option_steps
-        ('goal', 20)
+        ('goal', 14)
     """
 
     place_key = "features"
