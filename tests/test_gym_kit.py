@@ -13,7 +13,7 @@ import torch
 from gymnasium import spaces
 
 from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv
-from torchrl_hmcts.envs.gym.features import WithFeatures
+from torchrl_hmcts.envs.gym.features import WithFeatures, whole_observation
 from torchrl_hmcts.envs.gym.task import TaskEnv, fixed_actions, look_at
 from torchrl_hmcts.planners import HierarchicalPolicy, HighestValue, MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
@@ -58,13 +58,23 @@ def test_rewards_on_the_way_make_a_task_of_returns_and_costs_one_of_a_goal() -> 
     assert look_at(lambda: Line(noise=True)).stochastic
 
 
-def test_an_option_moves_the_features_by_a_tenth_of_what_they_span() -> None:
+def test_an_option_moves_the_features_by_a_twelfth_of_what_they_span() -> None:
     look = look_at(lambda: Line())
     env = Line()
     points = [look.features(env, np.array([place], np.float32)) for place in (0.0, 1.0)]
     step = float(abs(points[1] - points[0]).item())  # of one base step
     assert look.novelty_radius == pytest.approx(look.option_steps * step / 2)
-    assert look.option_steps * step >= 0.1 > (look.option_steps - 1) * step
+    assert look.option_steps * step >= 0.08 > (look.option_steps - 1) * step
+
+
+def test_an_option_ends_where_it_no_longer_moves_the_features() -> None:
+    keywords: dict[str, Any] = {"features": whole_observation, "num_processes": 0, "max_steps": 18}
+    lengths = {}
+    for still in (0.0, 0.5):  # in a fifth of 18 steps, rounded up
+        pool = OptionPool(lambda: Line(), RepeatActions(2), still=still, **keywords)
+        starts = pool.reset().expand(2).clone().set("option", torch.arange(2))
+        lengths[still] = pool.step(starts)["next", "duration"].flatten().tolist()
+    assert lengths == {0.0: [18, 9], 0.5: [5, 9]}  # left is a wall, right the goal
 
 
 @pytest.mark.parametrize(

@@ -428,6 +428,7 @@ class Wide(RepeatActions):
         ({"num_processes": -1}, ValueError, "num_processes >= 0; got -1"),
         ({"gamma": 1.5}, ValueError, r"gamma .*<= 1.0; got 1.5"),
         ({"step_seconds": 0.0}, ValueError, "step_seconds > 0.0 .*got 0.0"),
+        ({"still": 0.1}, ValueError, "pass features="),
         ({"start_method": "fork"}, ValueError, "would inherit"),
         ({"env": "CartPol-v1"}, ValueError, "Nearest: CartPole-v1"),
         ({"env": gymnasium.make("CartPole-v1")}, TypeError, "an id or a function"),

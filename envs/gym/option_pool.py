@@ -57,6 +57,8 @@ class OptionPool(ProcessPool):
         snapshot, cap: as in :class:`SettableGymEnv`.
         features (callable, optional): ``features(env, observation)`` gives an array ``[F]`` of the
             state at an option's end, e.g. a place for a novelty test that no observation has.
+        still (float): an option ends early once it has moved the features less than this within a
+            fifth of ``max_steps``, e.g. before a wall. Default 0: it does not.
         start_method ("forkserver" or "spawn"): how processes are started. Default forkserver, or
             spawn where the path of the temporary folder (``TMPDIR``) is too long for it. As
             always with :mod:`multiprocessing`, a script needs ``if __name__ == "__main__":``.
@@ -103,6 +105,7 @@ class OptionPool(ProcessPool):
         snapshot: Any = None,
         cap: int = DEFAULT_CAP,
         features: Features | None = None,
+        still: float = 0.0,
         start_method: Literal["forkserver", "spawn"] = "forkserver",
         step_seconds: float = 60.0,
         batch_size: Sequence[int] = (),
@@ -114,6 +117,10 @@ class OptionPool(ProcessPool):
                 f"OptionPool makes an env in each process, so it needs an id or a function that "
                 f"makes one; got the env {env}. Pass e.g. lambda: make_it()."
             )
+        if still and features is None:
+            raise ValueError(
+                f"OptionPool(still={still}) is a distance of features; pass features=."
+            )
         run = GymRun(
             env,
             keywords,
@@ -124,6 +131,7 @@ class OptionPool(ProcessPool):
             real_number("OptionPool", "gamma", gamma, above=0.0, most=1.0),
             not determinised,
             features,
+            real_number("OptionPool", "still", still, least=0.0),
         )
         super().__init__(
             run,

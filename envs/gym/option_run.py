@@ -9,6 +9,7 @@ import hashlib
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Protocol
 
 import gymnasium
@@ -20,7 +21,7 @@ from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
 from torchrl_hmcts.envs.gym.generators import generator_memory, set_generator_state
-from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
 from torchrl_hmcts.envs.gym.snapshots import (
     SNAPSHOT_KEY,
     Snapshot,
@@ -79,12 +80,14 @@ class OptionRun(ABC):
         work: memory of one int64, counted up while options run.
         step: takes a step as an env of Gymnasium does.
         clock: a time limit that :meth:`run` keeps, since ``step`` goes past it.
+        block: in which the steps of an option are taken.
     """
 
     state_keys: list[Any]
     outputs: dict[Any, Shape]
     step: Callable[[Any], tuple[Any, Any, Any, Any, Any]]
     clock: Any = None
+    block: AbstractContextManager[Any] = nullcontext()
 
     def __init__(self, worker: OptionWorker, max_steps: int, gamma: float) -> None:
         self.worker, self.max_steps, self.gamma = worker, max_steps, gamma
@@ -124,16 +127,18 @@ class OptionRun(ABC):
         act, ends, take, gamma = self.worker.act, self.ends, self.step, self.gamma
         reward, discount, work, clock = 0.0, 1.0, self.work, self.clock
         left = clock._max_episode_steps - clock._elapsed_steps if clock is not None else np.inf
-        for step in range(1, self.max_steps + 1):
-            action = act(observation, option, generator)
-            observation, gained, terminated, truncated, _ = take(action)
-            work[0] += 1
-            reward += discount * gained
-            discount *= gamma
-            if step >= left:
-                truncated = True
-            if terminated or truncated or (ends is not None and ends(observation, option, step)):
-                break
+        with self.block:
+            for step in range(1, self.max_steps + 1):
+                action = act(observation, option, generator)
+                observation, gained, terminated, truncated, _ = take(action)
+                work[0] += 1
+                reward += discount * gained
+                discount *= gamma
+                if step >= left:
+                    truncated = True
+                over = terminated or truncated
+                if over or (ends is not None and ends(observation, option, step)):
+                    break
         if clock is not None:
             clock._elapsed_steps += step
         slots["reward"][index] = reward
@@ -218,11 +223,12 @@ class GymRun(OptionRun):
         gamma: float,
         redrawing: bool,
         features: Features | None = None,
+        still: float = 0.0,
     ) -> None:
         super().__init__(worker, max_steps, gamma)
         if callable(env) and not isinstance(env, CloudpickleWrapper):
             env = CloudpickleWrapper(env)
-        parts = (worker, max_steps, gamma, redrawing, features)
+        parts = (worker, max_steps, gamma, redrawing, features, still)
         self.arguments = (env, keywords, snapshot, cap, *parts)
         self.env: gymnasium.Env = make_gym(env, **keywords)
         self.snapshot: Snapshot = snapshot_of(self.env, snapshot, cap=cap)
@@ -241,6 +247,7 @@ class GymRun(OptionRun):
             inner = inner.env
         if type(inner) is TimeLimit and not self._notes_actions:
             self.clock, inner = inner, inner.env
+        self.block = next((e for e in self._layers if isinstance(e, PrivateRandom)), self.block)
         self._take = inner.step
         self.step = self._noted_step if self._notes_actions else self._take
         observation = self.first_observation()
@@ -262,6 +269,21 @@ class GymRun(OptionRun):
         if features is not None:
             first = features(self.env, observation)
             self.outputs[FEATURES_KEY] = (first.shape, first.dtype)
+            if still > 0.0:
+                self._window = -(-max_steps // 5)
+                self._past = np.zeros((self._window, *first.shape), first.dtype)
+                self._still, self._worker_ends = still**2, self.ends
+                self.ends = self._rests
+
+    def _rests(self, observation: Any, option: int, steps: int) -> bool:
+        """Whether the worker ends the option, or it no longer moves the features."""
+        if self._worker_ends is not None and self._worker_ends(observation, option, steps):
+            return True
+        assert self._features is not None
+        here, at = self._features(self.env, observation), steps % self._window
+        moved = here - self._past[at]
+        self._past[at] = here
+        return steps > self._window and float(moved @ moved) < self._still
 
     def reset(self, generator: np.random.Generator, seed: int | None) -> Any:
         seed = int(generator.integers(2**31)) if seed is None else seed & 0x7FFFFFFF

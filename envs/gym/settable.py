@@ -36,7 +36,8 @@ class PrivateRandom(gymnasium.Wrapper):
     """Gives an env that draws from the global generators of NumPy and Python states of its own.
 
     Such an env is neither fixed by ``reset(seed=...)``, nor independent of what else draws. Under
-    this wrapper the global generators are as they were after every reset and step.
+    this wrapper the global generators are as they were after every reset and step, and after a
+    ``with`` block of it: many steps in one block save the time of exchanging states, 0.2 ms each.
 
     Args:
         env (gymnasium.Env): e.g. OGBench's mazes, which draw starts, goals and teleports so.
@@ -44,6 +45,7 @@ class PrivateRandom(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
+        self._outside: tuple[Any, Any] | None = None  # in a block, the states outside it
         self.seed_globals(0)
 
     def seed_globals(self, seed: int) -> None:
@@ -64,13 +66,21 @@ class PrivateRandom(gymnasium.Wrapper):
         return self._inside(lambda: self.env.step(action))
 
     def _inside(self, call: Callable[[], Any]) -> Any:
-        before = _global_states()
-        _set_global_states(self._states)
-        try:
+        if self._outside is not None:
             return call()
-        finally:
-            self._states = _global_states()
-            _set_global_states(before)
+        with self:
+            return call()
+
+    def __enter__(self) -> PrivateRandom:
+        self._outside = _global_states()
+        _set_global_states(self._states)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        assert self._outside is not None
+        self._states = _global_states()
+        _set_global_states(self._outside)
+        self._outside = None
 
 
 def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords: Any) -> Any:

@@ -18,7 +18,7 @@ from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.envs.gym.snapshots import env_layers, redraw
 
 _LENGTHS = (1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56)  # base steps of an option that are tried
-_REACH = 0.1  # how far an option should move the features, as a share of what they span
+_REACH = 0.08  # how far an option should move the features, as a share of what they span
 _CELLS = 2_000  # of a novelty radius that should fill the features' span
 _EPISODES, _STEPS = 6, 200
 _MAX_OPTIONS = 64
@@ -131,7 +131,7 @@ class Look:
         features: what says where the env is.
         discrete: whether the features are numbers of kinds, not of degree.
         option_steps: base steps after which a quarter of the options has moved the features by a
-            tenth of what they span, or nearly as far as any option does.
+            twelfth of what they span, or by three quarters of the farthest that any length does.
         novelty_radius: half of how far that is; more where there are many features, so that some
             thousand states fill their span.
         step_reward: least reward of a step that does not end an episode.
@@ -218,7 +218,7 @@ def look_at(
         wide = span[span > 0.0]
         whole = float(np.linalg.norm(wide) if goal else span.max())
         least = float(np.exp(np.log(wide).mean())) * _CELLS ** (-1 / len(wide)) if len(wide) else 0
-        wanted = min(max(_REACH * whole, 1.6 * least * goal), 0.9 * float(moved.max()))
+        wanted = min(max(_REACH * whole, 1.6 * least * goal), 0.75 * float(moved.max()))
         best = int(np.argmax(moved >= wanted))
         option_steps, radius = _LENGTHS[best], max(float(moved[best]) / 2, least, 1e-6)
     shift = -float(steady.min()) if not walk.ended and steady.min() < 0.0 else 0.0

@@ -417,7 +417,7 @@ class GymConfig(SkillsConfig):
     """Base steps of a mini-episode in training; 0: twice those of an option."""
     novelty_radius: float = 0.0
     """Distance between features within which a state counts as visited; 0: half of how far an
-    option moves them."""
+    action that is repeated moves them, three quarters of how far a skill does."""
     train_base_steps: int = 50_000
     """Base steps of worker training."""
     expansions: int = 20_000

@@ -36,6 +36,8 @@ from torchrl_hmcts.trainers.experiments.settings import GymConfig
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 _PLAYED = 1_000_003  # added to the seed of envs to act in
+_RADIUS = 0.75  # novelty radius, as a share of how far learned options move the features
+_STILL = 0.05  # of the radius, within a fifth of an option: it no longer moves
 _WORKER_KEYS = ("achieved_goal", "desired_goal", "features", "snapshot")
 
 
@@ -93,7 +95,7 @@ class GymKit(Kit):
         >>> from torchrl_hmcts.trainers.experiments.settings import GymConfig
         >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
         >>> kit.look.kind, kit.config.option_steps
-        ('goal', 20)
+        ('goal', 14)
     """
 
     place_key = "features"
@@ -121,7 +123,7 @@ class GymKit(Kit):
             novelty_radius=config.novelty_radius or look.novelty_radius,
         )
         self._fixed: Any = None  # worker of a pool whose options are given
-        self._radius = config.novelty_radius  # 0: half of how far the options reach
+        self._radius = config.novelty_radius  # 0: found
 
     @cached_property
     def gym_env(self) -> gymnasium.Env:
@@ -208,6 +210,7 @@ class GymKit(Kit):
             gamma=1.0 if real else config.gamma,
             determinised=not self.look.stochastic,
             features=self.look.features,
+            still=0.0 if self.look.discrete or self.replans else _STILL * config.novelty_radius,
             seed=config.seed + (_PLAYED if real else 0),
         )
 
@@ -229,7 +232,7 @@ class GymKit(Kit):
         return TensorDictModule(lambda skill: table[skill], ["skill"], ["action"])
 
     def prepare(self, worker: TensorDictModuleBase) -> None:
-        """Set the novelty radius to half of how far learned options move the features."""
+        """Set the novelty radius to three quarters of how far learned options move the features."""
         if self._radius or self.config.options != "learned":
             return
         starts = self.starts("train", 8)
@@ -238,7 +241,7 @@ class GymKit(Kit):
         before = starts.repeat(pool.num_options)
         after = pool.step(before.set("option", options))["next"]
         moved = (after["features"] - before["features"]).float().norm(dim=-1)
-        radius = float(moved.quantile(0.75)) / 2
+        radius = _RADIUS * float(moved.quantile(0.75))
         if radius > 0.0:
             self.config = dataclasses.replace(self.config, novelty_radius=radius)
 
