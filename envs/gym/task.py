@@ -220,7 +220,7 @@ def look_at(
         wanted = min(max(_REACH * whole, 1.6 * least * goal), 0.9 * float(moved.max()))
         best = int(np.argmax(moved >= wanted))
         option_steps, radius = _LENGTHS[best], max(float(moved[best]) / 2, least, 1e-6)
-    shift = -float(steady.min()) if not walk.ended and steady.min() < 0.0 else 0.0
+    shift = -float(steady.mean()) if not walk.ended and steady.min() < 0.0 else 0.0
     size = max((abs(value) for value in walk.returns), default=1.0)
     return Look(
         "goal" if goal else "return",
@@ -314,6 +314,7 @@ def _is_stochastic(env: gymnasium.Env, draws: np.random.Generator, walk: _Walk) 
         for seed in range(4):
             snapshot.restore(row)
             redraw(layers, seed)
+            snapshot.note_redraw(seed)
             snapshot.note_step(action)
             observation, *rest = env.step(action)[:4]
             walk.steps += 1
