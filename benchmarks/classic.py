@@ -29,7 +29,7 @@ EPISODES = {
     "MountainCar-v0": 10,
     "Acrobot-v1": 10,
     "LunarLander-v3": 5,
-    "Taxi-v3": 10,
+    "Taxi-v4": 10,
     "CliffWalking-v1": 10,
     "FrozenLake-v1": 100,
     "Pendulum-v1": 10,

@@ -175,10 +175,10 @@ def test_a_return_counts_as_solved_from_the_envs_threshold_on(
 
 
 def test_where_every_step_costs_the_plan_is_the_shortest() -> None:
-    agent = HMCTS("Taxi-v3")
+    agent = HMCTS("Taxi-v4")
     for seed in range(3):
         solution = agent.solve(seed=seed)
-        taxi: Any = gymnasium.make("Taxi-v3").unwrapped
+        taxi: Any = gymnasium.make("Taxi-v4").unwrapped
         reached, steps = {int(agent.kit.starts("test", 1)["observation"])}, 0
         while 20 not in {taxi.P[s][a][0][2] for s in reached for a in range(6)}:
             reached |= {taxi.P[s][a][0][1] for s in reached for a in range(6)}
@@ -217,8 +217,8 @@ def test_a_table_learns_the_values_of_a_random_chain() -> None:
     table = ValueTable(["observation"], gamma=0.9)
     pool.on_step = table.note
     state = pool.reset(TensorDict({}, [1]))
-    for number in range(3_000):
-        td = pool.step(state.set("option", torch.tensor([number % 2])))["next"]
+    for option in np.random.default_rng(0).integers(2, size=(3_000, 1)):
+        td = pool.step(state.set("option", torch.from_numpy(option)))["next"]
         over = bool(td["done"])
         state = pool.reset(TensorDict({}, [1])) if over else td.exclude("reward")
     q = 0.8 * 0.9 / (1 - 0.2 * 0.9)  # of a step that may have to be taken again

@@ -134,7 +134,9 @@ class Look:
         novelty_radius: half of how far that is; more where there are many features, so that some
             thousand states fill their span.
         step_reward: least reward of a step that does not end an episode.
-        shift, scale: of the rewards of a task of kind ``"return"``.
+        shift, scale: of the rewards of a task of kind ``"return"``. Where no episode ends early and
+            steps cost, the mean reward is shifted to 0, so that a path is worth neither more nor
+            less for being searched deeper; the scale brings returns of random episodes to 1.
         steps: base steps that the look took.
     """
 

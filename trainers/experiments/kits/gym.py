@@ -270,7 +270,9 @@ class GymKit(Kit):
             },
         }
         if self.look.kind == "return":
+            part["rollout"]["max_options"] = 10
             part |= {
+                "tree_policy": {"_component_": f"{planners}.UCT", "c": 0.3},
                 "backup": "max",
                 "final_choice": {"_component_": f"{planners}.HighestValue"},
             }
