@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from tensordict import TensorDict
 
 from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv
 from torchrl_hmcts.envs.gym.features import WithFeatures, whole_observation
+from torchrl_hmcts.envs.gym.snapshots import ReplaySnapshot, redraw
 from torchrl_hmcts.envs.gym.task import TaskEnv, fixed_actions, look_at
 from torchrl_hmcts.planners import HierarchicalPolicy, HighestValue, MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import HMCTS, load_worker
 from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 
@@ -160,12 +163,102 @@ def test_rewards_are_collected_with_a_search_before_every_option() -> None:
 
     agent = HMCTS(make, option_steps=1, search_steps=200, gamma=0.9)
     solution = agent.solve()
+    assert solution.solved is None  # nothing says which return would do
     assert isinstance(agent.planner.final_choice, HighestValue)
     assert agent.planner.budget == SearchBudget(base_steps=200, until_plan=False)
     assert solution.base_steps == 12  # to the right and to the end would take 9
     assert 1 + 2 + 3 + 4 + 5 + 6 + 7 + 8 + 9 < solution.reward <= 36 + 7 + 8 + 7 + 8
     with pytest.raises(ValueError, match=r"gymnasium\.register"):
         agent.save("nowhere")
+
+
+@pytest.mark.parametrize(("threshold", "solved"), [(20.0, True), (99.0, False)])
+def test_a_return_counts_as_solved_from_the_envs_threshold_on(
+    threshold: float, solved: bool
+) -> None:
+    keywords = {"max_episode_steps": 12, "reward_threshold": threshold}
+    gymnasium.register("TestDense-v0", Line, kwargs={"reward": "dense"}, **keywords)
+    solution = HMCTS("TestDense-v0", option_steps=1, search_steps=50, gamma=0.9).solve()
+    gymnasium.registry.pop("TestDense-v0")
+    assert 20.0 < solution.reward < 99.0
+    assert solution.solved is solved
+
+
+def test_where_every_step_costs_the_plan_is_the_shortest() -> None:
+    agent = HMCTS("Taxi-v4")
+    for seed in range(3):
+        solution = agent.solve(seed=seed)
+        taxi: Any = gymnasium.make("Taxi-v4").unwrapped
+        reached, steps = {int(agent.kit.starts("test", 1)["observation"])}, 0
+        while 20 not in {taxi.P[s][a][0][2] for s in reached for a in range(6)}:
+            reached |= {taxi.P[s][a][0][1] for s in reached for a in range(6)}
+            steps += 1
+        assert solution.reward == 20 - steps
+
+
+class Slope(gymnasium.Env):
+    """Go one place further with probability 0.8, or two with 0.5, or else fall; 4 is the goal."""
+
+    action_space, observation_space = spaces.Discrete(2), spaces.Discrete(6)
+    place = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict]:
+        super().reset(seed=seed)
+        self.place = 0
+        return self.place, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict]:
+        lucky = self.np_random.random() < (0.5 if action else 0.8)
+        falls = bool(action) and not lucky
+        self.place = min(4, self.place + lucky * (2 if action else 1))
+        return self.place, float(self.place == 4), falls or self.place == 4, False, {}
+
+
+def test_with_chance_the_agent_takes_the_surer_way() -> None:
+    agent = HMCTS(Slope, search_steps=300)
+    assert agent.kit.look.stochastic
+    solutions = [agent.solve(seed=seed) for seed in range(5)]
+    assert all(solution.solved for solution in solutions)
+    assert len({solution.base_steps for solution in solutions}) > 1  # it does not know the dice
+
+
+def test_a_table_learns_the_values_of_a_random_chain() -> None:
+    pool = OptionPool(Slope, RepeatActions(2), max_steps=1, num_processes=0, determinised=False)
+    table = ValueTable(["observation"], gamma=0.9)
+    pool.on_step = table.note
+    state = pool.reset(TensorDict({}, [1]))
+    for option in np.random.default_rng(0).integers(2, size=(3_000, 1)):
+        td = pool.step(state.set("option", torch.from_numpy(option)))["next"]
+        over = bool(td["done"])
+        state = pool.reset(TensorDict({}, [1])) if over else td.exclude("reward")
+    q = 0.8 * 0.9 / (1 - 0.2 * 0.9)  # of a step that may have to be taken again
+    values = table(TensorDict({"observation": torch.arange(4)}, [4]))
+    last = 0.8 / (1 - 0.2 * 0.9)
+    assert values.numpy() == pytest.approx([last * q**3, last * q**2, last * q, last], abs=0.05)
+
+
+def test_states_of_a_pool_with_other_dice_are_whole() -> None:
+    dice = {"max_steps": 4, "num_processes": 0, "determinised": False, "seed": 0}
+    pool = OptionPool(lambda: Line(noise=True), RepeatActions(2), **dice)
+    start = pool.reset().expand(40).clone().set("option", torch.ones(40, dtype=torch.int64))
+    after = pool.step(start)["next"]
+    places, rows = after["observation"].flatten().tolist(), after["snapshot"].tolist()
+    assert len(set(places)) == len({tuple(row) for row in rows}) > 1  # equal states, equal rows
+    env, other = Line(noise=True), Line(noise=True)
+    snapshot, again = ReplaySnapshot(env, max_steps=20), ReplaySnapshot(other, max_steps=20)
+    snapshot.note_reset(3)
+    env.reset(seed=3)
+    for step in range(20):
+        if step % 4 == 0:
+            redraw([env], step + 1)
+            snapshot.note_redraw(step + 1)
+        snapshot.note_step(1)
+        env.step(1)
+        again.restore(snapshot.read())  # on the way
+        assert other.place == env.place
+    again.note_reset(0)
+    again.restore(snapshot.read())  # from the beginning
+    assert other.place == env.place
 
 
 def test_the_kit_from_the_command_line(tmp_path: Path) -> None:

@@ -38,7 +38,8 @@ class Solution:
     """One episode: what was planned, and what came of it in an env of its own.
 
     Attributes:
-        solved (bool): whether the goal was reached, or the reward that the env asks for.
+        solved (bool, optional): whether the goal was reached; where rewards are collected, whether
+            they sum up to the env's ``reward_threshold``, and None where it names none.
         reward (float): the env's own rewards, summed.
         base_steps (int): of the episode.
         num_options (int): that were executed.
@@ -52,7 +53,7 @@ class Solution:
         True
     """
 
-    solved: bool
+    solved: bool | None
     reward: float
     base_steps: int
     num_options: int
@@ -256,8 +257,8 @@ class HMCTS:
         """
         start = self._start(seed)
         if not search:
-            return _solution(self.kit.act_by(self.policy, self.real_env, start))
-        return _solution(self.kit.act(self.planner, self.real_env, start))
+            return self._solution(self.kit.act_by(self.policy, self.real_env, start))
+        return self._solution(self.kit.act(self.planner, self.real_env, start))
 
     def play(
         self, seed: int = 0, *, render: bool = True, out: str | Path | None = None
@@ -273,10 +274,21 @@ class HMCTS:
         start = self._start(seed)
         if out is None:
             mode = "human" if render else ""
-            return _solution(self.kit.film(self.worker, self.planner, start, render=mode))
+            return self._solution(self.kit.film(self.worker, self.planner, start, render=mode))
         episode = self.kit.film(self.worker, self.planner, start, render="rgb_array")
         self.kit.write_film(episode, Path(out).with_suffix(".gif"))
-        return _solution(episode)
+        return self._solution(episode)
+
+    def _solution(self, results: Results) -> Solution:
+        return Solution(
+            bool(results.solved[0]) if getattr(self.kit, "can_be_solved", True) else None,
+            float(results.rewards[0]),
+            int(results.episode_steps[0]),
+            int(results.plan_options[0]),
+            int(results.simulated_steps[0]),
+            float(results.plan_seconds[0]),
+            results.plans[0] if results.plans else None,
+        )
 
     def _start(self, seed: int) -> TensorDictBase:
         self.kit.config = dataclasses.replace(self.config, seed=seed)
@@ -344,18 +356,6 @@ class HMCTS:
         return (
             f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
         )
-
-
-def _solution(results: Results) -> Solution:
-    return Solution(
-        bool(results.solved[0]),
-        float(results.rewards[0]),
-        int(results.episode_steps[0]),
-        int(results.plan_options[0]),
-        int(results.simulated_steps[0]),
-        float(results.plan_seconds[0]),
-        results.plans[0] if results.plans else None,
-    )
 
 
 def _load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:

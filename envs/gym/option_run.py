@@ -300,6 +300,7 @@ class GymRun(OptionRun):
         seed = self.seed_of(slots, index, mark)
         if self._redrawing:
             redraw(self._layers, seed)
+            self.snapshot.note_redraw(seed)
         start = (seed << 64 | seed).to_bytes(16, "little") + (seed << 1 | 1).to_bytes(16, "little")
         if self._memory is None:
             set_generator_state(self._draws, start + bytes(8))
@@ -318,6 +319,8 @@ class GymRun(OptionRun):
         return self._take(action)
 
     def write(self, slots: dict[str, np.ndarray], index: int, observation: Any) -> None:
+        if self._redrawing and not self._notes_actions:  # equal states have equal rows
+            redraw(self._layers, 0)
         slots[_ROW_AFTER][index] = self.snapshot.read()
         for name, path in zip(self._after, self._paths, strict=True):
             slots[name][index] = _leaf(observation, path)

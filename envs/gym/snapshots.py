@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import gymnasium
@@ -107,6 +108,13 @@ class Snapshot(ABC):
             action: of the step.
         """
 
+    def note_redraw(self, seed: int) -> None:  # noqa: B027
+        """Take note that the generators were given other numbers; whoever redraws calls this.
+
+        Args:
+            seed: as of :func:`redraw`.
+        """
+
 
 def env_layers(env: gymnasium.Env) -> list[gymnasium.Env]:
     """Return the wrappers from the outside, the env itself, and envs that it holds as attributes.
@@ -165,22 +173,31 @@ def redraw(layers: Sequence[gymnasium.Env], seed: int) -> None:
         seed: of the numbers.
     """
     for number, layer in enumerate(layers):
-        if getattr(layer, "_np_random", None) is not None:
+        generator = getattr(layer, "_np_random", None)
+        if generator is not None and type(generator.bit_generator) is np.random.PCG64:
+            generator.bit_generator.state = _new_draws(seed, number)
+        elif generator is not None:
             layer._np_random = np.random.default_rng((seed, number))
         if hasattr(type(layer), "seed_globals"):
             layer.seed_globals(seed)  # type: ignore[attr-defined]
 
 
+@lru_cache(maxsize=16)
+def _new_draws(seed: int, number: int) -> Any:
+    return np.random.PCG64((seed, number)).state
+
+
 class ReplaySnapshot(Snapshot):
     """Stores how a state was reached, the seed and the actions since, and takes them again.
 
-    Exact for every deterministic env; restoring costs as many steps as the episode has had.
+    Exact for every deterministic env, and for one that draws as long as each :func:`redraw` is
+    noted; restoring costs as many steps as the episode has had.
 
     Example:
         >>> import gymnasium
         >>> snapshot = ReplaySnapshot(gymnasium.make("CartPole-v1"))
-        >>> snapshot.width  # seed, number of steps, and 500 actions
-        4016
+        >>> snapshot.width  # seed, number of steps, and 500 actions with what was redrawn
+        8016
 
     Args:
         env (gymnasium.Env): any env.
@@ -202,16 +219,22 @@ class ReplaySnapshot(Snapshot):
         sample = np.asarray(env.action_space.sample())
         self._shape, self._dtype = sample.shape, sample.dtype
         self._bytes = sample.nbytes
-        self.width = 16 + self._max_steps * self._bytes
+        self.width = 16 + self._max_steps * (8 + self._bytes)
+        self._layers = env_layers(env)
         self._seed: int | None = None
         self._actions: list[np.ndarray] = []
+        self._redraws: list[int] = []  # seeds of new draws before each action, 0 for none
+        self._redraw = 0  # before the next action
 
     def note_reset(self, seed: int | None) -> None:
         if seed is None:
             raise SnapshotError(
                 "A snapshot by replay needs every episode to begin with reset(seed=...)."
             )
-        self._seed, self._actions = seed, []
+        self._seed, self._actions, self._redraws, self._redraw = seed, [], [], 0
+
+    def note_redraw(self, seed: int) -> None:
+        self._redraw = seed
 
     def note_step(self, action: Any) -> None:
         if len(self._actions) == self._max_steps:
@@ -220,29 +243,35 @@ class ReplaySnapshot(Snapshot):
                 "Pass max_steps= to ReplaySnapshot."
             )
         self._actions.append(np.array(action, self._dtype))
+        self._redraws.append(self._redraw)
+        self._redraw = 0
 
     def read(self) -> np.ndarray:
         if self._seed is None:
             raise SnapshotError("No episode has begun. Call reset(seed=...) first.")
         row = np.zeros(self.width, np.uint8)
-        row[:16].view(np.int64)[:] = self._seed, len(self._actions)
-        if self._actions:
-            taken = np.stack(self._actions)
-            row[16 : 16 + taken.nbytes] = np.frombuffer(taken.tobytes(), np.uint8)
+        steps = len(self._actions)
+        row[:16].view(np.int64)[:] = self._seed, steps
+        if steps:
+            taken = np.array(self._redraws, np.uint64).tobytes() + np.stack(self._actions).tobytes()
+            row[16 : 16 + len(taken)] = np.frombuffer(taken, np.uint8)
         return row
 
     def restore(self, row: np.ndarray) -> None:
         seed, steps = (int(n) for n in np.frombuffer(row[:16].tobytes(), np.int64))
-        taken = np.frombuffer(row[16 : 16 + steps * self._bytes].tobytes(), self._dtype)
-        actions = list(taken.reshape(steps, *self._shape))
-        if seed == self._seed and len(self._actions) <= steps and _same(self._actions, actions):
-            ahead = actions[len(self._actions) :]  # the state lies on the way to that one
-        else:
+        taken = row[16 : 16 + steps * (8 + self._bytes)].tobytes()
+        redraws = np.frombuffer(taken[: 8 * steps], np.uint64).tolist()
+        actions = list(np.frombuffer(taken[8 * steps :], self._dtype).reshape(steps, *self._shape))
+        known = len(self._actions)
+        on_the_way = self._redraws == redraws[:known] and _same(self._actions, actions)
+        if seed != self._seed or self._redraw or not on_the_way:
             self.note_reset(seed)
             self.env.reset(seed=seed)
-            ahead = actions
-        self._actions = actions
-        for action in ahead:
+            known = 0
+        self._actions, self._redraws = actions, redraws
+        for again, action in zip(redraws[known:], actions[known:], strict=True):
+            if again:
+                redraw(self._layers, again)
             self.env.step(self._plain(action))
 
     def _plain(self, action: np.ndarray) -> Any:

@@ -135,7 +135,9 @@ class Look:
         novelty_radius: half of how far that is; more where there are many features, so that some
             thousand states fill their span.
         step_reward: least reward of a step that does not end an episode.
-        shift, scale: of the rewards of a task of kind ``"return"``.
+        shift, scale: of the rewards of a task of kind ``"return"``. Where no episode ends early and
+            steps cost, the mean reward is shifted to 0, so that a path is worth neither more nor
+            less for being searched deeper; the scale brings returns of random episodes to 1.
         steps: base steps that the look took.
     """
 
@@ -221,7 +223,7 @@ def look_at(
         wanted = min(max(_REACH * whole, 1.6 * least * goal), 0.75 * float(moved.max()))
         best = int(np.argmax(moved >= wanted))
         option_steps, radius = _LENGTHS[best], max(float(moved[best]) / 2, least, 1e-6)
-    shift = -float(steady.min()) if not walk.ended and steady.min() < 0.0 else 0.0
+    shift = -float(steady.mean()) if not walk.ended and steady.min() < 0.0 else 0.0
     size = max((abs(value) for value in walk.returns), default=1.0)
     return Look(
         "goal" if goal else "return",
@@ -315,6 +317,7 @@ def _is_stochastic(env: gymnasium.Env, draws: np.random.Generator, walk: _Walk) 
         for seed in range(4):
             snapshot.restore(row)
             redraw(layers, seed)
+            snapshot.note_redraw(seed)
             snapshot.note_step(action)
             observation, *rest = env.step(action)[:4]
             walk.steps += 1

@@ -23,15 +23,17 @@ from torchrl_hmcts.envs import (
     SettableGymEnv,
     SkillWorker,
 )
+from torchrl_hmcts.envs.gym.families import Box2DSnapshot
 from torchrl_hmcts.envs.gym.features import WithFeatures, achieved_goal, root_place
 from torchrl_hmcts.envs.gym.minigrid import MiniGridSnapshot
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, extract_plans
+from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, SearchBudget, extract_plans
 from torchrl_hmcts.trainers.evaluation import Results, spread
 from torchrl_hmcts.trainers.experiments.kits import Kit, Trial
 from torchrl_hmcts.trainers.experiments.kits.film import Film
+from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
 from torchrl_hmcts.trainers.experiments.settings import GymConfig
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
@@ -250,13 +252,14 @@ class GymKit(Kit):
     def planner_part(self) -> dict[str, Any]:
         config, part = self.config, super().planner_part()
         if self.look.discrete:
+            part["leaves_per_wave"] = 32
+        if self.look.step_reward < 0.0:  # shorter plans pay more
+            part["novelty"]["shorter_paths"] = True
+            part["budget"]["improve_expansions"] = config.improve_expansions
+        elif self.look.discrete:
             stages = getattr(self.look.features, "stages", ())
             name = "torchrl_hmcts.planners.WidthNovelty"
             part["novelty"] = {"_component_": name, "key": self.place_key, "stages": stages}
-            part["leaves_per_wave"] = 32
-        elif self.look.step_reward < 0.0:  # shorter plans pay more
-            part["novelty"]["shorter_paths"] = True
-            part["budget"]["improve_expansions"] = config.improve_expansions
         if not self.replans:
             return part
         planners = "torchrl_hmcts.planners"
@@ -264,7 +267,8 @@ class GymKit(Kit):
             "novelty": None,
             "expand": "one",
             "rollout": {"_component_": f"{planners}.TreeRollout", "max_options": 20},
-            "leaves_per_wave": 1,
+            # Rollouts side by side would be replayed from the beginning at every step.
+            "leaves_per_wave": 1 if Box2DSnapshot.fits(self.gym_env) else 16,
             "budget": {
                 "_component_": f"{planners}.SearchBudget",
                 "base_steps": config.search_steps,
@@ -272,25 +276,38 @@ class GymKit(Kit):
             },
         }
         if self.look.kind == "return":
+            part["rollout"]["max_options"] = 10
             part |= {
+                "tree_policy": {"_component_": f"{planners}.UCT", "c": 0.3},
                 "backup": "max",
                 "final_choice": {"_component_": f"{planners}.HighestValue"},
             }
         else:
             part["chance"] = {"_component_": f"{planners}.ProgressiveWidening"}
+        if self.look.discrete and self.look.stochastic:
+            name = "torchrl_hmcts.trainers.experiments.kits.table.ValueTable"
+            keys = self.state_entries
+            part["leaf_evaluator"] = {"_component_": name, "keys": keys, "gamma": config.gamma}
+            part["budget"]["base_steps"] = max(1, config.search_steps // 100)
         return part
 
     def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
         planner = super().make_planner(simulator, **budget)
         planner.simulator.keep([self.place_key])  # for pictures
+        table: Any = planner.evaluate.leaf_evaluator
+        if isinstance(table, ValueTable):
+            planner.final_choice, simulator.on_step = table, table.note
         return planner
+
+    @cached_property
+    def state_entries(self) -> Sequence[Any]:
+        """Entries of the observation."""
+        keys = self.make_env("train").observation_spec.keys(True, True)
+        return [key for key in keys if key not in ("features", "snapshot")]
 
     @property
     def manager_keys(self) -> Sequence[Any]:
-        if self._moves:  # the view of the grid has too little
-            return []
-        keys = self.make_env("train").observation_spec.keys(True, True)
-        return [key for key in keys if key not in ("features", "snapshot")]
+        return [] if self._moves else self.state_entries  # the view of the grid has too little
 
     @property
     def replans(self) -> bool:
@@ -308,11 +325,26 @@ class GymKit(Kit):
             return super().act(planner, real, starts, keys)
         return Results.concatenate([self._play(planner, real, one) for one in starts.split(1)])
 
+    def act_by(self, policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase) -> Results:
+        results = super().act_by(policy, real, start)
+        if self.look.kind == "return":
+            wanted = np.inf if self.threshold is None else self.threshold
+            results.solved = results.rewards >= wanted
+        return results
+
     def _play(self, planner: MCTSPlanner, real: EnvBase, start: TensorDictBase) -> Results:
         """Act in one episode, with a search before every option."""
-        policy = HierarchicalPolicy(planner, replan_every=1, reuse=not self.look.stochastic)
+        policy = HierarchicalPolicy(planner, replan_every=1, reuse=True)
         pool: Any = planner.simulator.given_env
         before = pool.num_steps
+        table, budget = planner.final_choice, planner.budget
+        if isinstance(table, ValueTable):  # which all later searches share, but no other episode
+            table.clear()
+            planner.budget = SearchBudget(base_steps=self.config.search_steps, until_plan=False)
+            search = planner.search(start)
+            planner.budget = SearchBudget(expansions=self.config.expansions)
+            planner.resume(search)
+            planner.budget = budget
         results = self.act_by(policy, real, start)
         results.simulated_steps = np.array([pool.num_steps - before])
         if planner.last_search is not None:
@@ -368,10 +400,23 @@ class GymKit(Kit):
     def figures(self, trial: Trial) -> dict[str, Any]:
         results = trial.results
         found = results.summary() | {"reward": spread(results.rewards)}
+        if not self.can_be_solved:
+            found["solved"] = None
         threshold = self.threshold
         if threshold is not None:
             found["reward_threshold"] = threshold
         return found | {"plan_seconds": spread(results.plan_seconds)}
+
+    def table(self, metrics: Mapping[str, Any]) -> str:
+        if self.can_be_solved:
+            return super().table(metrics)
+        mean = metrics["test"]["reward"]["mean"]
+        return f"Mean return {mean:.4g}; {self.config.id} names none that counts as solved."
+
+    @property
+    def can_be_solved(self) -> bool:
+        """Whether there is a goal to reach, or a return that the env asks for."""
+        return self.look.kind == "goal" or self.threshold is not None
 
     @cached_property
     def threshold(self) -> float | None:
