@@ -25,6 +25,7 @@ from torchrl_hmcts.envs import (
     DeepMindLabEnv,
     GridworldMazeEnv,
     LabMazeEnv,
+    MujocoBatch,
     OptionPool,
     RepeatActions,
     SettableGymEnv,
@@ -230,5 +231,5 @@ def test_no_env_that_is_exported_is_left_out() -> None:
     envs = {c for c in exported if isinstance(c, type) and issubclass(c, EnvBase)}
     made = [*MACRO_ENVS.values(), *ATARI_ENVS.values(), LAB]
     covered = {make.func if isinstance(make, functools.partial) else make for make in made}
-    own_tests = {OptionModelEnv, OptionPool, StatelessSimulator, SettableGymEnv}
+    own_tests = {OptionModelEnv, OptionPool, StatelessSimulator, SettableGymEnv, MujocoBatch}
     assert envs == covered | own_tests

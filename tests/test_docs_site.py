@@ -151,7 +151,7 @@ def commands() -> list[tuple[str, str]]:
 def test_every_command_of_the_pages_is_understood(page: str, command: str) -> None:
     pytest.importorskip("omegaconf")
     _, verb, *words = command.split()
-    assert verb in {"demo", "train", "evaluate", "sweep", "report", "list"}
+    assert verb in {"demo", "train", "evaluate", "play", "sweep", "report", "list"}
     if verb not in {"demo", "train"} or not words:  # the bare verb is a name, no command
         return
     own, keys = split_words(words, ["experiment", "kit"])

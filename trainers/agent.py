@@ -384,6 +384,7 @@ def load_worker(folder: str | Path) -> SkillPolicy:
         >>> from torchrl_hmcts.trainers import HMCTS, load_worker
         >>> folder = tempfile.mkdtemp()
         >>> agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
+        Learning 8 skills in 64 base steps ...
         >>> load_worker(agent.save(folder)).in_keys
         ['observation', 'skill']
     """

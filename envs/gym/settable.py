@@ -76,11 +76,12 @@ class PrivateRandom(gymnasium.Wrapper):
         _set_global_states(self._states)
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error: Any) -> bool:
         assert self._outside is not None
         self._states = _global_states()
         _set_global_states(self._outside)
         self._outside = None
+        return False
 
 
 def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords: Any) -> Any:

@@ -259,13 +259,13 @@ class HierarchicalPolicy(TensorDictModuleBase):
     ) -> None:
         """Plan for the elements ``needs`` and write their plans."""
         found, fallback = self._searched(td, needs, executed)
-        if self.replan_every == 1:  # only the first option counts, which is the planner's choice
-            found.found = torch.zeros_like(found.found)
         device = kept["plan"].device
         width = min(found.options.shape[-1], self.max_plan_length)
         plan = torch.zeros((len(found), self.max_plan_length), dtype=torch.int64)
         plan[:, :width] = found.options[:, :width].clamp_min(0)
-        plan[~found.found, 0] = fallback[~found.found]
+        # Where the next option is planned again, only the first one counts: the planner's choice.
+        chosen = ~found.found | (self.replan_every == 1)
+        plan[chosen, 0] = fallback[chosen]
         length = torch.where(found.found, found.lengths.clamp_max(self.max_plan_length), 1)
         kept["plan"][needs] = plan.to(device)
         kept["plan_length"][needs] = length.unsqueeze(-1).to(device)

@@ -296,7 +296,8 @@ class GymKit(Kit):
         planner.simulator.keep([self.place_key])  # for pictures
         table: Any = planner.evaluate.leaf_evaluator
         if isinstance(table, ValueTable):
-            planner.final_choice, simulator.on_step = table, table.note
+            planner.final_choice = table  # type: ignore[assignment]
+            simulator.on_step = table.note
         return planner
 
     @cached_property
