@@ -7,7 +7,7 @@ import importlib
 import pickle
 import random
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import gymnasium.wrappers
@@ -76,7 +76,7 @@ class PrivateRandom(gymnasium.Wrapper):
         _set_global_states(self._states)
         return self
 
-    def __exit__(self, *error: Any) -> bool:
+    def __exit__(self, *error: Any) -> Literal[False]:
         assert self._outside is not None
         self._states = _global_states()
         _set_global_states(self._outside)
