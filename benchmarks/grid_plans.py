@@ -34,7 +34,7 @@ from torchrl_hmcts.envs import GridFeatures, GridMoves, GridView, OptionPool, Re
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.planners import MCTSPlanner, Search, SearchBudget, WidthNovelty
 
-CLAIMED = ["FourRooms", "KeyCorridorS3R3", "DoorKey-16x16", "ObstructedMaze-1Dlhb"]
+MAIN = ["FourRooms", "KeyCorridorS3R3", "DoorKey-16x16", "ObstructedMaze-1Dlhb"]
 WIDER = [
     "Unlock", "UnlockPickup", "BlockedUnlockPickup", "MultiRoom-N6", "KeyCorridorS6R3",
     "LavaCrossingS11N5", "Dynamic-Obstacles-16x16", "BossLevel",
@@ -160,9 +160,9 @@ def measure(name: str, how: str, seeds: range) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=[*CLAIMED, *WIDER])
+    parser.add_argument("names", nargs="*", default=[*MAIN, *WIDER])
     parser.add_argument("--search", nargs="*", default=["pairs"])
-    parser.add_argument("--seeds", type=int, help="default: 100 where a claim is made, else 20")
+    parser.add_argument("--seeds", type=int, help="default: 100 for the first four envs, else 20")
     parser.add_argument("--out", type=Path, help="rows of other envs and searches stay")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -170,7 +170,7 @@ def main() -> None:
     torch.set_num_threads(1)
     for name in args.names:
         for how in args.search:
-            number = args.seeds or (100 if name in CLAIMED else 20)
+            number = args.seeds or (100 if name in MAIN else 20)
             row = measure(full_name(name), how, range(number))
             print(row, flush=True)
             if args.out:

@@ -189,7 +189,7 @@ def test_where_every_step_costs_the_plan_is_the_shortest() -> None:
     for seed in range(3):
         solution = agent.solve(seed=seed)
         taxi: Any = gymnasium.make("Taxi-v4").unwrapped
-        reached, steps = {int(agent.kit.starts("test", 1)["observation"])}, 0
+        reached, steps = {int(agent.start(seed)["observation"])}, 0
         while 20 not in {taxi.P[s][a][0][2] for s in reached for a in range(6)}:
             reached |= {taxi.P[s][a][0][1] for s in reached for a in range(6)}
             steps += 1
@@ -304,3 +304,32 @@ def test_a_distilled_manager_guides_the_search_and_acts_alone(tmp_path: Path) ->
     assert again.solve(search=False) == alone
     assert again.solve() == agent.solve()
     gymnasium.registry.pop("TestLine-v0")
+
+
+def test_an_episode_depends_on_nothing_but_its_seed() -> None:
+    agent = HMCTS(lambda: Line(noise=True), option_steps=1, search_steps=400)
+    before, noise = agent.solve(seed=2), torch.get_rng_state()
+    agent.solve(seed=1)
+    assert agent.solve(seed=2) == before
+    assert agent.config.seed == 0
+    assert torch.equal(torch.get_rng_state(), noise)  # the caller's draws are his own
+
+
+def test_an_agent_is_not_written_over_a_run(tmp_path: Path) -> None:
+    agent = HMCTS("MountainCar-v0", option_steps=14)
+    agent.save(tmp_path)
+    (tmp_path / "manager.torchrl").write_bytes(b"of an older agent")
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="overwrite=true"):
+        agent.save(tmp_path)
+    agent.save(tmp_path, overwrite=True)
+    names = sorted(path.name for path in tmp_path.iterdir() if not path.name.startswith("."))
+    assert names == ["notes.txt", "run.json"]
+
+
+def test_ogbenchs_tasks_follow_the_seed() -> None:
+    pytest.importorskip("ogbench")
+    agent = HMCTS("pointmaze-medium-v0")
+    places = [agent.start(seed)["observation"][0].round() for seed in (0, 1, 5)]
+    assert not torch.equal(places[0], places[1])
+    assert (places[0] - places[2]).norm() < 3.0  # task 1 with other noise

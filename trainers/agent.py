@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,14 @@ from torchrl_hmcts.trainers.experiments.kits.gym import GymKit
 from torchrl_hmcts.trainers.experiments.registry import load_config
 from torchrl_hmcts.trainers.experiments.settings import GymConfig, SkillsConfig
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer
-from torchrl_hmcts.trainers.manager import ManagerNet, ManagerPolicy, make_manager
+from torchrl_hmcts.trainers.manager import ManagerPolicy, make_manager, scale_by
+from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
-from torchrl_hmcts.trainers.saving.run_folder import end_record, read_run, start_record
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 
 _MANAGER = "manager.torchrl"
+_OTHER_DRAWS = 1_000_003  # added to the seed of the env to act in, whose draws no planner knows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,20 +169,22 @@ class HMCTS:
             base_steps: of training.
             progress: show a bar.
             save_dir: folder of checkpoints. Default: none.
+
+        Raises:
+            ValueError: if the agent is none of a Gymnasium env.
         """
-        changes = {"options": "learned", "train_base_steps": base_steps}
-        names = {field.name for field in dataclasses.fields(self._asked)}
-        known: dict[str, Any] = {key: value for key, value in changes.items() if key in names}
-        self.kit = self._make_kit(dataclasses.replace(self._asked, **known))
-
-        def bar(total: int) -> Any:
-            return tqdm(total=total, desc="learn", unit="step", disable=not progress)
-
-        self._take(skills.learn(self.kit, save_dir=save_dir, progress=bar))
+        if not isinstance(self._asked, GymConfig):
+            raise ValueError(
+                f"{self} is of the kit {self.config.KIT}: train it with hmcts train "
+                f"kit={self.config.KIT}, and load the folder."
+            )
+        changes: dict[str, Any] = {"options": "learned", "train_base_steps": base_steps}
+        self.kit = self._make_kit(dataclasses.replace(self._asked, **changes))
+        self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
         return self
 
     def _take(self, learned: LearnedSkills) -> None:
-        self.learned, self._worker = learned, learned.worker
+        self.learned, self._worker, self.manager = learned, learned.worker, None
         for name in ("env", "planner", "real_env"):
             part = self.__dict__.pop(name, None)
             if isinstance(part, EnvBase):
@@ -217,16 +221,12 @@ class HMCTS:
                 f"{self} plans over features of which no network can learn. Distil from an env "
                 "whose observation shows its state."
             )
-        goal = not getattr(self.kit, "replans", False)
-        starts = self.kit.starts("train", 16)
+        goal = not self.kit.replans
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
-            network = make_manager(self.planner, keys, starts, bounded=goal)
+            network = make_manager(self.planner, keys, bounded=goal)
+        scale_by(network, self.planner, self.kit.starts("train", 4))
         guided = self.kit.guide(self.kit.make_planner(self.env), network)
-
-        def bar(total: int) -> Any:
-            return tqdm(total=total, desc="distil", unit="update", disable=not progress)
-
         loss = ExpertIterationLoss(network, value_loss="log" if goal else "smooth_l1")
         ExpertIterationTrainer(
             self.env,
@@ -238,7 +238,7 @@ class HMCTS:
             searches_per_iteration=searches,
             updates_per_iteration=updates,
             example_kwargs={"roots": not goal},
-            progress=bar,
+            progress=_bar("distil", progress),
             seed=self.config.seed,
         ).train()
         self._guide(network)
@@ -252,10 +252,10 @@ class HMCTS:
         """Plan from a start and act in an env of its own.
 
         Args:
-            seed: of the start.
+            seed: of the start, and of all that is drawn in the episode and its searches.
             search: False: act by :attr:`policy` alone.
         """
-        start = self._start(seed)
+        start = self.start(seed)
         if not search:
             return self._solution(self.kit.act_by(self.policy, self.real_env, start))
         return self._solution(self.kit.act(self.planner, self.real_env, start))
@@ -271,7 +271,7 @@ class HMCTS:
             out: GIF to write instead, with a video (``.mp4``) beside it: the env's own pictures
                 where it draws any, else its features.
         """
-        start = self._start(seed)
+        start = self.start(seed)
         if out is None:
             mode = "human" if render else ""
             return self._solution(self.kit.film(self.worker, self.planner, start, render=mode))
@@ -281,7 +281,7 @@ class HMCTS:
 
     def _solution(self, results: Results) -> Solution:
         return Solution(
-            bool(results.solved[0]) if getattr(self.kit, "can_be_solved", True) else None,
+            bool(results.solved[0]) if self.kit.can_be_solved else None,
             float(results.rewards[0]),
             int(results.episode_steps[0]),
             int(results.plan_options[0]),
@@ -290,37 +290,54 @@ class HMCTS:
             results.plans[0] if results.plans else None,
         )
 
-    def _start(self, seed: int) -> TensorDictBase:
-        self.kit.config = dataclasses.replace(self.config, seed=seed)
-        return self.kit.starts("test", 1)
+    def start(self, seed: int) -> TensorDictBase:
+        """Begin an episode that depends on nothing but its seed.
+
+        Args:
+            seed: of the start, and of all that is drawn from then on.
+
+        Returns:
+            The state to start from, ``[1]``.
+        """
+        own = self.config
+        with torch.random.fork_rng(devices=[]):  # TorchRL seeds its global generator, too
+            self.env.set_seed(seed)
+            self.real_env.set_seed(seed + _OTHER_DRAWS)
+        self.planner.set_seed(seed)
+        try:
+            self.kit.config = dataclasses.replace(own, seed=seed)
+            return self.kit.starts("test", 1)
+        finally:
+            self.kit.config = own
 
     # ------------------------------------------------------------ files
 
-    def save(self, folder: str | Path) -> Path:
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write keys and networks into a folder: JSON and plain arrays, no code.
 
         Args:
             folder: made if absent; ``hmcts play run=FOLDER`` shows the agent.
+            overwrite: replace the agent or the run that is in the folder.
 
         Returns:
             The folder.
 
         Raises:
-            ValueError: if the env is a function, which cannot be written.
+            ValueError: if the env is a function, which cannot be written, or the folder holds an
+                agent or a run already.
         """
         if isinstance(self.kit, GymKit) and not self.kit.config.id:
             raise ValueError(
                 "An agent over a function that makes its env cannot be saved: register the env "
                 "with gymnasium.register and build the agent from its id."
             )
-        config = dataclasses.replace(self.config, out=str(folder))
-        start_record(config.EXPERIMENT, config, [], {})
-        if self.learned is not None and self.learned.loss is not None:
-            save_worker(folder, self.learned.loss, self.learned.worker_step)
-        if self.manager is not None:
-            plain_checkpoint(manager=self.manager).save(Path(folder) / _MANAGER)
-        end_record(folder, "finished")
-        return Path(folder)
+        changes: dict[str, Any] = {"out": str(folder), "overwrite": overwrite, "resume": False}
+        with open_run(dataclasses.replace(self.config, **changes)) as run:
+            if self.learned is not None and self.learned.loss is not None:
+                save_worker(run.path, self.learned.loss, self.learned.worker_step)
+            if self.manager is not None:
+                plain_checkpoint(manager=self.manager).save(run.path / _MANAGER)
+        return run.path
 
     @classmethod
     def load(cls, folder: str | Path) -> HMCTS:
@@ -340,11 +357,8 @@ class HMCTS:
         if config.options == "learned":
             agent._take(_load_skills(agent.kit, folder))
         if (Path(folder) / _MANAGER).is_file():
-            keys, spec = agent.kit.manager_keys, agent.env.full_observation_spec
-            zeros = torch.zeros(sum(spec[key].shape.numel() for key in keys))
-            goal = not getattr(agent.kit, "replans", False)
-            net = ManagerNet(zeros, zeros, agent.planner.num_options, bounded=goal)
-            network = TensorDictModule(net, list(keys), ["logits", "state_value"])
+            bounded = not agent.kit.replans
+            network = make_manager(agent.planner, agent.kit.manager_keys, bounded=bounded)
             plain_checkpoint(manager=network).load(Path(folder) / _MANAGER)
             agent._guide(network)
         return agent
@@ -356,6 +370,10 @@ class HMCTS:
         return (
             f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
         )
+
+
+def _bar(name: str, shown: bool) -> Callable[..., Any]:
+    return partial(tqdm, desc=name, disable=not shown)
 
 
 def _load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
@@ -388,9 +406,8 @@ def load_worker(folder: str | Path) -> SkillPolicy:
         >>> load_worker(agent.save(folder)).in_keys
         ['observation', 'skill']
     """
-    agent = HMCTS.load(folder)
-    worker = agent.worker
+    worker = HMCTS.load(folder).worker
     if not isinstance(worker, SkillPolicy):
         raise ValueError(f"{folder} holds an agent whose options are given, not learned.")
-    torch.nn.Module.eval(worker)
+    worker.eval()
     return worker

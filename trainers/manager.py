@@ -55,27 +55,40 @@ class ManagerNet(nn.Module):
 
 
 def make_manager(
-    planner: MCTSPlanner, keys: Sequence[NestedKey], starts: TensorDictBase, *, bounded: bool
+    planner: MCTSPlanner, keys: Sequence[NestedKey], *, bounded: bool
 ) -> TensorDictModule:
-    """Build a manager network for a planner's states, scaled by those that searches meet.
+    """Build a manager network for a planner's states; :func:`scale_by` sets what it is scaled by.
 
     Args:
         planner: over the options.
         keys: entries of its states that the network reads, each ``[F_i]``.
-        starts: to search from, ``[M]``.
         bounded: see :class:`ManagerNet`.
 
     Returns:
         A module that writes ``"logits"`` and ``"state_value"``.
     """
     planner.simulator.keep(list(keys))
-    search = planner.search(starts)
-    assert search.tree.states is not None
-    used = torch.arange(search.tree.capacity) < torch.from_numpy(search.tree.num_nodes)[:, None]
-    states = search.tree.states[:, : search.tree.capacity][used]
-    seen = torch.cat([states[key].float().reshape(len(states), -1) for key in keys], -1)
-    net = ManagerNet(seen.mean(0), seen.std(0), planner.num_options, bounded=bounded)
+    spec = planner.simulator.env.full_observation_spec_unbatched
+    size = sum(spec[key].shape.numel() for key in keys)
+    net = ManagerNet(torch.zeros(size), torch.ones(size), planner.num_options, bounded=bounded)
     return TensorDictModule(net, list(keys), ["logits", "state_value"])
+
+
+def scale_by(network: TensorDictModule, planner: MCTSPlanner, starts: TensorDictBase) -> None:
+    """Scale a manager network by the states that searches meet.
+
+    Args:
+        network: of :func:`make_manager`; changed in place.
+        planner: that searches.
+        starts: to search from, ``[M]``.
+    """
+    tree = planner.search(starts).tree
+    assert tree.states is not None
+    states = tree.states[torch.arange(tree.capacity) < torch.from_numpy(tree.num_nodes)[:, None]]
+    parts = [states[key].float().reshape(len(states), -1) for key in network.in_keys]
+    seen = torch.cat(parts, -1)
+    network.module.mean.copy_(seen.mean(0))
+    network.module.std.copy_(seen.std(0).clamp_min(1e-6))
 
 
 class ManagerPolicy(TensorDictModuleBase):

@@ -57,7 +57,7 @@ print(agent.solve(seed=0))
 # Change what was found
 # ---------------------
 #
-# Whatever the look finds is a key: ``option_steps``, ``novelty_radius``, ``task``. Parts of the
+# All that the look finds is a key: ``option_steps``, ``novelty_radius``, ``task``. Parts of the
 # planner go by the names of their classes, as in :doc:`/kits`.
 
 puct = {"tree_policy": {"_component_": "torchrl_hmcts.planners.PUCT", "c": 2.0}}

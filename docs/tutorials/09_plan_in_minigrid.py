@@ -42,7 +42,7 @@ import matplotlib.pyplot as plt
 
 names = "right down left up pick-up drop toggle done".split()
 print(" ".join(names[option] for option in solution.plan.options.tolist()))
-start = agent.kit.starts("test", 1)
+start = agent.start(seed=0)
 episode = agent.kit.film(agent.worker, agent.planner, start, render="rgb_array")
 shown = [episode.frames[int(i)] for i in (0, len(episode.frames) // 2, len(episode.frames) - 1)]
 figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained")

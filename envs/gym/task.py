@@ -225,9 +225,11 @@ def look_at(
         option_steps, radius = _LENGTHS[best], max(float(moved[best]) / 2, least, 1e-6)
     shift = -float(steady.mean()) if not walk.ended and steady.min() < 0.0 else 0.0
     size = max((abs(value) for value in walk.returns), default=1.0)
+    stochastic = _is_stochastic(made, draws, walk)
+    made.close()
     return Look(
         "goal" if goal else "return",
-        _is_stochastic(made, draws, walk),
+        stochastic,
         chosen,
         discrete,
         option_steps,

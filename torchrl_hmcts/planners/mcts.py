@@ -193,9 +193,7 @@ class MCTSPlanner(TensorDictModuleBase):
             raise TypeError(f"progress must be callable; got {progress!r}.")
         self.final_choice = final_choice
         self.progress = progress
-        if seed is not None:
-            whole_number("MCTSPlanner", "seed", seed)
-        self._seeds = None if seed is None else np.random.SeedSequence(int(seed))
+        self.set_seed(seed)
         self.in_keys = list(self.simulator.root_keys)
         self.out_keys = [self.option_key, *_WRITTEN]
         self.last_search: Search | None = None
@@ -368,6 +366,16 @@ class MCTSPlanner(TensorDictModuleBase):
             self.root_noise.add(search, np.flatnonzero(kept))
         self.last_search = search
         return torch.from_numpy(kept).view(shape)
+
+    def set_seed(self, seed: int | None) -> None:
+        """Begin the random numbers again.
+
+        Args:
+            seed: as of the constructor.
+        """
+        if seed is not None:
+            whole_number("MCTSPlanner", "seed", seed)
+        self._seeds = None if seed is None else np.random.SeedSequence(int(seed))
 
     def _draw_seed(self) -> int:
         """The seed of the next call."""

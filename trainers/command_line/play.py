@@ -42,7 +42,8 @@ def play(words: Sequence[str]) -> int:
             print(agent.play(seed))
         else:
             folder = Path(home(own["run"])) / "play"
-            solution = agent.play(seed, out=_made(folder) / "play.gif")
+            folder.mkdir(exist_ok=True)
+            solution = agent.play(seed, out=folder / "play.gif")
             print(solution)
             print(f"Page: {_write_page(agent, solution, folder, seed)}")
     return 0
@@ -52,11 +53,6 @@ def _has_display() -> bool:
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(exist_ok=True)
-    return folder
 
 
 def _write_page(agent: HMCTS, solution: Solution, folder: Path, seed: int) -> Path:

@@ -29,12 +29,16 @@ from torchrl_hmcts.trainers.saving.run_folder import (
 )
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled, stop_asked
 
-_RECORDS = ("run.json", "metrics.json", "evaluation.json", "page.json", "curves.csv", "index.html")
-_FOLDERS = ("checkpoints", "worker", "log", "tensorboard", "wandb")
+_RECORDS = (
+    *("run.json", "metrics.json", "evaluation.json", "page.json", "curves.csv", "index.html"),
+    "manager.torchrl",
+)
+_FOLDERS = ("checkpoints", "worker", "log", "play", "tensorboard", "wandb")
 _PICTURES = (
     *("episode.gif", "episode.mp4", "goals.png", "learning.png", "losses.png", "mazes.png"),
     *("scores.png", "search.png", "skills.png", "solving.png", "view.png"),
 )
+_PLAYED = ("play/index.html", "play/play.gif", "play/play.mp4", "play/search.png")
 _SWEEP = ("sweep.json", "journal.log", "importances.png", "trials.png")
 _IN_CHECKPOINTS = ("checkpoint-*", "worker-*", "run.pt*", "trials.json", ".*writing-*", ".lock")
 
@@ -321,7 +325,7 @@ def _clear(path: Path) -> None:
         run = read_run(path)
     pictures = {name for name in run.pictures if Path(name).name == name}
     videos = {str(Path(name).with_suffix(".mp4")) for name in pictures if name.endswith(".gif")}
-    for name in {*_RECORDS, *_PICTURES, *pictures, *videos, "log", "tensorboard"}:
+    for name in {*_RECORDS, *_PICTURES, *pictures, *videos, *_PLAYED, "log", "tensorboard"}:
         remove(path / name)
     for folder, pattern in product(("checkpoints", "worker"), _IN_CHECKPOINTS):
         for entry in (path / folder).glob(pattern):

@@ -111,6 +111,8 @@ class Kit:
         curve_steps (str): column of the steps in ``curves.csv``, named for their unit.
         title (str): of the page.
         group (int): starts that are planned side by side.
+        replans (bool): whether it plans before every option, rather than execute one plan.
+        can_be_solved (bool): whether it is known what counts as solved.
 
     Example:
         >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
@@ -136,6 +138,8 @@ class Kit:
     curve_steps = "base_steps"
     title = "Planning over learned skills"
     group = 38
+    replans = False
+    can_be_solved = True
 
     def __init__(self, config: Any) -> None:
         self.config: SkillsConfig = config

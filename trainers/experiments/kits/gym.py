@@ -40,7 +40,7 @@ from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 _PLAYED = 1_000_003  # added to the seed of envs to act in
 _RADIUS = 0.75  # novelty radius, as a share of how far learned options move the features
 _STILL = 0.05  # of the radius, within a fifth of an option: it no longer moves
-_WORKER_KEYS = ("achieved_goal", "desired_goal", "features", "snapshot")
+_GOALS = ("achieved_goal", "desired_goal")
 
 
 def make_seen(name: Any, given: bool, **keywords: Any) -> gymnasium.Env:
@@ -129,7 +129,7 @@ class GymKit(Kit):
 
     @cached_property
     def gym_env(self) -> gymnasium.Env:
-        """Return the env as Gymnasium makes it, for what it says of itself."""
+        """The env as Gymnasium makes it, for what it says of itself."""
         return self._env(**self.config.make)
 
     # ------------------------------------------------------- envs
@@ -140,10 +140,13 @@ class GymKit(Kit):
         return SettableGymEnv(make, features=self.look.features, seed=seed)
 
     @cached_property
+    def _start_env(self) -> SettableGymEnv:
+        return self.make_env("test")
+
+    @cached_property
     def worker_keys(self) -> Sequence[Any]:  # type: ignore[override]
         """Entries of the observation but those of goals."""
-        keys = self.make_env("train").observation_spec.keys(True, True)
-        return [key for key in keys if key not in _WORKER_KEYS]
+        return [key for key in self.state_entries if key not in _GOALS]
 
     def make_training_env(self, num_envs: int = 16) -> EnvBase:
         config = self.config
@@ -163,10 +166,12 @@ class GymKit(Kit):
         )
 
     def starts(self, split: str, num_starts: int) -> TensorDictBase:
-        env = self.make_env(split)
+        env, seed = self._start_env, self.config.seed
+        with torch.random.fork_rng(devices=[]):  # TorchRL seeds its global generator, too
+            env.set_seed(seed + _PLAYED if split == "test" else seed)
         tasks = getattr(self.gym_env.unwrapped, "num_tasks", 0)
         found: list[TensorDictBase] = []
-        for number in range(num_starts):
+        for number in range(seed, seed + num_starts):
             options = {"options": {"task_id": number % tasks + 1}} if tasks else {}
             found.append(env.reset(**options))
         return torch.stack(found).exclude("done", "terminated", "truncated")  # type: ignore[attr-defined]
@@ -303,7 +308,7 @@ class GymKit(Kit):
     @cached_property
     def state_entries(self) -> Sequence[Any]:
         """Entries of the observation."""
-        keys = self.make_env("train").observation_spec.keys(True, True)
+        keys = self._start_env.observation_spec.keys(True, True)
         return [key for key in keys if key not in ("features", "snapshot")]
 
     @property
@@ -311,7 +316,7 @@ class GymKit(Kit):
         return [] if self._moves else self.state_entries  # the view of the grid has too little
 
     @property
-    def replans(self) -> bool:
+    def replans(self) -> bool:  # type: ignore[override]
         """Whether it plans again after every option, rather than execute one plan."""
         return self.look.stochastic or self.look.kind == "return"
 
@@ -338,19 +343,25 @@ class GymKit(Kit):
         policy = HierarchicalPolicy(planner, replan_every=1, reuse=True)
         pool: Any = planner.simulator.given_env
         before = pool.num_steps
-        table, budget = planner.final_choice, planner.budget
-        if isinstance(table, ValueTable):  # which all later searches share, but no other episode
-            table.clear()
-            planner.budget = SearchBudget(base_steps=self.config.search_steps, until_plan=False)
-            search = planner.search(start)
-            planner.budget = SearchBudget(expansions=self.config.expansions)
-            planner.resume(search)
-            planner.budget = budget
+        if isinstance(planner.final_choice, ValueTable):
+            self._fill(planner.final_choice, planner, start)
         results = self.act_by(policy, real, start)
         results.simulated_steps = np.array([pool.num_steps - before])
         if planner.last_search is not None:
             results.plans = [extract_plans(planner.last_search)[0]]
         return results
+
+    def _fill(self, table: ValueTable, planner: MCTSPlanner, start: TensorDictBase) -> None:
+        """Begin an episode's table by a long search, until it has met the goal."""
+        table.clear()
+        budget, steps = planner.budget, self.config.search_steps
+        try:
+            planner.budget = SearchBudget(base_steps=steps, until_plan=False)
+            search = planner.search(start)
+            planner.budget = SearchBudget(expansions=self.config.expansions)
+            planner.resume(search)
+        finally:
+            planner.budget = budget
 
     # ------------------------------------------------------- figures
 
@@ -415,12 +426,12 @@ class GymKit(Kit):
         return f"Mean return {mean:.4g}; {self.config.id} names none that counts as solved."
 
     @property
-    def can_be_solved(self) -> bool:
+    def can_be_solved(self) -> bool:  # type: ignore[override]
         """Whether there is a goal to reach, or a return that the env asks for."""
         return self.look.kind == "goal" or self.threshold is not None
 
     @cached_property
     def threshold(self) -> float | None:
-        """Return at which the env counts as solved; None where it names none."""
+        """The return at which the env counts as solved; None where it names none."""
         spec = self.gym_env.spec
         return None if spec is None else spec.reward_threshold

@@ -19,7 +19,7 @@ _BACKUPS = 4  # of states, for each outcome that is noted
 class ValueTable:
     r"""Estimates values of states that are met again and again, with chance between them.
 
-    .. math:: V(s) = \max_o \frac{1}{n_{so}} \sum_i R_i + \gamma^{k_i} V(s'_i)
+    .. math:: V(s) = \max_o \frac{1}{n_{so}} \sum_i \bigl(R_i + \gamma^{k_i} V(s'_i)\bigr)
 
     over the outcomes that option :math:`o` had in :math:`s`; 0 where nothing is known. So what was
     drawn in one branch of a tree counts in all others. An outcome backs up its state, then those
