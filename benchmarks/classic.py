@@ -10,7 +10,6 @@ stands a policy that draws each action uniformly. Seconds are of the processor, 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 import warnings
@@ -20,6 +19,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from table import add_row
 
 from torchrl_hmcts.trainers import HMCTS
 
@@ -91,10 +91,7 @@ def main() -> None:
         row = measure(name, args.episodes or EPISODES[name])
         print(row, flush=True)
         if args.out:
-            rows = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
-            rows = [other for other in rows if other["id"] != name] + [row]
-            text = json.dumps({"command": COMMAND, "rows": rows}, indent=1)
-            args.out.write_text(text + "\n", encoding="utf-8")
+            add_row(args.out, row, "id", command=COMMAND)
 
 
 if __name__ == "__main__":

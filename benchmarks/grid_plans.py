@@ -17,7 +17,6 @@ the env's actions as options; and in the env with its pictures, without a mask.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 import warnings
@@ -29,6 +28,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from table import add_row
 
 from torchrl_hmcts.envs import GridFeatures, GridMoves, GridView, OptionPool, RepeatActions
 from torchrl_hmcts.envs.gym.settable import make_gym
@@ -174,14 +174,8 @@ def main() -> None:
             row = measure(full_name(name), how, range(number))
             print(row, flush=True)
             if args.out:
-                rows = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
-                rows = [r for r in rows if (r["id"], r["search"]) != (row["id"], row["search"])]
-                command = (
-                    "python benchmarks/grid_plans.py --out docs/results/settable/minigrid.json"
-                )
-                content = {"command": command, "budget_cpu_seconds": SECONDS, "nodes": NODES}
-                text = json.dumps({**content, "rows": [*rows, row]}, indent=1)
-                args.out.write_text(text + "\n", encoding="utf-8")
+                facts = {"command": COMMAND, "budget_cpu_seconds": SECONDS, "nodes": NODES}
+                add_row(args.out, row, "id", "search", **facts)
 
 
 if __name__ == "__main__":

@@ -55,3 +55,11 @@ def write(arguments: argparse.Namespace, figures: Any) -> None:
     if arguments.out is not None:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         arguments.out.write_text(json.dumps(figures, indent=1, default=str) + "\n")
+
+
+def add_row(path: Path, row: Mapping[str, Any], *keys: str, **facts: Any) -> None:
+    """Write a row into a file of rows, in place of that with the same values of the keys."""
+    rows = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.exists() else []
+    rows = [other for other in rows if any(other[key] != row[key] for key in keys)]
+    text = json.dumps({**facts, "rows": [*rows, row]}, indent=1)
+    path.write_text(text + "\n", encoding="utf-8")

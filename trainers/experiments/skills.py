@@ -397,7 +397,7 @@ def solve(
     begin = time.perf_counter()
     kit.make_planner(kit.make_simulator(worker)).plan(starts[:1])
     compile_seconds = time.perf_counter() - begin
-    say(f"Solving {config.mazes} test mazes that the worker has never seen ...", flush=True)
+    say(f"Solving {config.mazes} {kit.start_name} ...", flush=True)
     cpu = time.process_time()
     quiet = None if say is print else True
     results = _solve(kit, worker, planner, starts, quiet)

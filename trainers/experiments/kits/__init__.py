@@ -107,6 +107,7 @@ class Kit:
         worker_keys (sequence of NestedKey): what the worker sees besides its skill.
         state_keys (sequence of NestedKey): what pictures need of a state.
         captions (mapping): of the pictures.
+        start_name (str): what a start is called, in the plural.
         unit (str): of the times that are reported.
         curve_steps (str): column of the steps in ``curves.csv``, named for their unit.
         title (str): of the page.
@@ -134,6 +135,7 @@ class Kit:
         "skills.png": "The skills: 10 mini-episodes for each, in an open room and in a maze.",
         "losses.png": "Training of the worker: actor, both critics, discriminator.",
     }
+    start_name = "test mazes that the worker has never seen"
     unit = "base steps"
     curve_steps = "base_steps"
     title = "Planning over learned skills"

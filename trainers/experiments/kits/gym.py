@@ -102,6 +102,14 @@ class GymKit(Kit):
 
     place_key = "features"
     state_keys = ("features",)
+    captions = {
+        **Kit.captions,
+        "episode.gif": "A solved episode: the plan (pale; colours are options) and the way.",
+        "unsolved": "An episode that was NOT solved: the plan, if one was found (pale; colours are "
+        "options), and how far it came.",
+        "skills.png": "The skills: 10 mini-episodes for each, from one start.",
+    }
+    start_name = "starts, at one trial each"
     title = "Planning over options of a Gymnasium env"
     group = 1  # each search is timed on its own
     config: GymConfig
