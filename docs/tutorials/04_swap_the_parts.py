@@ -157,9 +157,8 @@ plt.show()
 
 from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
 from torchrl_hmcts.objectives import METRAEncoderLoss
-from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
+from torchrl_hmcts.planners import option_color
+from torchrl_hmcts.trainers import DIAYNTrainer, make_training_env
 from torchrl_hmcts.transforms import SkillReward
 
 training_env = make_training_env(num_skills=4)

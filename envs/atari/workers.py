@@ -47,6 +47,9 @@ class RepeatActions:
             raise ValueError("RepeatActions needs at least one action; got actions=().")
         self.num_options = len(self.actions)
 
+    def __repr__(self) -> str:
+        return f"RepeatActions({list(self.actions)})"
+
     def act(self, observation: Any, option: int, generator: np.random.Generator) -> Any:
         """Return the option's action."""
         return self.actions[option]

@@ -45,7 +45,10 @@ _MAX_LEGEND = 16  # options in a legend
 
 
 def option_color(option: int) -> Color:
-    """Return the colour of an option, 0 to 1; colours repeat after eight.
+    """Return the colour of an option in all pictures: red, green and blue, 0 to 1.
+
+    Args:
+        option: its number; colours repeat after eight.
 
     Example:
         >>> option_color(3) == option_color(11)
@@ -209,7 +212,7 @@ def plot_positions(
         key: entry of the state with (x, y), any shape of two numbers; or a callable that makes
             ``[N, 2]`` of the states ``[N]``. Default ``"position"``.
         ax: axes to draw over, whose limits stay if they show something already, e.g. a maze.
-            Default: those of a new figure of pyplot.
+            Default: those of a new figure of pyplot, over the map of an env that has ``draw_map``.
         max_nodes: how many nodes at most: those with most visits, and the best plan. Default: all.
         option_names: one for each of the ``A`` options. Default: their numbers.
         legend: whether to say what the colours mean. Default True.
@@ -239,6 +242,8 @@ def plot_positions(
     points = _positions(tree, root, key, shown.ids)
     if ax is None:
         ax = pyplot.subplots(layout="constrained")[1]
+        if tree.draw_map is not None and tree.states is not None and key == "position":
+            tree.draw_map(ax, tree.states[root, 0])
     fresh = not ax.has_data()
     if fresh:
         ax.set_aspect("equal")

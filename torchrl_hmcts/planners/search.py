@@ -94,6 +94,13 @@ class Search:
         self._room = 1  # nodes of the largest tree, at most
         self._root_kernels.limit(self.tree.roots, NO_LIMIT)
 
+    def __repr__(self) -> str:
+        plans = int((self.best_node >= 0).sum())
+        return f"Search({self.tree!r}, plans of {plans} of {self.num_roots} roots)"
+
+    def _repr_html_(self) -> str:
+        return self.tree._repr_html_()
+
     def __getstate__(self) -> dict[str, Any]:  # a module can be neither copied nor sent
         return {**self.__dict__, "_kernels": None, "_root_kernels": None}
 

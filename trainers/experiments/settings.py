@@ -19,6 +19,9 @@ class SkillsConfig(RunConfig):
     ``objective``, ``loss``, ``trainer`` and ``planner`` hold what differs from the kit's own: by
     keyword, with ``"_component_"`` the path of a class where another one is chosen.
 
+    Raises:
+        ValueError: if a value is out of its range or does not fit the others.
+
     Example:
         >>> SkillsConfig(planner={"waves_in_flight": 2}).planner
         {'waves_in_flight': 2}

@@ -154,6 +154,11 @@ def learn(
 
     Reference:
         Dissertation, algorithm 3 and figures 4.6 to 4.10.
+
+    Example:
+        >>> from torchrl_hmcts.trainers import DemoConfig, make_kit
+        >>> learn(make_kit(DemoConfig(options="actions"))).steps  # given options need no training
+        0
     """
     config = kit.config
     begin = time.process_time()
@@ -388,6 +393,12 @@ def solve(
         kit: of the experiment.
         worker: executes the options.
         say: told what is done, e.g. ``print``. Default: nobody is.
+
+    Example:
+        >>> from torchrl_hmcts.trainers import DemoConfig, make_kit
+        >>> kit = make_kit(DemoConfig(options="actions", option_steps=20, mazes=2))
+        >>> solve(kit, kit.given_worker()).results.solved.tolist()
+        [True, True]
     """
     kit.prepare(worker)
     config = kit.config

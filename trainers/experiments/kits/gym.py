@@ -355,7 +355,7 @@ class GymKit(Kit):
             self._fill(planner.final_choice, planner, start)
         results = self.act_by(policy, real, start)
         results.simulated_steps = np.array([pool.num_steps - before])
-        if planner.last_search is not None:
+        if planner.has_searched:
             results.plans = [extract_plans(planner.last_search)[0]]
         return results
 
