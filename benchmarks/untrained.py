@@ -2,8 +2,8 @@
 
     python benchmarks/untrained.py --seeds 0 1 2 --out docs/results/skills/untrained.json
 
-The same networks, starts and search as `hmcts demo`, in the first 20 of its test mazes. "Actions": no network,
-an option repeats one action.
+The same networks, starts and search as `hmcts demo`, in the first 20 of its test mazes. "Actions":
+no network, an option repeats one action.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ _OTHER_DRAWS = 1_000_003  # added to the seed of the env to act in, whose draws 
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """One episode: what was planned, and what came of it in an env of its own.
+    """One episode: its plan, and its result in another instance of the env.
 
     Attributes:
         solved (bool, optional): whether the goal was reached; where rewards are collected, whether

@@ -35,7 +35,7 @@ starts = env.reset(TensorDict(batch_size=[8]))
 # The planner
 # -----------
 #
-# A planner is a policy: a module that reads a state and writes the option. Whatever does so takes
+# A planner is a policy: a module that reads a state and writes the option. All that does so takes
 # the place of tree search. Here is one that tries sequences of options at random and takes the
 # best, in a dozen lines, with the macro env as its simulator:
 

@@ -79,8 +79,9 @@ plt.show()
 # A worker that learns
 # --------------------
 #
-# Any TorchRL agent can be trained in this env. The source's is A3C: asynchronous actor-learners
-# (here one, in this process, so that the page can be built; ``num_learners=2`` starts processes).
+# Any TorchRL agent can be trained in this env. The dissertation's is A3C: asynchronous
+# actor-learners (here one, in this process, so that the page can be built; ``num_learners=2``
+# starts processes).
 # To be quick, this worker reads no walls: its velocity and the goals, which lead around them.
 
 from torchrl_hmcts.objectives import A3CLoss

@@ -59,7 +59,7 @@ class FollowGoals:
 
     Args:
         goals (sequence of ByteGoal): one for each option.
-        fire (int, optional): index of an action that is taken now and then whatever the goal, since
+        fire (int, optional): index of an action that is taken now and then with any goal, since
             games wait for it, e.g. to serve. Default: none.
         fire_probability (float): how often. Default 0.05.
 
@@ -104,9 +104,9 @@ class FollowGoals:
 
 
 class OccasionalAction:
-    """Another worker's options, with one action taken now and then whatever the option.
+    """Another worker's options, with one action taken now and then.
 
-    Games wait for FIRE, e.g. to serve; a learned worker that has forgotten it waits for ever.
+    Games wait for FIRE, e.g. to serve; a learned worker that has forgotten it never starts.
 
     Args:
         worker (OptionWorker): whose options they are.

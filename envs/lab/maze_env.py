@@ -51,7 +51,7 @@ class LabMazeEnv(MazeEnv):
     r"""Walk through DeepMind Lab's random maze: momentum, friction, and a goal far away.
 
     The level ``demos/random_maze`` with the engine's ground movement, frame by frame: friction,
-    acceleration towards the keys' direction, a slide along whatever is in the way, and a velocity
+    acceleration towards the keys' direction, a slide along what is in the way, and a velocity
     rounded to integers. With the velocity :math:`v`, the wanted direction :math:`w` and a frame of
     :math:`\Delta t` seconds, without contact,
 

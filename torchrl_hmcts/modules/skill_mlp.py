@@ -230,7 +230,7 @@ class FeatureMLP(nn.Sequential):
 
     @property
     def stackable(self) -> bool:
-        """Whether :meth:`run` can be used."""
+        """True if :meth:`run` can be used."""
         return can_stack(self)
 
 

@@ -1,4 +1,4 @@
-"""How much a search may spend, how often it asks again, and how far it looks beyond a leaf."""
+"""Limits of a search: its spending, its repeated outcomes, and its look beyond a leaf."""
 
 from __future__ import annotations
 

@@ -27,16 +27,16 @@ from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, TreeArrays
 Axes = Any  # matplotlib.axes.Axes; matplotlib is loaded by the first picture only
 Color = tuple[float, float, float]
 
-OPTION_COLORS = (
-    (230, 97, 0),
-    (93, 58, 155),
-    (0, 121, 140),
-    (212, 17, 89),
-    (140, 110, 0),
-    (90, 90, 90),
-    (26, 133, 255),
-    (64, 176, 60),
-)  # 0 to 255
+OPTION_COLORS = (  # 0 to 255; apart for the colour-blind, too (tests/test_palette.py)
+    (255, 132, 0),
+    (127, 16, 253),
+    (28, 174, 255),
+    (111, 3, 28),
+    (65, 104, 122),
+    (196, 148, 124),
+    (191, 13, 0),
+    (116, 0, 151),
+)
 _PRUNED, _REFUSED = (0.77, 0.77, 0.77), (0.6, 0.6, 0.6)
 _PLAN = "#ffd23f"
 _INK = "#1f2430"
@@ -204,7 +204,7 @@ def plot_positions(
     """Draw where the options of a search led: every node at its place in the plane.
 
     Straight lines join each node to the one above, in the colour of the option; what was refused is
-    grey, the best plan thick. The blue dot is the root, the green ring the end of the best plan.
+    grey, the best plan thick, with a letter or number for each option. The blue dot is the root.
 
     Args:
         tree: of a finished or interrupted search, whose states are kept.
@@ -256,6 +256,11 @@ def plot_positions(
     ):
         rows = np.flatnonzero(chosen & (shown.parents >= 0))
         shown.lines(ax, paths, rows, linewidths=line_width, alpha=alpha, zorder=order)
+    for row in shown.plan[1:]:  # a letter on each segment of the plan
+        name = labels[int(shown.nodes["option"][row])]
+        style = {"weight": "bold", "ha": "center", "va": "center", "zorder": 6, "clip_on": True}
+        box = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": shown.colors[row]}
+        ax.text(*paths[row].mean(0), _letter(name), fontsize=7, bbox=box, **style)
     ax.plot(*points[0], "o", color=_START, markersize=11, zorder=5)
     if len(shown.plan):
         ax.plot(*points[shown.plan[-1]], "o", mec=_END, mew=2.5, mfc="white", ms=7.5, zorder=5)
@@ -269,6 +274,12 @@ def plot_positions(
             handles.append(_line("refused", color=_PRUNED))
         _add_legend(ax, handles, below=0.08 if fresh else 0.02)
     return ax
+
+
+def _letter(name: str) -> str:
+    """The number of an option, or the first letter of its name."""
+    number = name.rpartition(" ")[2]
+    return number if number.isdigit() else name[:1].upper()
 
 
 def layered_layout(parents: np.ndarray, order: np.ndarray) -> np.ndarray:

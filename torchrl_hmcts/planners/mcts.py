@@ -80,7 +80,7 @@ class MCTSPlanner(TensorDictModuleBase):
     are closed and never simulated again.
 
     Root ``b`` of a call with seed ``s`` draws its random numbers (root noise, Gumbel, rollouts,
-    sampled choices) from ``s + b``, so that it has the same tree whatever is searched beside it
+    sampled choices) from ``s + b``, so that its tree does not depend on the roots beside it
     (with more than one wave in flight only where it is alone: waves are of all roots together).
 
     Args:
@@ -240,7 +240,7 @@ class MCTSPlanner(TensorDictModuleBase):
 
     @property
     def has_searched(self) -> bool:
-        """Whether there is a :attr:`last_search`."""
+        """True if there is a :attr:`last_search`."""
         return self._last_search is not None
 
     def __getattr__(self, name: str) -> Any:

@@ -31,7 +31,7 @@ from torchrl_hmcts.planners.tree_view import SearchTree
 
 
 class Wave:
-    """What to simulate next: take ``options[i]`` in node ``nodes[i]`` of root ``roots[i]``."""
+    """Triples to simulate next: take ``options[i]`` in node ``nodes[i]`` of root ``roots[i]``."""
 
     def __init__(self, records: np.ndarray, *, detached: bool = False) -> None:
         self.records = records  # [m] of tree.WAVE
@@ -330,7 +330,7 @@ class Search:
 
     @property
     def revisits_exhausted(self) -> bool:
-        """Whether an exhausted root still spends its simulations on what it knows."""
+        """True if an exhausted root still spends its simulations on what it knows."""
         return self.settings.revisit and bool((self.roots["limit"] != NO_LIMIT).all())
 
     def allowed(self) -> np.ndarray:

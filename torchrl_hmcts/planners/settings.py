@@ -128,12 +128,12 @@ class SearchSettings:
 
     @property
     def is_gumbel(self) -> bool:
-        """Whether the search follows a schedule of simulations."""
+        """True if the search follows a schedule of simulations."""
         return isinstance(self.tree_policy, Gumbel)
 
     @property
     def revisit(self) -> bool:
-        """Whether descents land on what they know: chance never closes, Gumbel counts visits."""
+        """True if descents land on what they know: chance never closes, Gumbel counts visits."""
         return self.exhausted == "revisit" or self.chance is not None or self.is_gumbel
 
     def check_simulations(self, num_simulations: int | None) -> None:

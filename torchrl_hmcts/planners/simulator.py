@@ -144,7 +144,7 @@ class Simulator:
         return self._completed(states, after)
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
-        """Begin what :meth:`step` does; :meth:`receive` returns what comes of it, in any order."""
+        """Begin what :meth:`step` does; :meth:`receive` returns its outcome, in any order."""
         if not self.works_beside:
             return self.step(states, options)
         self._choose(states, options)

@@ -124,7 +124,7 @@ class SkillsConfig(RunConfig):
 
 @dataclass
 class DemoConfig(SkillsConfig):
-    """What ``hmcts demo`` does: the agent over the kit ``waterworld``.
+    """Keys of ``hmcts demo``: the agent over the kit ``waterworld``.
 
     Raises:
         ValueError: if a number is out of its range, or ``train_base_steps`` is no multiple of 64.
@@ -175,7 +175,7 @@ class DemoConfig(SkillsConfig):
 
 @dataclass
 class LabMazeConfig(SkillsConfig):
-    """What ``hmcts train experiment=labmaze`` does: the agent over the kit ``labmaze``.
+    """Keys of ``hmcts train experiment=labmaze``: the agent over the kit ``labmaze``.
 
     A frame is a 60th of a second of the game. A base step of the worker is ``frames_per_step``
     frames with one action.
@@ -286,7 +286,7 @@ class LabMazeConfig(SkillsConfig):
 
 @dataclass
 class WaterworldA3CConfig(RunConfig):
-    """What ``hmcts train experiment=waterworld_a3c`` does; each field is a key.
+    """Keys of ``hmcts train experiment=waterworld_a3c``.
 
     Example:
         >>> WaterworldA3CConfig(seed=1).total_frames
@@ -355,7 +355,7 @@ class WaterworldA3CConfig(RunConfig):
 
 @dataclass
 class WaterworldGoalsConfig(WaterworldA3CConfig):
-    """What ``hmcts train experiment=waterworld_goals`` does; each field is a key.
+    """Keys of ``hmcts train experiment=waterworld_goals``.
 
     Example:
         >>> WaterworldGoalsConfig().goal_divergence_threshold
@@ -391,7 +391,7 @@ class WaterworldGoalsConfig(WaterworldA3CConfig):
 
 @dataclass
 class GymConfig(SkillsConfig):
-    """What ``hmcts train kit=gym env.id=NAME`` does: the agent over the kit ``gym``.
+    """Keys of ``hmcts train kit=gym env.id=NAME``: the agent over the kit ``gym``.
 
     Example:
         >>> GymConfig(id="PointMaze_Large-v3").num_skills

@@ -18,7 +18,7 @@ from torchrl_hmcts.planners.simulator import Simulator
 
 @dataclass(frozen=True)
 class Controllability:
-    r"""What the actions do to each feature.
+    r"""Effects of the actions on each feature.
 
     Attributes:
         effects: float64 ``[A, F]``, mean change of a feature by an action minus its mean change

@@ -82,7 +82,7 @@ class Options:
 
 
 class OptionSource(Protocol):
-    """What gives a game its options, e.g. a :class:`RuleSource` or one of your own."""
+    """Protocol of what gives a game its options, e.g. a :class:`RuleSource` or one of your own."""
 
     def find(self, kit: AtariKit) -> Options:
         """Return the options of a game."""

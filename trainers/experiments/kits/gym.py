@@ -325,7 +325,7 @@ class GymKit(Kit):
 
     @property
     def replans(self) -> bool:  # type: ignore[override]
-        """Whether it plans again after every option, rather than execute one plan."""
+        """True if it plans again after every option, rather than execute one plan."""
         return self.look.stochastic or self.look.kind == "return"
 
     def act(
@@ -435,7 +435,7 @@ class GymKit(Kit):
 
     @property
     def can_be_solved(self) -> bool:  # type: ignore[override]
-        """Whether there is a goal to reach, or a return that the env asks for."""
+        """True if there is a goal to reach, or a return that the env asks for."""
         return self.look.kind == "goal" or self.threshold is not None
 
     @cached_property
