@@ -22,6 +22,7 @@ from torchrl_hmcts.planners.export import (
     plural,
     shown_nodes,
 )
+from torchrl_hmcts.planners.layout import layered_layout
 from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, TreeArrays
 
 Axes = Any  # matplotlib.axes.Axes; matplotlib is loaded by the first picture only
@@ -282,65 +283,6 @@ def _letter(name: str) -> str:
     return number if number.isdigit() else name[:1].upper()
 
 
-def layered_layout(parents: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Place the nodes of a tree across: parents over the middle of their children, no overlaps.
-
-    Nodes of one layer are at least 1 apart, and subtrees as close as that allows. The mean of the
-    layouts packed from the left and from the right: mirrored trees are drawn as mirror images.
-
-    Args:
-        parents: int64 ``[N]``, row of the node above, which comes first; -1 for the root, row 0.
-        order: int64 ``[N]``, all rows, those of siblings from left to right.
-
-    Returns:
-        float64 ``[N]``, the root at 0.
-
-    Reference:
-        Reingold and Tilford, "Tidier drawings of trees", 1981.
-
-    Example:
-        >>> layered_layout(np.array([-1, 0, 0, 1, 1]), np.arange(5))
-        array([ 0. , -0.5,  0.5, -1. ,  0. ])
-    """
-    return (_pack(parents, order) - _pack(parents, order[::-1])) / 2.0
-
-
-def _pack(parents: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Place subtrees from left to right, each as far to the left as it goes."""
-    below: list[list[int]] = [[] for _ in parents]
-    for row in order.tolist():
-        if parents[row] >= 0:
-            below[parents[row]].append(row)
-    offsets = np.zeros(len(parents))  # from the node above
-    edges: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # left and right outline, by layer
-    for row in reversed(range(len(parents))):
-        rows = below[row]
-        if not rows:
-            edges[row] = np.zeros(1), np.zeros(1)
-            continue
-        left, right = edges.pop(rows[0])
-        places = [0.0]
-        for child in rows[1:]:
-            child_left, child_right = edges.pop(child)
-            common = min(len(right), len(child_left))
-            gaps = np.full(common, 1.3)  # between cousins; 1 between sisters
-            gaps[0] = 1.0
-            place = float((right[:common] - child_left[:common] + gaps).max())
-            left = np.concatenate((left, child_left[len(left) :] + place))
-            right = np.concatenate((child_right + place, right[len(child_right) :]))
-            places.append(place)
-        middle = (places[0] + places[-1]) / 2.0
-        offsets[rows] = np.array(places) - middle
-        edges[row] = (
-            np.concatenate(([0.0], left - middle)),
-            np.concatenate(([0.0], right - middle)),
-        )
-    across = np.zeros(len(parents))
-    for row in range(1, len(parents)):
-        across[row] = across[parents[row]] + offsets[row]
-    return across
-
-
 def _draw_curves(
     ax: Axes, shown: _Shown, points: np.ndarray, share: np.ndarray, thin: float
 ) -> None:
@@ -360,11 +302,14 @@ def _draw_curves(
 def _draw_nodes(ax: Axes, shown: _Shown, points: np.ndarray, diameters: np.ndarray) -> Any:
     """Draw the nodes, each once; return what a colour bar is made of."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import Normalize, PowerNorm
 
     values, inner = shown.nodes["value"].astype(float), ~shown.pruned & ~shown.terminal
     scale = values[inner] if inner.any() else values
-    colors = ScalarMappable(Normalize(float(scale.min()), float(scale.max())), "Blues")
+    low, high = float(scale.min()), float(scale.max())
+    crowded = np.median(scale) - low < 0.1 * (high - low)  # a linear scale would leave all white
+    norm = PowerNorm(0.4, low, high) if crowded else Normalize(low, high)
+    colors = ScalarMappable(norm, "Blues")
     thin = np.clip(diameters / 12.0, 0.3, 0.9)
     rims = np.where(shown.rewarded, np.maximum(1.6, thin), thin)
     for chosen, marker, area in ((inner, "o", 1.0), (shown.terminal, "s", 0.8)):
