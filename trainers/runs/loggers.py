@@ -183,7 +183,8 @@ def make_logger(config: Any) -> ScalarLoggers:
         offline = os.environ.get("WANDB_MODE", "offline") != "online"
         loggers.append(WandbLogger(exp_name=out.name, offline=offline, save_dir=str(out)))
     made = ScalarLoggers(loggers, _OBSERVERS.get())
-    made.log_hparams({**asdict(config), "out": out.name})
+    keys = {**asdict(config), "out": out.name}  # TensorBoard takes no dicts
+    made.log_hparams({k: str(v) if isinstance(v, dict) else v for k, v in keys.items()})
     return made
 
 
