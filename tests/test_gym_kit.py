@@ -137,7 +137,9 @@ def test_a_search_before_every_option_takes_the_final_choice() -> None:
     assert policy(ChainEnv(length=4).reset())["action"].item() == 0  # the plan says 1
 
 
-def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
+def test_an_agent_solves_saves_and_is_loaded(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     agent = HMCTS("MountainCar-v0", option_steps=14, novelty_radius=0.06, expansions=300)
     solution = agent.solve(seed=3)
     assert solution.solved
@@ -146,7 +148,9 @@ def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
     again = HMCTS.load(agent.save(tmp_path / "given"))
     assert repr(again) == repr(agent) == "HMCTS(MountainCar-v0, 3 actions, each for 14 base steps)"
     assert again.solve(seed=3) == solution
+    capfd.readouterr()
     agent.learn(640, progress=False)
+    assert capfd.readouterr() == ("", "")
     assert agent.config.num_skills == 8
     assert agent.loss is not None
     again = HMCTS.load(agent.save(tmp_path / "learned"))
