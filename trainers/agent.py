@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -168,7 +170,7 @@ class HMCTS:
 
         Args:
             base_steps: of training.
-            progress: show a bar.
+            progress: show a bar; False prints nothing.
             save_dir: folder of checkpoints. Default: none.
 
         Raises:
@@ -181,7 +183,8 @@ class HMCTS:
             )
         changes: dict[str, Any] = {"options": "learned", "train_base_steps": base_steps}
         self.kit = self._make_kit(dataclasses.replace(self._asked, **changes))
-        self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
+        with _torchrl_quiet():
+            self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
         return self
 
     def _take(self, learned: LearnedSkills) -> None:
@@ -204,7 +207,7 @@ class HMCTS:
             searches: of each iteration.
             iterations: Default 2.
             updates: of the network, in each iteration.
-            progress: show a bar.
+            progress: show a bar; False prints nothing.
 
         Returns:
             The agent.
@@ -229,19 +232,20 @@ class HMCTS:
         scale_by(network, self.planner, self.kit.starts("train", 4))
         guided = self.kit.guide(self.kit.make_planner(self.env), network)
         loss = ExpertIterationLoss(network, value_loss="log" if goal else "smooth_l1")
-        ExpertIterationTrainer(
-            self.env,
-            network,
-            self.planner,
-            planner=guided,
-            loss_module=loss,
-            iterations=iterations,
-            searches_per_iteration=searches,
-            updates_per_iteration=updates,
-            example_kwargs={"roots": not goal},
-            progress=_bar("distil", progress),
-            seed=self.config.seed,
-        ).train()
+        with _torchrl_quiet():
+            ExpertIterationTrainer(
+                self.env,
+                network,
+                self.planner,
+                planner=guided,
+                loss_module=loss,
+                iterations=iterations,
+                searches_per_iteration=searches,
+                updates_per_iteration=updates,
+                example_kwargs={"roots": not goal},
+                progress=_bar("distil", progress),
+                seed=self.config.seed,
+            ).train()
         self._guide(network)
         return self
 
@@ -378,8 +382,20 @@ class HMCTS:
         )
 
 
-def _bar(name: str, shown: bool) -> Callable[..., Any]:
-    return partial(tqdm, desc=name, disable=not shown)
+def _bar(name: str, shown: bool) -> Callable[..., Any] | None:
+    return partial(tqdm, desc=name) if shown else None
+
+
+@contextlib.contextmanager
+def _torchrl_quiet() -> Iterator[None]:
+    """Keeps TorchRL's messages that are no warnings to itself."""
+    logger = logging.getLogger("torchrl")
+    level = logger.level
+    logger.setLevel(max(level, logging.WARNING))
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
@@ -408,7 +424,6 @@ def load_worker(folder: str | Path) -> SkillPolicy:
         >>> from torchrl_hmcts.trainers import HMCTS, load_worker
         >>> folder = tempfile.mkdtemp()
         >>> agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
-        Learning 8 skills in 64 base steps ...
         >>> load_worker(agent.save(folder)).in_keys
         ['observation', 'skill']
     """

@@ -406,7 +406,8 @@ class GymConfig(SkillsConfig):
     """Keywords of gymnasium.make: make.KEY=VALUE, e.g. make.maze_map=[[1,1],[1,1]]."""
     options: str = "learned"
     """"learned": the manager plans over skills; "actions": over primitive actions, each repeated;
-    "directions": the same, where actions lie within bounds."""
+    "directions": the same, where actions lie within bounds; "goals": over values that features are
+    brought to, of the features that actions control."""
     task: str = "auto"
     """"goal": plan until it is reached; "return": collect rewards, with a search before every
     option; "auto": found by a short look at the env."""
@@ -442,7 +443,7 @@ class GymConfig(SkillsConfig):
     LEAST = {"curve_points": 0, "option_steps": 0, "skill_steps": 0, "processes": 0}
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("updates_per_step",)
     CHOICES = SkillsConfig.CHOICES | {
-        "options": ("learned", "actions", "directions"),
+        "options": ("learned", "actions", "directions", "goals"),
         "task": ("auto", "goal", "return"),
         "keep": ("last",),
     }

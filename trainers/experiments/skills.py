@@ -148,7 +148,7 @@ def learn(
     Args:
         kit: whose env it learns in.
         save_dir: folder of the checkpoints. Default: none are written.
-        progress: makes a progress bar, e.g. ``tqdm.tqdm``.
+        progress: makes a progress bar, e.g. ``tqdm.tqdm``. Default: nothing is printed.
         logger: of TorchRL; gets the training's values and, as ``test_solved`` and ``test_frames``,
             those of the tests on the way. Default: none.
         resume: continue from the newest checkpoint in ``save_dir``.
@@ -167,7 +167,8 @@ def learn(
     if given is not None:
         return LearnedSkills(given, None, {}, RoundRecords(), 0, 0, 0, 0.0)
     frames = config.train_steps * config.frames_per_step
-    console.say(f"Learning {config.num_skills} skills in {frames:,} {kit.unit} ...")
+    if progress is not None:
+        console.say(f"Learning {config.num_skills} skills in {frames:,} {kit.unit} ...")
     loss = make_loss(kit)
     common = {"save_dir": save_dir, "progress": progress, "logger": logger, "seed": config.seed}
     common |= {"total_frames": config.train_steps, **config.trainer}
