@@ -55,7 +55,8 @@ def readme_claims() -> list[str]:
     return [
         f"mazes, 4 skills, {steps} | {listed(r['solved'] for r in demo)} of {demo[0]['mazes']} "
         f"| {len(demo)} |",
-        f"untrained skills | {listed(r['solved'] for r in untrained)} of {untrained[0]['starts']} "
+        f"the first {untrained[0]['starts']} of these mazes, untrained skills | "
+        f"{listed(r['solved'] for r in untrained)} of {untrained[0]['starts']} "
         f"| {len(untrained)} |",
         f"{frames:,} frames of training | {listed(r['solved'] for r in lab)} of {lab[0]['mazes']} "
         f"| {len(lab)} |",

@@ -128,7 +128,7 @@ class SkillMLP(nn.Module):
 
     @property
     def stackable(self) -> bool:
-        """Whether the parameters of N copies may be put in stacked, to run all copies at once."""
+        """True if the parameters of N copies may be put in stacked, to run all copies at once."""
         return can_stack(self.trunk)
 
     def extra_repr(self) -> str:
