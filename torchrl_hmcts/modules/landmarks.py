@@ -257,18 +257,24 @@ def _nearest(places: Tensor, landmarks: Tensor) -> Tensor:
 
 
 def _passages(labels: np.ndarray, ends: np.ndarray, most: int) -> dict[tuple[int, int], list[int]]:
-    """Base steps of each passage from a landmark to another, up to ``most`` landmarks on."""
+    """Base steps of each passage from a landmark to another, up to ``most`` landmarks on.
+
+    Episodes begin between landmarks: what is recorded from there counts where nothing else is.
+    """
     begins = np.ones(len(labels), np.bool_)
-    begins[1:] = (labels[1:] != labels[:-1]) | ends[:-1]
+    first = np.append(True, ends[:-1])
+    begins[1:] = (labels[1:] != labels[:-1]) | first[1:]
     at = np.flatnonzero(begins)
-    who, episode = labels[at], np.cumsum(np.append(False, ends[:-1]))[at]
-    found: dict[tuple[int, int], list[int]] = {}
+    who, episode, partial = labels[at], np.cumsum(first)[at], first[at]
+    whole: dict[tuple[int, int], list[int]] = {}
+    rest: dict[tuple[int, int], list[int]] = {}
     for on in range(1, most + 1):
         same = (episode[on:] == episode[:-on]) & (who[on:] != who[:-on])
-        rows = zip(who[:-on][same], who[on:][same], (at[on:] - at[:-on])[same], strict=True)
-        for i, j, steps in rows:
-            found.setdefault((int(i), int(j)), []).append(int(steps))
-    return found
+        pairs = np.stack([who[:-on][same], who[on:][same]], 1).tolist()
+        steps = (at[on:] - at[:-on])[same].tolist()
+        for pair, taken, cut in zip(pairs, steps, partial[:-on][same].tolist(), strict=True):
+            (rest if cut else whole).setdefault(tuple(pair), []).append(taken)
+    return {pair: whole.get(pair) or rest[pair] for pair in whole | rest}
 
 
 class LandmarkEnv(EnvBase):
