@@ -105,6 +105,10 @@ def measure(name: str, check: bool) -> dict[str, Any]:
         mujoco.mj_getState(model, data, state, snapshot._spec)
         bare = micro(lambda: mujoco.mj_setState(model, data, state, snapshot._spec))
         row["mj_setState_us"] = round(bare / 300 * 1e6, 1)
+        if snapshot.forward:
+            row["mj_forward_us"] = round(
+                micro(lambda: mujoco.mj_forward(model, data)) / 300 * 1e6, 1
+            )
     return row
 
 

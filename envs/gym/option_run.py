@@ -127,20 +127,21 @@ class OptionRun(ABC):
         act, ends, take, gamma = self.worker.act, self.ends, self.step, self.gamma
         reward, discount, work, clock = 0.0, 1.0, self.work, self.clock
         left = clock._max_episode_steps - clock._elapsed_steps if clock is not None else np.inf
+        begun = work[0]
         with self.block:
             for step in range(1, self.max_steps + 1):
                 action = act(observation, option, generator)
                 observation, gained, terminated, truncated, _ = take(action)
-                work[0] += 1
-                reward += discount * gained
+                work[0] = begun + step
+                reward += discount * float(gained)
                 discount *= gamma
-                if step >= left:
-                    truncated = True
-                over = terminated or truncated
-                if over or (ends is not None and ends(observation, option, step)):
+                if terminated or truncated or step >= left:
+                    break
+                if ends is not None and ends(observation, option, step):
                     break
         if clock is not None:
             clock._elapsed_steps += step
+            truncated = truncated or step >= left
         slots["reward"][index] = reward
         slots["duration"][index] = step
         slots["terminated"][index], slots["truncated"][index] = terminated, truncated
