@@ -165,6 +165,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ids", nargs="*", default=list(TASKS))
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--budgets", nargs="+", default=["simulations", "seconds"])
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -182,7 +183,8 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for name in args.ids:
         task = TASKS[name]
-        for seconds in (None, task.seconds):
+        for budget in args.budgets:
+            seconds = task.seconds if budget == "seconds" else None
             for player, play in players.items():
                 runs = [play(name, seed, seconds) for seed in range(args.seeds)]
                 total = {key: sum(run[key] for run in runs) for key in runs[0]}

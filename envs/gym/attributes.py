@@ -34,6 +34,7 @@ _FIXED_TYPES = (
 )
 _NO_OBJECTS = frozenset({*ATOMS, list, dict, tuple, np.ndarray, np.dtype})
 _FIXED, _PLAIN, _OTHER = range(3)
+_REMEMBERED = 8  # states of attributes whose objects are kept
 
 
 class AttributeSnapshot(Snapshot):
@@ -91,6 +92,7 @@ class AttributeSnapshot(Snapshot):
         self._unchanged: bytes | None = None  # attributes of the env, if it took no step since
         self._known: tuple[Any, bytes] = None, b""  # a mark, and what it stands for
         self._seen: Seen | None = None
+        self._recent: dict[bytes, tuple[Seen, Any, list[Any], list[Any], list[Any]]] = {}
         content = self._pickled(learning=True)
         self._unpickled(content)  # a class that is not read is named now, not in a search
         self.width = _room_for(len(content), cap, env)
@@ -147,8 +149,26 @@ class AttributeSnapshot(Snapshot):
         if content != self._unchanged:
             mark, known = self._known
             if content != known or mark is None or self._mark() != mark:
-                self._load_attributes(content)
+                if not self._recalls(content):
+                    self._load_attributes(content)
             self._unchanged = content
+
+    def _recalls(self, content: bytes) -> bool:
+        """Sets the attributes to the objects that were read, if these have not changed since."""
+        if content not in self._recent:
+            return False
+        seen, mark, states, inner, lists = self._recent[content]
+        for layer, state in zip(self._layers, states, strict=True):
+            vars(layer).update(state)
+        for held, copied in zip(seen.dicts[len(states) :], inner, strict=True):
+            held.clear()
+            held.update(copied)
+        for items, copies in zip(seen.lists, lists, strict=True):
+            items[:] = copies
+        if not seen.still() or seen.contents() != mark:
+            return False
+        self._seen, self._known = seen, (mark, content)
+        return True
 
     def _load_attributes(self, content: bytes) -> None:
         """Sets the attributes of all layers."""
@@ -158,7 +178,7 @@ class AttributeSnapshot(Snapshot):
             now = vars(layer)
             if len(now) > len(plain) + len(other):
                 for name in [n for n in now if n not in plain and n not in other]:
-                    if self._kind(number, name, now[name]) != _FIXED:
+                    if self._is_state(number, name, now[name]):
                         del now[name]
             now.update(plain)
             now.update((name, value) for name, value in other.items() if value is not _KEPT)
@@ -221,6 +241,13 @@ class AttributeSnapshot(Snapshot):
             except Exception as error:
                 raise SnapshotError(self._refusal(others, error)) from error
         self._known = mark, stream.getvalue()
+        if mark is not None and self._seen is not None:
+            if len(self._recent) == _REMEMBERED:
+                del self._recent[next(iter(self._recent))]
+            states = [a | b for a, b in zip(values, others, strict=True)]
+            inner = [*map(dict, self._seen.dicts[len(states) :])]
+            lists = [*map(list, self._seen.lists)]
+            self._recent[self._known[1]] = self._seen, mark, states, inner, lists
         return self._known[1]
 
     def _mark(self) -> Any:

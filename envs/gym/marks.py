@@ -102,18 +102,19 @@ class _Look:
         marks: list[Any] = []
         for number, layer in enumerate([*self._owners]):
             own = vars(layer)
-            marks += [
-                (name, self._digest(value))
-                for name, value in own.items()
-                if is_state(number, name, value)
-            ]
+            for (name, value), matters in zip(own.items(), read[number], strict=True):
+                if type(value) in ATOMS:
+                    if matters:
+                        marks += name, value
+                elif is_state(number, name, value):
+                    marks += name, self._digest(value)
             generator = own.get("_np_random")
             memory = () if generator is None else generator_memory(generator)
             if memory is None:
                 raise TypeError
             self._memory += memory
             marks.append(len(memory))
-        dicts = [*map(vars, self._owners), *self._dicts]
+        dicts: list[dict[Any, Any]] = [*[vars(owner) for owner in self._owners], *self._dicts]
         flags = [*chain.from_iterable(read)]
         flags += [True] * (sum(map(len, dicts)) - len(flags))
         values = compress(chain.from_iterable(map(dict.values, dicts)), flags)

@@ -176,6 +176,8 @@ class MiniGridSnapshot(AttributeSnapshot):
         """Drops the reference of the last episode."""
         self._reference, self._cells, self._movable = b"", [], []
         self._changes, self._seen = _Changes([], [], b""), None
+        self._known = None, b""
+        self._recent.clear()
         for item in self._fixed[self._own_fixed :]:
             self._index.pop(id(item), None)
         del self._fixed[self._own_fixed :]
