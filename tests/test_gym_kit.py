@@ -291,6 +291,19 @@ def test_wrong_words_say_what_to_write(
     assert not (tmp_path / "run").exists()
 
 
+def test_goals_are_found_on_features_that_actions_control() -> None:
+    agent = HMCTS(lambda: Line(), options="goals")
+    goals = agent.kit._fixed.goals  # type: ignore[attr-defined]
+    assert {(g.controlled, g.raising, g.lowering) for g in goals} == {(0, 1, 0)}
+    scale = float(goals[0].features(None, np.array([1.0])).item())  # of one place
+    assert [g.value / scale for g in goals] == pytest.approx([-0.8, 1.6, 4.0, 6.4, 8.8])  # of 0..8
+    solution = agent.solve(seed=0)
+    assert solution.solved
+    assert solution.base_steps == 9
+    with pytest.raises(ValueError, match="are kinds without an order. Use options=actions"):
+        HMCTS("FrozenLake-v1", options="goals")
+
+
 def test_no_skills_no_worker() -> None:
     with pytest.raises(RuntimeError, match=r"Call learn\(\) first"):
         HMCTS("MountainCar-v0", options="learned").solve()

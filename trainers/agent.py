@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from tqdm import tqdm
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import MCTSPlanner, Plan
@@ -39,7 +40,7 @@ _OTHER_DRAWS = 1_000_003  # added to the seed of the env to act in, whose draws 
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """One episode: what was planned, and what came of it in an env of its own.
+    """One episode: its plan, and its result in another instance of the env.
 
     Attributes:
         solved (bool, optional): whether the goal was reached; where rewards are collected, whether
@@ -367,9 +368,14 @@ class HMCTS:
             agent._guide(network)
         return agent
 
+    def _repr_html_(self) -> str:
+        planner = self.__dict__.get("planner")
+        searched = planner is not None and planner.has_searched
+        return notebook.shown(repr(self)) + (planner.last_search._repr_html_() if searched else "")
+
     def __repr__(self) -> str:
         config = self.config
-        name = getattr(config, "id", "") or config.EXPERIMENT
+        name = getattr(config, "id", "") or getattr(self._env, "__name__", config.EXPERIMENT)
         what = "skills" if config.options == "learned" else "actions"
         return (
             f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"

@@ -275,7 +275,7 @@ class SkillPolicy(TensorDictModuleBase):
     Args:
         actor (SkillActor): the actor whose parameters are used; later updates are seen.
         deterministic (bool): take the most probable action (of a Gaussian: its mean, squashed)
-            instead of sampling, whatever the exploration type. Default ``False``: sample, unless
+            instead of sampling, under any exploration type. Default ``False``: sample, unless
             TorchRL's ``set_exploration_type`` asks for ``DETERMINISTIC``, ``MODE`` or ``MEAN``,
             which mean the same here.
         generator (torch.Generator, optional): source of the samples. Default ``None``: torch's

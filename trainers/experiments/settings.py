@@ -19,6 +19,9 @@ class SkillsConfig(RunConfig):
     ``objective``, ``loss``, ``trainer`` and ``planner`` hold what differs from the kit's own: by
     keyword, with ``"_component_"`` the path of a class where another one is chosen.
 
+    Raises:
+        ValueError: if a value is out of its range or does not fit the others.
+
     Example:
         >>> SkillsConfig(planner={"waves_in_flight": 2}).planner
         {'waves_in_flight': 2}
@@ -121,7 +124,7 @@ class SkillsConfig(RunConfig):
 
 @dataclass
 class DemoConfig(SkillsConfig):
-    """What ``hmcts demo`` does: the agent over the kit ``waterworld``.
+    """Keys of ``hmcts demo``: the agent over the kit ``waterworld``.
 
     Raises:
         ValueError: if a number is out of its range, or ``train_base_steps`` is no multiple of 64.
@@ -172,7 +175,7 @@ class DemoConfig(SkillsConfig):
 
 @dataclass
 class LabMazeConfig(SkillsConfig):
-    """What ``hmcts train experiment=labmaze`` does: the agent over the kit ``labmaze``.
+    """Keys of ``hmcts train experiment=labmaze``: the agent over the kit ``labmaze``.
 
     A frame is a 60th of a second of the game. A base step of the worker is ``frames_per_step``
     frames with one action.
@@ -283,7 +286,7 @@ class LabMazeConfig(SkillsConfig):
 
 @dataclass
 class WaterworldA3CConfig(RunConfig):
-    """What ``hmcts train experiment=waterworld_a3c`` does; each field is a key.
+    """Keys of ``hmcts train experiment=waterworld_a3c``.
 
     Example:
         >>> WaterworldA3CConfig(seed=1).total_frames
@@ -352,7 +355,7 @@ class WaterworldA3CConfig(RunConfig):
 
 @dataclass
 class WaterworldGoalsConfig(WaterworldA3CConfig):
-    """What ``hmcts train experiment=waterworld_goals`` does; each field is a key.
+    """Keys of ``hmcts train experiment=waterworld_goals``.
 
     Example:
         >>> WaterworldGoalsConfig().goal_divergence_threshold
@@ -388,7 +391,7 @@ class WaterworldGoalsConfig(WaterworldA3CConfig):
 
 @dataclass
 class GymConfig(SkillsConfig):
-    """What ``hmcts train kit=gym env.id=NAME`` does: the agent over the kit ``gym``.
+    """Keys of ``hmcts train kit=gym env.id=NAME``: the agent over the kit ``gym``.
 
     Example:
         >>> GymConfig(id="PointMaze_Large-v3").num_skills
@@ -403,7 +406,8 @@ class GymConfig(SkillsConfig):
     """Keywords of gymnasium.make: make.KEY=VALUE, e.g. make.maze_map=[[1,1],[1,1]]."""
     options: str = "learned"
     """"learned": the manager plans over skills; "actions": over primitive actions, each repeated;
-    "directions": the same, where actions lie within bounds."""
+    "directions": the same, where actions lie within bounds; "goals": over values that features are
+    brought to, of the features that actions control."""
     task: str = "auto"
     """"goal": plan until it is reached; "return": collect rewards, with a search before every
     option; "auto": found by a short look at the env."""
@@ -439,7 +443,7 @@ class GymConfig(SkillsConfig):
     LEAST = {"curve_points": 0, "option_steps": 0, "skill_steps": 0, "processes": 0}
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("updates_per_step",)
     CHOICES = SkillsConfig.CHOICES | {
-        "options": ("learned", "actions", "directions"),
+        "options": ("learned", "actions", "directions", "goals"),
         "task": ("auto", "goal", "return"),
         "keep": ("last",),
     }

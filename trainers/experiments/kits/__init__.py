@@ -94,7 +94,7 @@ class Trial:
 
 
 class Kit:
-    """What an experiment must know of an environment.
+    """Base class of kits: all that an experiment must know of an environment.
 
     A split is ``"train"``, ``"curve"`` (tried while it learns) or ``"test"``.
 
