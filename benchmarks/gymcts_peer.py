@@ -23,6 +23,7 @@ Seconds are those of the processor.
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.metadata
 import json
 import os
@@ -60,7 +61,7 @@ TASKS: dict[str, Task] = {
     "FrozenLake-v1": Task({"is_slippery": False}, 50, 0.1, 30, 1, positive),
     "CliffWalking-v1": Task({"max_episode_steps": 40}, 30, 0.05, 40, 1, lambda r: r > -40),
     "CartPole-v1": Task({"max_episode_steps": 100}, 10, 0.02, 100, 2, lambda r: r >= 100),
-    "MiniGrid-Empty-5x5-v0": Task({"max_steps": 15}, 10, 0.1, 15, 2, positive),
+    "MiniGrid-Empty-5x5-v0": Task({}, 10, 0.1, 15, 2, positive),
     "MiniGrid-FourRooms-v0": Task({"max_steps": 50}, 10, 0.1, 50, 4, positive),
 }
 
@@ -120,9 +121,8 @@ def ours(name: str, options: bool, seed: int, seconds: float | None) -> dict[str
     torch.manual_seed(seed)
     actions = RepeatActions(int(make_gym(name, **task.keywords).action_space.n))
     settings: dict[str, Any] = {"max_steps": task.repeats if options else 1, "num_processes": 0}
-    model, real = (
-        OptionPool(name, actions, seed=seed, **settings, **task.keywords) for _ in range(2)
-    )
+    make = functools.partial(make_gym, name, **task.keywords)
+    model, real = (OptionPool(make, actions, seed=seed, **settings) for _ in range(2))
     at_once = 16 if options else 2  # simulations between two looks at the clock
     count = task.simulations if seconds is None else at_once
     planner = MCTSPlanner(
@@ -166,6 +166,7 @@ def main() -> None:
     parser.add_argument("ids", nargs="*", default=list(TASKS))
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--budgets", nargs="+", default=["simulations", "seconds"])
+    parser.add_argument("--players", nargs="*", help="default: all four")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -185,7 +186,8 @@ def main() -> None:
         task = TASKS[name]
         for budget in args.budgets:
             seconds = task.seconds if budget == "seconds" else None
-            for player, play in players.items():
+            for player in args.players or players:
+                play = players[player]
                 runs = [play(name, seed, seconds) for seed in range(args.seeds)]
                 total = {key: sum(run[key] for run in runs) for key in runs[0]}
                 rows.append(
