@@ -127,12 +127,11 @@ class OptionRun(ABC):
         act, ends, take, gamma = self.worker.act, self.ends, self.step, self.gamma
         reward, discount, work, clock = 0.0, 1.0, self.work, self.clock
         left = clock._max_episode_steps - clock._elapsed_steps if clock is not None else np.inf
-        begun = work[0]
         with self.block:
             for step in range(1, self.max_steps + 1):
                 action = act(observation, option, generator)
                 observation, gained, terminated, truncated, _ = take(action)
-                work[0] = begun + step
+                work[0] += 1  # a step of Atari adds to it as well
                 reward += discount * float(gained)
                 discount *= gamma
                 if terminated or truncated or step >= left:
