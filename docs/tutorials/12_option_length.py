@@ -36,6 +36,7 @@ def search(option_steps, radius):
 
 
 starts = make_env(20).reset(TensorDict(batch_size=[12]))
+shown = int((starts["position"] - starts["target"]).norm(dim=-1).argmax())  # the farthest target
 
 
 def report(name, values, searches):
@@ -50,8 +51,8 @@ def draw(values, searches, name):
     for axes, value, found, words in zip(
         panels, values, searches, ("too small", "right", "too large"), strict=True
     ):
-        found.tree.draw_map(axes, found.tree.states[3, 0])
-        found.tree.plot_positions(3, ax=axes, legend=False, max_nodes=400)
+        found.tree.draw_map(axes, found.tree.states[shown, 0])
+        found.tree.plot_positions(shown, ax=axes, legend=False, max_nodes=400)
         axes.set_title(f"{words}: {name} {value}", loc="left")
     plt.show()
 
