@@ -49,7 +49,8 @@ class LandmarkModel(nn.Module):
         places: float32 ``[N, F]``.
         is_jump: bool ``[N]``, places before jumps.
         jump: distance of two places from which on a step is a jump.
-        targets: int64 ``[N, A]``, to which landmark an option goes; -1: there is no such option.
+        targets: int64 ``[N, A]``, to which landmark an option goes; -1: there is no such option,
+            and it stays.
         durations: float32 ``[N, A]``, base steps.
         outcomes: int64 ``[N, A, K]``, landmarks; probabilities: float32 ``[N, A, K]``, of each.
 
@@ -83,8 +84,10 @@ class LandmarkModel(nn.Module):
         self.register_buffer("jump", torch.tensor(torch.inf))
         self.register_buffer("targets", torch.full((n, a), -1))
         self.register_buffer("durations", torch.ones(n, a))
-        self.register_buffer("outcomes", torch.zeros(n, a, num_outcomes, dtype=torch.int64))
+        own = torch.arange(n)[:, None, None].expand(n, a, num_outcomes).clone()
+        self.register_buffer("outcomes", own)
         self.register_buffer("probabilities", torch.zeros(n, a, num_outcomes))
+        self.probabilities[..., 0] = 1.0
 
     @classmethod
     def fit(
@@ -142,14 +145,14 @@ class LandmarkModel(nn.Module):
         for (i, j), times in passages.items():
             if len(times) >= min_count and i < len(plain):
                 options[i].append((j, max(1, round(float(np.quantile(times, _SHARE))))))
-        for p in exits:
-            options[p].append((p, 1))
-        width = max(map(len, options))
-        if not width:
+        if not any(options):
             raise ValueError(
                 f"{owner} found no two of {len(options)} landmarks between which {min_count} "
                 f"passages were recorded. Use a smaller radius or min_count."
             )
+        for p in exits:
+            options[p].append((p, 1))
+        width = max(map(len, options))
         most = max((len(after) for after in exits.values()), default=1)
         model = cls(len(options), x.shape[1], width, most)
         model.places.copy_(torch.cat(found))
@@ -254,18 +257,24 @@ def _nearest(places: Tensor, landmarks: Tensor) -> Tensor:
 
 
 def _passages(labels: np.ndarray, ends: np.ndarray, most: int) -> dict[tuple[int, int], list[int]]:
-    """Base steps of each passage from a landmark to another, up to ``most`` landmarks on."""
+    """Base steps of each passage from a landmark to another, up to ``most`` landmarks on.
+
+    Episodes begin between landmarks: what is recorded from there counts where nothing else is.
+    """
     begins = np.ones(len(labels), np.bool_)
-    begins[1:] = (labels[1:] != labels[:-1]) | ends[:-1]
+    first = np.append(True, ends[:-1])
+    begins[1:] = (labels[1:] != labels[:-1]) | first[1:]
     at = np.flatnonzero(begins)
-    who, episode = labels[at], np.cumsum(np.append(False, ends[:-1]))[at]
-    found: dict[tuple[int, int], list[int]] = {}
+    who, episode, partial = labels[at], np.cumsum(first)[at], first[at]
+    whole: dict[tuple[int, int], list[int]] = {}
+    rest: dict[tuple[int, int], list[int]] = {}
     for on in range(1, most + 1):
         same = (episode[on:] == episode[:-on]) & (who[on:] != who[:-on])
-        rows = zip(who[:-on][same], who[on:][same], (at[on:] - at[:-on])[same], strict=True)
-        for i, j, steps in rows:
-            found.setdefault((int(i), int(j)), []).append(int(steps))
-    return found
+        pairs = np.stack([who[:-on][same], who[on:][same]], 1).tolist()
+        steps = (at[on:] - at[:-on])[same].tolist()
+        for pair, taken, cut in zip(pairs, steps, partial[:-on][same].tolist(), strict=True):
+            (rest if cut else whole).setdefault(tuple(pair), []).append(taken)
+    return {pair: whole.get(pair) or rest[pair] for pair in whole | rest}
 
 
 class LandmarkEnv(EnvBase):
@@ -358,7 +367,8 @@ class LandmarkEnv(EnvBase):
             which = torch.zeros_like(landmark)
         else:
             draws = torch.rand((*landmark.shape, 1), generator=self._generator).to(self.device)
-            which = (shares.cumsum(-1) <= draws).sum(-1).clamp_max((shares > 0).sum(-1) - 1)
+            most = (shares > 0.0).sum(-1) - 1
+            which = torch.minimum((shares.cumsum(-1) <= draws).sum(-1), most)
         after = model.outcomes[landmark, option].gather(-1, which[..., None]).squeeze(-1)
         duration = model.durations[landmark, option].to(torch.int64)[..., None]
         out = self._shown(after, goal, duration)

@@ -117,7 +117,7 @@ def learn(
         if update % 100 == 99 or update == config.updates - 1:
             curves["updates"].append(update + 1)
             for name in ("loss_actor", "action_error"):
-                curves[name].append(float(out[name]))
+                curves[name].append(out[name].item())
     return loss.eval(), curves
 
 

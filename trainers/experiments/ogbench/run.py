@@ -11,17 +11,21 @@ import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tqdm import tqdm
 
-from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
+from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.objectives import GoalCloningLoss
 from torchrl_hmcts.trainers.evaluation import spread
-from torchrl_hmcts.trainers.experiments.ogbench.agent import LandmarkAgent, fit_model, learn
-from torchrl_hmcts.trainers.experiments.ogbench.agent import make_worker as _make_worker
+from torchrl_hmcts.trainers.experiments.ogbench.agent import (
+    LandmarkAgent,
+    fit_model,
+    learn,
+    make_worker,
+)
 from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
 from torchrl_hmcts.trainers.experiments.ogbench.data import load, record, save
 from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.figures.intervals import wilson
+from torchrl_hmcts.trainers.runs.console import counted
 from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
@@ -51,7 +55,7 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
             loss, curves = _loss(data, config), {}
             load_networks(loss, run.path)
         else:
-            loss, curves = learn(data, config, progress=_bar("learn", "update"))
+            loss, curves = learn(data, config, progress=counted("learn", "updates"))
             run.checkpoints.mkdir(exist_ok=True)
             name = f"checkpoint-{config.updates:012d}.torchrl"
             plain_checkpoint(loss_module=loss).save(run.checkpoints / name)
@@ -60,7 +64,7 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
         steps = curves.pop("updates", [])
         run.write_curves({k: (steps, v) for k, v in curves.items()}, "updates")
         agent = LandmarkAgent(fit_model(data, config), loss.actor_network, config)
-        episodes = play_tasks(agent, config, progress=_bar("act", "episode"))
+        episodes = play_tasks(agent, config, progress=counted("act", "episodes"))
         metrics = {
             "seed": config.seed,
             "recorded_steps": len(data),
@@ -95,12 +99,8 @@ def evaluate_ogbench(config: OGBenchConfig) -> dict[str, Any]:
 
 
 def _loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
-    worker = _make_worker(data, config)
+    worker = make_worker(data, config)
     return GoalCloningLoss(worker, progress_coeff=config.progress_coeff).eval()
-
-
-def _bar(name: str, unit: str) -> Callable[[Any], Any]:
-    return lambda steps: tqdm(steps, desc=name, unit=unit, disable=None)
 
 
 def recorded(config: OGBenchConfig) -> TensorDictBase:
@@ -112,7 +112,7 @@ def recorded(config: OGBenchConfig) -> TensorDictBase:
     path = Path(config.data) if config.data else _FOLDER / config.id
     if not config.data and not path.exists():
         print(f"Recording {config.id} in {path} ...", flush=True)
-        save(record(config.id, progress=_bar("record", "episode")), path)
+        save(record(config.id, progress=counted("record", "episodes")), path)
     return load(path)
 
 
@@ -136,17 +136,27 @@ def play_tasks(
     env = make_gym(split_name(config.id).env)
     numbers = [(task, i) for task in range(1, _TASKS + 1) for i in range(config.episodes)]
     return [
-        {"task": task, **_episode(env, agent, task, (config.seed, task, number))}
+        {"task": task, **act_once(env, agent, task, (config.seed, task, number))}
         for task, number in progress(numbers)
     ]
 
 
-def _episode(
+def act_once(
     env: gymnasium.Env, agent: LandmarkAgent, task: int, seeds: Sequence[int]
 ) -> dict[str, Any]:
+    """Act in one episode.
+
+    Args:
+        env: of OGBench, as :func:`make_gym` makes it.
+        agent: acts.
+        task: 1 to 5.
+        seeds: what start, goal and chance are drawn from.
+
+    Returns:
+        As of :func:`play_tasks`, for one episode.
+    """
     seed = int(np.random.SeedSequence(seeds).generate_state(1)[0])
-    if isinstance(env, PrivateRandom):
-        env.seed_globals(seed)
+    env.seed_globals(seed)  # type: ignore[attr-defined]
     begin = time.process_time()
     observation, info = env.reset(seed=seed, options={"task_id": task})
     agent.begin(info["goal"])
