@@ -208,8 +208,9 @@ def _rows(figures: Mapping[str, Any], before: str) -> Iterator[tuple[str, str]]:
         elif isinstance(value, str):
             yield f"{before}{words}", value
         elif isinstance(value, numbers.Real) and math.isfinite(value):
-            exact = isinstance(value, numbers.Integral) or abs(value) >= 1e4
-            shown = f"{int(value):,}" if exact else f"{value:,.4g}"
+            number = float(value)
+            exact = isinstance(value, numbers.Integral) or abs(number) >= 1e4
+            shown = f"{number:,.0f}" if exact else f"{number:,.4g}"
             if words in ("mean", "median", "95 %"):  # of a spread
                 words = f"{before.removesuffix(': ')}, {words}"
             else:
