@@ -57,7 +57,8 @@ _PLAIN = (bool, int, float, str)  # types that Hydra checks; any other may be a 
 _PACKAGES: Mapping[str, Mapping[str, str]] = {
     "torchrl_hmcts.objectives": {
         "loss": "A3CLoss DIAYNLoss DiscreteSkillSACLoss ExpertIterationLoss "
-        "IntraOptionQLoss OptionModelLoss OptionTerminationLoss SkillPriorLoss SkillSACLoss",
+        "GoalCloningLoss IntraOptionQLoss OptionModelLoss OptionTerminationLoss SkillPriorLoss "
+        "SkillSACLoss",
         "objective": "dads=SkillDynamicsLoss diayn=SkillDiscriminatorLoss lsd=LSDEncoderLoss "
         "metra=METRAEncoderLoss",
     },

@@ -52,6 +52,7 @@ class GoalCloningLoss(Loss):
         arXiv 1912.06088.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.objectives import GoalCloningLoss

@@ -55,7 +55,17 @@ class OGBenchConfig(RunConfig):
 
     EXPERIMENT = "ogbench"
     TOY = {"updates": 200, "episodes": 1}
-    KEPT = ("seed", "toy", "id", "data", "radius", "min_count", "jump_factor", "goal_steps", "updates")
+    KEPT = (
+        "seed",
+        "toy",
+        "id",
+        "data",
+        "radius",
+        "min_count",
+        "jump_factor",
+        "goal_steps",
+        "updates",
+    )
     PATHS = ("out", "data")
     ABOVE_ZERO = ("radius", "learning_rate", "jump_factor")
     LEAST = {"progress_coeff": 0}

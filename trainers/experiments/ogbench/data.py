@@ -146,11 +146,11 @@ def load(path: str | Path) -> TensorDictBase:
     """
     path = Path(path)
     if path.suffix != ".npz":
-        found = TensorDict.load_memmap(path)
+        found = TensorDict.load_memmap(path, allow_pickle=False)
         if not {"observation", "action", "done"} <= set(found.keys()):
             raise ValueError(f"{path} holds no recorded episodes: {sorted(found.keys())}.")
         return found
-    with np.load(path) as arrays:
+    with np.load(path, allow_pickle=False) as arrays:
         names = {"observation": "observations", "action": "actions", "done": "terminals"}
         if missing := sorted(set(names.values()) - set(arrays)):
             raise ValueError(f"{path} is no file of OGBench's: it lacks {', '.join(missing)}.")

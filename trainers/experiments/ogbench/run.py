@@ -100,7 +100,7 @@ def evaluate_ogbench(config: OGBenchConfig) -> dict[str, Any]:
 
 def _loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
     worker = make_worker(data, config)
-    return GoalCloningLoss(worker, progress_coeff=config.progress_coeff).eval()
+    return GoalCloningLoss(worker, progress_coeff=config.progress_coeff)
 
 
 def recorded(config: OGBenchConfig) -> TensorDictBase:
