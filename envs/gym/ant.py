@@ -9,6 +9,7 @@ Letters: *B batch, q a number of quarter turns.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -27,55 +28,52 @@ _BENDS = [1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0, 1.0]  # ankles of every other leg
 _ACTUATORS = [6, 7, 0, 1, 2, 3, 4, 5]  # are those of legs 4, 1, 2 and 3
 
 
-def seen_from(frame: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return vectors ``[*B, 2]`` in a frame.
+def seen_from(frame: Sequence[Any], x: Any, y: Any) -> tuple[Any, Any]:
+    """Return a vector in a frame.
 
     Args:
-        frame: cosine and sine of its first axis, ``[*B, 2]``.
-        vector: in the world.
+        frame: cosine and sine of its first axis, each a number or ``[*B]``.
+        x, y: of the vector in the world.
     """
-    c, s = frame[..., :1], frame[..., 1:]
-    x, y = vector[..., :1], vector[..., 1:]
-    return np.concatenate((c * x + s * y, c * y - s * x), -1)
+    c, s = frame
+    return c * x + s * y, c * y - s * x
 
 
-def _unit(x: np.ndarray) -> np.ndarray:
-    return x / np.maximum(np.sqrt((x * x).sum(-1, keepdims=True)), 1e-12)
+def _scaled(*x: Any) -> list[Any]:
+    """A vector at length 1, or 0 where it has none."""
+    square = sum(number * number for number in x)
+    length = square**0.5 + (square == 0)
+    return [number / length for number in x]
 
 
-def body_of(physics: np.ndarray, frame: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def body_of(physics: np.ndarray, frame: Any = None) -> tuple[np.ndarray, Any]:
     """Return what the worker sees of positions and velocities, ``[*B, 32]``, and the frame.
 
     Height, rotation matrix, joints, and all velocities, scaled.
 
     Args:
         physics: ``qpos`` and ``qvel``, float64 ``[*B, 29]``.
-        frame: ``[*B, 2]``. Default: the body's own heading, which turns by a quarter where the body
-            does.
+        frame: cosine and sine, each a number or ``[*B]``. Default: those of the body's own heading,
+            which turns by a quarter where the body does.
     """
-    qpos, qvel = physics[..., :POSITIONS], physics[..., POSITIONS:]
-    w, x, y, z = np.moveaxis(_unit(qpos[..., 3:7]), -1, 0)
-    rows = (
-        np.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
-        np.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
-        np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
-    )
+    single = physics.ndim == 1  # numbers of Python are faster than arrays of one
+    numbers = physics.tolist() if single else list(np.moveaxis(physics, -1, 0))
+    qpos, qvel = numbers[:POSITIONS], numbers[POSITIONS:]
+    w, x, y, z = _scaled(*qpos[3:7])
+    first = (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y))
+    second = (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x))
+    third = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
     if frame is None:
-        cosine = rows[0][..., 0] + rows[1][..., 1]
-        frame = _unit(np.stack((cosine, rows[1][..., 0] - rows[0][..., 1]), -1))
-    c, s = frame[..., :1], frame[..., 1:]
-    parts = (
-        qpos[..., 2:3],
-        c * rows[0] + s * rows[1],
-        c * rows[1] - s * rows[0],
-        rows[2],
-        qpos[..., 7:],
-        0.5 * seen_from(frame, qvel[..., :2]),
-        0.5 * qvel[..., 2:3],
-        0.25 * qvel[..., 3:6],
-        0.1 * qvel[..., 6:],
+        frame = _scaled(first[0] + second[1], second[0] - first[1])
+    seen = [seen_from(frame, *pair) for pair in zip(first, second, strict=True)]
+    speed = seen_from(frame, qvel[0], qvel[1])
+    body = (
+        [qpos[2], *(pair[0] for pair in seen), *(pair[1] for pair in seen), *third, *qpos[7:]]
+        + [0.5 * v for v in (*speed, qvel[2])]
+        + [0.25 * v for v in qvel[3:6]]
+        + [0.1 * v for v in qvel[6:]]
     )
-    return np.concatenate(parts, -1), frame
+    return (np.array(body) if single else np.stack(body, -1)), frame
 
 
 def up_of(qpos: np.ndarray) -> np.ndarray:
@@ -103,7 +101,9 @@ class Turn(NamedTuple):
         return cls(index, sign.astype(np.float32))
 
     def __call__(self, x: np.ndarray, quarters: Any) -> np.ndarray:
-        """Turn ``[*B, n]`` by ``[*B]`` quarters."""
+        """Turn ``[*B, n]`` by ``[*B]`` quarters, or all by a number of them."""
+        if isinstance(quarters, int):
+            return x[..., self.index[quarters]] * self.sign[quarters]
         turned: np.ndarray = np.take_along_axis(x, self.index[quarters], -1)
         return turned * self.sign[quarters].astype(x.dtype)
 
@@ -195,7 +195,7 @@ class AntWorker:
         self._skills = SkillWorker(actor, deterministic=True)
         self.num_options = 2 * self._skills.num_options
         self._body, self._action, _ = turns()
-        self._frame: np.ndarray | None = None
+        self._frame: Any = None
 
     def begin(self, observation: Any, option: int) -> None:
         """Take note of the heading."""

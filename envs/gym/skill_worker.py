@@ -122,7 +122,8 @@ class SkillWorker:
                 return int(choose(*arrays, draw, 1.0))
             run_network(*arrays, 1.0)
             outputs = net._logits
-        loc, raw = np.split(outputs, 2)
+        size = len(outputs) // 2
+        loc, raw = outputs[:size], outputs[size:]
         if not self.deterministic:
             scale = np.logaddexp(0.0, raw + _SHIFT) + _LEAST_SCALE
             loc = loc + scale * generator.standard_normal(len(loc))

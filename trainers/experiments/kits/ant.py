@@ -118,12 +118,13 @@ class SkillFrame(EnvTransform):
 
     def _write(self, td: TensorDictBase, frame: Tensor | None, origin: Tensor | None) -> None:
         physics = td.get("physics").numpy()[..., 1 : 1 + POSITIONS + VELOCITIES]  # 0 is the time
-        body, axis = body_of(physics, None if frame is None else frame.numpy())
+        body, axes = body_of(physics, None if frame is None else np.moveaxis(frame.numpy(), -1, 0))
         place = physics[..., :2]
         began = place.copy() if origin is None else origin.numpy()
-        moved = seen_from(axis, place - began)
+        x, y = np.moveaxis(place - began, -1, 0)
+        moved, axes = (np.stack(pair, -1) for pair in (seen_from(axes, x, y), axes))
         found = {"body": np.float32(body), "displacement": np.float32(moved)}
-        for key, value in {**found, "frame": axis, "origin": began}.items():
+        for key, value in {**found, "frame": axes, "origin": began}.items():
             td.set(key, torch.from_numpy(value))
 
     def _reset(
