@@ -9,6 +9,7 @@ Letters: *B batch, q a number of quarter turns.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -25,6 +26,9 @@ from torchrl_hmcts.modules import SkillActor
 POSITIONS, VELOCITIES, BODY, ACTIONS = 15, 14, 32, 8
 _LEGS = [2, 3, 4, 5, 6, 7, 0, 1]  # leg i of a body turned by a quarter is leg i + 1
 _BENDS = [1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0, 1.0]  # ankles of every other leg bend the other way
+_BACK = -0.3  # cosine between walk and option: what is less is to turn back
+_WALKS = 0.7  # metres a second
+_NEAR, _ZOOM = 4.0, 4.0  # metres from the goal within which a metre counts as 4
 _ACTUATORS = [6, 7, 0, 1, 2, 3, 4, 5]  # are those of legs 4, 1, 2 and 3
 
 
@@ -86,6 +90,21 @@ def up_of(qpos: np.ndarray) -> np.ndarray:
     return up
 
 
+def goal_rings(env: gymnasium.Env, observation: Any) -> np.ndarray:
+    """Return the place, and how near the goal is where it is near, float32 ``[3]``.
+
+    So that a search tells places apart that are metres from each other, and near the goal those
+    that are a goal's width nearer.
+
+    Args:
+        env: is not looked at.
+        observation: of :class:`AntView`.
+    """
+    x, y = observation["achieved_goal"]
+    u, v = observation["desired_goal"]
+    return np.array([x, y, _ZOOM * min(math.hypot(x - u, y - v), _NEAR)], np.float32)
+
+
 class Turn(NamedTuple):
     """A body or an action after 0 to 3 quarter turns: its number i is ``sign * x[index[q, i]]``."""
 
@@ -130,10 +149,14 @@ def turns() -> tuple[Turn, Turn, Turn]:
 class AntView(gymnasium.Wrapper):
     """Shows an ant maze as positions, velocities, place and goal, and slows its ant down.
 
+    With ``directions`` there is an ``"action_mask"`` too: an ant that walks does not turn back.
+
     Args:
         env (gymnasium.Env): an ant maze of OGBench or gymnasium-robotics.
         repeat (int): steps of the env that an action lasts.
         strength (float): share of the torques that an action may use.
+        directions (ndarray, optional): of the options, as seen from the heading, ``[A, 2]``; of
+            those that are unknown (0, 0). Default: no mask.
 
     Raises:
         SnapshotError: if it is none.
@@ -141,7 +164,14 @@ class AntView(gymnasium.Wrapper):
 
     is_stateless = True
 
-    def __init__(self, env: gymnasium.Env, *, repeat: int = 1, strength: float = 1.0) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        *,
+        repeat: int = 1,
+        strength: float = 1.0,
+        directions: np.ndarray | None = None,
+    ) -> None:
         super().__init__(env)
         model, self._data = find_physics(env)
         if (model.nq, model.nv, model.nu) != (POSITIONS, VELOCITIES, ACTIONS):
@@ -154,14 +184,23 @@ class AntView(gymnasium.Wrapper):
         self.observation_space = spaces.Dict(
             {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
         )
+        self._directions = directions
+        if directions is not None:
+            self.observation_space.spaces["action_mask"] = spaces.MultiBinary(len(directions))
 
     def _seen(self) -> dict[str, np.ndarray]:
         physics = np.concatenate((self._data.qpos, self._data.qvel))
-        return {
+        seen = {
             "physics": physics,
             "achieved_goal": physics[:2].copy(),
             "desired_goal": self._task.goal().astype(np.float64),
         }
+        if self._directions is not None:
+            x, y = physics[POSITIONS : POSITIONS + 2].tolist()
+            _, frame = body_of(physics)
+            forward = self._directions @ np.array(seen_from(frame, x, y))
+            seen["action_mask"] = forward >= _BACK * max(math.hypot(x, y), _WALKS)
+        return seen
 
     def reset(self, **keywords: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode."""

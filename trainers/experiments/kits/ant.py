@@ -5,7 +5,8 @@ Letters: *B batch, S numbers of a state.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
 from torchrl.objectives import LossModule
 
-from torchrl_hmcts.envs import MujocoBatch, MujocoTask
+from torchrl_hmcts.envs import MujocoBatch, MujocoTask, OptionPool
 from torchrl_hmcts.envs.gym.ant import (
     ACTIONS,
     BODY,
@@ -27,6 +28,7 @@ from torchrl_hmcts.envs.gym.ant import (
     AntView,
     AntWorker,
     body_of,
+    goal_rings,
     seen_from,
     turns,
     up_of,
@@ -54,7 +56,7 @@ _METRES = 10.0  # of a reward in which a metre is about 1
 _LOSS = {"gamma": 0.98, "alpha_init": 0.1, "fixed_alpha": False, "target_entropy": -float(ACTIONS)}
 
 
-def make_ant(name: Any, gait: Mapping[str, float], **keywords: Any) -> AntView:
+def make_ant(name: Any, gait: Mapping[str, Any], **keywords: Any) -> AntView:
     """Make an ant maze as the worker sees it.
 
     Args:
@@ -62,7 +64,7 @@ def make_ant(name: Any, gait: Mapping[str, float], **keywords: Any) -> AntView:
         gait: keywords of :class:`AntView`.
         **keywords: of ``gymnasium.make``.
     """
-    return AntView(make_gym(name, **keywords), **gait)  # type: ignore[arg-type]
+    return AntView(make_gym(name, **keywords), **gait)
 
 
 def open_arena(name: Any, **keywords: Any) -> gymnasium.Env:
@@ -220,6 +222,7 @@ class AntKit(GymKit):
     def __init__(self, config: AntConfig, env: Any = None) -> None:
         self._name = config.id if env is None else env
         super().__init__(config, env)
+        self.look = replace(self.look, features=goal_rings)
 
     def maker(self, name: Any) -> Any:
         config = self.config
@@ -228,7 +231,32 @@ class AntKit(GymKit):
             "repeat": config.repeat or (2 if slow else 1),
             "strength": config.strength or (0.3 if slow else 1.0),
         }
-        return partial(make_ant, name, self._gait)
+        return self._made(np.zeros((2 * config.num_skills, 2)))
+
+    def _made(self, directions: np.ndarray) -> Any:
+        mask = {"directions": directions} if self.config.options == "learned" else {}
+        return partial(make_ant, self._name, {**self._gait, **mask})
+
+    def prepare(self, worker: Any) -> None:
+        """Try each option where no wall is, and take note of its direction for the mask."""
+        arena = partial(make_ant, partial(open_arena, self._name), self._gait)
+        pool = OptionPool(
+            partial(arena, **self.config.make),
+            self.pool_worker(worker),
+            max_steps=self.config.option_steps,
+            num_processes=0,
+            seed=self.config.seed,
+        )
+        start = pool.reset()
+        after = pool.step(
+            start.expand(pool.num_options).clone().set("option", torch.arange(pool.num_options))
+        )["next"]
+        x, y = (after["achieved_goal"] - start["achieved_goal"]).numpy().T
+        _, frame = body_of(start["physics"].numpy())
+        moved = np.stack(seen_from(frame, x, y), -1)
+        pool.close()
+        length = np.linalg.norm(moved, axis=-1, keepdims=True)
+        self._env = self._made(moved / np.maximum(length, 1.0))
 
     def _arena(self, shape: list[int], *more: Transform) -> EnvBase:
         config = self.config
@@ -281,6 +309,10 @@ class AntKit(GymKit):
 
     def pool_worker(self, worker: SkillPolicy) -> OptionWorker:
         return AntWorker(worker.actor)
+
+    @property
+    def manager_keys(self) -> Sequence[Any]:
+        return [key for key in self.state_entries if key != "action_mask"]
 
     def planner_part(self) -> dict[str, Any]:
         part = super().planner_part()
