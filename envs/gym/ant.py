@@ -26,7 +26,7 @@ from torchrl_hmcts.modules import SkillActor
 POSITIONS, VELOCITIES, BODY, ACTIONS = 15, 14, 32, 8
 _LEGS = [2, 3, 4, 5, 6, 7, 0, 1]  # leg i of a body turned by a quarter is leg i + 1
 _BENDS = [1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0, 1.0]  # ankles of every other leg bend the other way
-_BACK = -0.3  # cosine between walk and option: what is less is to turn back
+_BACK = -0.7  # cosine between walk and option: what is less is to turn back
 _WALKS = 0.7  # metres a second
 _NEAR, _ZOOM = 4.0, 4.0  # metres from the goal within which a metre counts as 4
 _ACTUATORS = [6, 7, 0, 1, 2, 3, 4, 5]  # are those of legs 4, 1, 2 and 3
