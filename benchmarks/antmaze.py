@@ -213,23 +213,19 @@ def main() -> None:
             write_results(args.out, **{f"{name} seed {seed}": learn(name, seed)})
             continue
         agent = make_agent(name, kind_of(name), seed, untrained=args.untrained)
-        told = {"env": name + " untrained" * args.untrained, "seed": seed}
-        done = {
-            row["start"]
-            for row in read_rows(args.out)
-            if told.items() <= {**row, "seed": int(row["seed"])}.items()
-        }
+        told = {"env": name + " untrained" * args.untrained, "seed": str(seed)}
+        done = [row["start"] for row in read_rows(args.out) if told.items() <= row.items()]
         for start in range(args.starts):
             if str(start) not in done:
-                add_row(row := {**told, "start": start, **solve(agent, name, start)}, args.out)
+                row = {**told, "start": start, **solve(agent, name, start)}
+                add_row(row, args.out)
                 print(row, flush=True)
     if args.part == "table":
         write_results(args.out)
     if args.part == "draw":
         draw_skills(args.seeds[0], args.out / "skills.png")
-        draw_plan(
-            make_agent(n := "antmaze-giant-v0", kind_of(n), args.seeds[0]), 0, args.out / "plan.png"
-        )
+        agent = make_agent("antmaze-giant-v0", "ogbench", args.seeds[0])
+        draw_plan(agent, 0, args.out / "plan.png")
 
 
 if __name__ == "__main__":

@@ -179,7 +179,7 @@ class AntView(gymnasium.Wrapper):
                 f"{env} has no ant: its model has {model.nq} positions, {model.nv} velocities and "
                 f"{model.nu} motors, an ant {POSITIONS}, {VELOCITIES} and {ACTIONS}."
             )
-        self._task, self.repeat, self.strength = task_of(env), repeat, np.float32(strength)
+        self.task, self.repeat, self.strength = task_of(env), repeat, np.float32(strength)
         sizes = {"physics": POSITIONS + VELOCITIES, "achieved_goal": 2, "desired_goal": 2}
         self.observation_space = spaces.Dict(
             {key: spaces.Box(-np.inf, np.inf, (n,), np.float64) for key, n in sizes.items()}
@@ -193,7 +193,7 @@ class AntView(gymnasium.Wrapper):
         seen = {
             "physics": physics,
             "achieved_goal": physics[:2].copy(),
-            "desired_goal": self._task.goal().astype(np.float64),
+            "desired_goal": self.task.goal().astype(np.float64),
         }
         if self._directions is not None:
             x, y = physics[POSITIONS : POSITIONS + 2].tolist()
