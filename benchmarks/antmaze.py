@@ -39,7 +39,7 @@ from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.trainers.saving.worker_file import save_worker
 
 OUT, RUNS = Path("docs/results/antmaze"), Path("runs/antmaze")
-SMALL: dict[str, Any] = {"loss": {"hidden": [128, 128]}}
+SMALL: dict[str, Any] = {"hidden": 128}
 LONG: dict[str, Any] = {"train_base_steps": 75_008, "trainer": {"buffer_size": 75_000}}
 ANTS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {  # shape, and training
     "ogbench": ("antmaze-large-v0", {}, {}),

@@ -173,8 +173,8 @@ def test_an_option_keeps_the_heading_it_began_with_and_half_turns_are_exact() ->
 
 
 def test_an_agent_learns_plans_and_lends_its_skills(tmp_path: Path) -> None:
-    small = {"loss": {"hidden": [8, 8]}, "expansions": 6}
-    words = ["loss.hidden=[8,8]", "expansions=6", f"out={tmp_path}"]
+    small: dict[str, Any] = {"hidden": 8, "expansions": 6}
+    words = ["hidden=8", "expansions=6", f"out={tmp_path}"]
     assert main(["train", "kit=ant", "env.id=antmaze-medium-v0", "toy=true", *words]) == 0
     assert (tmp_path / "index.html").is_file()
     agent = HMCTS.load(tmp_path)

@@ -121,6 +121,8 @@ class AntConfig(GymConfig):
     imagined: float = 0.5
     """Share of replayed transitions that are turned by quarters, with legs renamed, and given to
     another skill."""
+    hidden: int = 256
+    """Units of each of the two hidden layers of actor and critics."""
     train_base_steps: int = 51_200
     """Actions of worker training."""
     updates_per_step: float = 0.25
@@ -132,7 +134,7 @@ class AntConfig(GymConfig):
 
     EXPERIMENT, KIT = "ant", "ant"
     TOY = {"train_base_steps": 256, "mazes": 2, "expansions": 20, "search_steps": 200}
-    KEPT = (*GymConfig.KEPT, "repeat", "strength", "imagined")
+    KEPT = (*GymConfig.KEPT, "repeat", "strength", "imagined", "hidden")
     LEAST = {**GymConfig.LEAST, "repeat": 0, "strength": 0, "imagined": 0}
 
     def check_inputs(self) -> None:

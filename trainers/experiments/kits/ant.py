@@ -282,8 +282,7 @@ class AntKit(GymKit):
 
     def make_loss(self) -> LossModule:
         config = self.config
-        keywords = {**_LOSS, **config.loss}
-        sizes: dict[str, Any] = {"hidden": keywords.pop("hidden", (256, 256)), "in_keys": ["body"]}
+        sizes: dict[str, Any] = {"hidden": (config.hidden, config.hidden), "in_keys": ["body"]}
         spec = self.make_training_env(1).action_spec_unbatched
         count = config.num_skills
         with torch.random.fork_rng(devices=[]):
@@ -293,7 +292,7 @@ class AntKit(GymKit):
             )
             actor = SkillActor(BODY, spec, count, **sizes)
             critic = SkillActionCritic(BODY, ACTIONS, count, activation=NormalizedReLU, **sizes)
-            return SkillSACLoss(actor, critic, LSDEncoderLoss(encoder), **keywords)
+            return SkillSACLoss(actor, critic, LSDEncoderLoss(encoder), **{**_LOSS, **config.loss})
 
     def trainer_part(self, loss: Any) -> dict[str, Any]:
         config = self.config
