@@ -44,6 +44,7 @@ test: $(DEV_STAMP) ## Set up, then check the style and run the tests
 # Warnings are errors. The tutorials are run while the pages are built: a few minutes.
 docs: $(DOCS_STAMP) ## Set up, then build the documentation site in docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/python docs/_extensions/check_site.py docs/_build/html
 	@echo "The site: docs/_build/html/index.html"
 
 # Compiled kernels are invisible to coverage. tests/test_kernels_in_python.py runs each of them as

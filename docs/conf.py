@@ -25,6 +25,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
     "myst_parser",
     "sphinx_copybutton",
     "sphinx_design",
@@ -117,7 +118,7 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 # ------------------------------------------------------------------------- look
 html_theme = "pydata_sphinx_theme"
-html_title = "torchrl_hmcts"
+html_title = f"torchrl_hmcts {version}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from torchrl_hmcts.envs.atari.goals import (
-    ByteGoal,
-    FollowGoals,
-    JoinedWorkers,
-    OccasionalAction,
-)
+from torchrl_hmcts.envs.atari.goals import ByteGoal
 from torchrl_hmcts.envs.atari.pool import AtariOptionPool
 from torchrl_hmcts.envs.atari.ram import AtariRAMEnv
-from torchrl_hmcts.envs.atari.workers import RepeatActions, SharedMLP
+from torchrl_hmcts.envs.atari.workers import SharedMLP
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.grid_features import GridFeatures
 from torchrl_hmcts.envs.gym.grid_moves import GridMoves, GridView
@@ -21,6 +16,13 @@ from torchrl_hmcts.envs.gym.option_run import OptionWorker
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv
 from torchrl_hmcts.envs.gym.skill_worker import SkillWorker
 from torchrl_hmcts.envs.gym.snapshots import ReplaySnapshot, Snapshot, SnapshotError
+from torchrl_hmcts.envs.gym.workers import (
+    FeatureGoal,
+    FollowGoals,
+    JoinedWorkers,
+    OccasionalAction,
+    RepeatActions,
+)
 from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
 from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS
 from torchrl_hmcts.envs.lab.deepmind_lab import DeepMindLabEnv
@@ -48,6 +50,7 @@ __all__ = [
     "AttributeSnapshot",
     "ByteGoal",
     "DeepMindLabEnv",
+    "FeatureGoal",
     "FollowGoals",
     "GridFeatures",
     "GridMoves",

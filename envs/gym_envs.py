@@ -27,10 +27,12 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
     Args:
         env (EnvBase): unbatched, with a ``Categorical`` action, ``render(td)`` and an entry
             ``"observation"``.
-        render_mode (str, optional): ``"rgb_array"``, or None for no pictures. Default None.
+        render_mode (str, optional): ``"rgb_array"``, ``"human"`` for a window that shows every step
+            (needs pygame, which the extra ``gym`` brings), or None for no pictures. Default None.
 
     Raises:
         ValueError: if the render mode is another, or the env's action is not one categorical.
+        ImportError: if a window is asked for and pygame is missing.
 
     Example:
         >>> from torchrl_hmcts.envs import GridworldMazeEnv, TorchRLGymnasiumEnv
@@ -43,11 +45,13 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
         (304, 304, 3)
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
 
     def __init__(self, env: EnvBase, render_mode: str | None = None) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f'render_mode must be None or "rgb_array", got {render_mode!r}.')
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(
+                f'render_mode must be None, "rgb_array" or "human", got {render_mode!r}.'
+            )
         action_spec = env.action_spec
         if not isinstance(action_spec, Categorical) or action_spec.shape or env.batch_size:
             raise ValueError(
@@ -56,7 +60,8 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
             )
         self.env = env
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, **getattr(env, "metadata", {})}
+        self.metadata = {**getattr(env, "metadata", self.metadata), **_MODES}
+        self._window = _Window(self.metadata["render_fps"]) if render_mode == "human" else None
         self._num_actions = int(action_spec.space.n)
         self.action_space = gymnasium.spaces.Discrete(self._num_actions)
         self.observation_space = _box(env.observation_spec["observation"])
@@ -74,7 +79,7 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
             self._tensordict = self.env.reset()
         else:
             self._tensordict = self.env.reset(state.copy(), set_state=True)
-        return self._read(self._tensordict)
+        return self._shown(self._tensordict)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Take one step; see ``gymnasium.Env.step``."""
@@ -85,7 +90,7 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
             )
         root = root.copy().set("action", torch.tensor(int(action), device=self.env.device))
         self._tensordict = td = self.env.step(root)["next"]
-        observation, info = self._read(td)
+        observation, info = self._shown(td)
         return (
             observation,
             td["reward"].item(),
@@ -95,12 +100,14 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
         )
 
     def render(self) -> np.ndarray | None:
-        """Draw the current state, uint8 ``[h, w, 3]``; None without a render mode."""
+        """Draw the current state, uint8 ``[h, w, 3]``; None in a window or without a mode."""
         td = self._current("render")
         return self.env.render(td) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Close the TorchRL env."""
+        """Close the TorchRL env, and the window."""
+        if self._window is not None:
+            self._window.close()
         if not self.env.is_closed:
             self.env.close()
 
@@ -111,10 +118,46 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
             )
         return self._tensordict
 
-    def _read(self, td: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
+    def _shown(self, td: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
+        if self._window is not None:
+            self._window.show(self.env.render(td))
         # Copies: the env may hand on the same tensor step after step.
         entries = {key: td[key].cpu().numpy().copy() for key in self.env.observation_spec.keys()}
         return entries.pop("observation"), entries
+
+
+_MODES = {"render_modes": TorchRLGymnasiumEnv.metadata["render_modes"]}
+
+
+class _Window:
+    """A window of pygame, opened by the first picture."""
+
+    def __init__(self, fps: int) -> None:
+        try:
+            import pygame
+        except ImportError as error:
+            raise ImportError(
+                'render_mode="human" opens a window of pygame, which is not installed; it comes '
+                "with pip install 'torchrl_hmcts[gym]'. \"rgb_array\" needs no window."
+            ) from error
+        self._pygame, self._fps, self._clock = pygame, fps, pygame.time.Clock()
+        self._screen: Any = None
+
+    def show(self, picture: np.ndarray) -> None:
+        """Show a picture, uint8 ``[h, w, 3]``, for as long as a step takes."""
+        display = self._pygame.display
+        if self._screen is None:
+            display.init()
+            self._screen = display.set_mode(picture.shape[1::-1])
+        self._pygame.event.pump()
+        self._pygame.surfarray.blit_array(self._screen, picture.swapaxes(0, 1))
+        display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        if self._screen is not None:
+            self._pygame.display.quit()
+            self._screen = None
 
 
 def _box(spec: Any) -> gymnasium.spaces.Box:

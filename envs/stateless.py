@@ -80,7 +80,7 @@ class StatelessSimulator(EnvBase):
 
     @property
     def batch_locked(self) -> bool:
-        """Whether the env steps only as many states as it holds."""
+        """True if the env steps only as many states as it holds."""
         return bool(self.env.batch_locked)
 
     def _reset(

@@ -13,7 +13,13 @@ pytest.importorskip("ale_py")
 
 from torchrl.checkpoint import CheckpointError  # noqa: E402
 
-from torchrl_hmcts.envs import AtariOptionPool, ByteGoal, FollowGoals, RepeatActions  # noqa: E402
+from torchrl_hmcts.envs import (
+    AtariOptionPool,
+    ByteGoal,
+    FollowGoals,
+    OccasionalAction,
+    RepeatActions,
+)  # noqa: E402
 from torchrl_hmcts.trainers import AtariAgent, AtariKit, AtariSearch  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari import run as experiment  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig  # noqa: E402
@@ -23,7 +29,8 @@ from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif  # noqa
 from torchrl_hmcts.trainers.figures.pictures import Pictures  # noqa: E402
 from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint  # noqa: E402
 
-TRACKERS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)], fire=1)
+GOALS = FollowGoals([ByteGoal(72, 99, offset, 2, 3) for offset in (-12, 0, 12)])
+TRACKERS = OccasionalAction(GOALS, 1)
 SHORT = {
     "frames": 9_000, "source": "repeat", "option_steps": 10, "num_processes": 0,
     "replant_every": 5, "seed": 4,

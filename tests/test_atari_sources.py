@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,7 +90,7 @@ def test_a_goal_brings_its_byte_to_the_target_plus_the_offset(controlled, action
 @pytest.mark.parametrize(
     ("worker", "others"),
     [
-        (FollowGoals([ByteGoal(72, 99, 0, 2, 3)], fire=1, fire_probability=0.25), 0),
+        (OccasionalAction(FollowGoals([ByteGoal(72, 99, 0, 2, 3)]), 1, 0.25), 0),
         (OccasionalAction(RepeatActions([3]), action=1, probability=0.25), 3),
     ],
 )
@@ -134,6 +135,13 @@ def test_options_are_built_again_from_what_was_saved() -> None:
                     for w, d in zip((again.worker, before), draws, strict=True)
                 ]
                 assert acts[0] == acts[1]
+
+
+def test_goals_of_an_older_folder_still_fire() -> None:
+    part = plain_worker(TRACKERS) | {"fire": 1, "fire_probability": 0.5}
+    older = {"names": ["a"], "num_frames": 7, "report": {}, "saved": {"parts": [part]}}
+    worker: Any = Options.from_plain(older).worker
+    assert (worker.action, worker.probability, worker.worker.goals) == (1, 0.5, TRACKERS.goals)
 
 
 def test_weights_are_written_back_into_the_network_they_came_from() -> None:
@@ -191,7 +199,7 @@ def test_the_goals_of_breakout_are_found_without_being_told() -> None:
     assert report["controllable"] == [72]  # the paddle
     assert 99 in report["moving"]  # the ball
     ranked = search.screen(candidates, states[:1], report)
-    best = ranked[0].worker.goals[0]
+    best = ranked[0].worker.worker.goals[0]
     assert (best.controlled, best.target) == (72, 99)
     # An action alone scores nothing in these steps, and is still a candidate.
     assert report["screened"][ranked[0].name] > 0.0
@@ -385,7 +393,6 @@ def test_while_the_critics_warm_up_the_actor_stays_and_then_it_learns() -> None:
     [
         (lambda: FollowGoals([]), ValueError, "a goal for each option; got none"),
         (lambda: FollowGoals([ByteGoal(128, 0, 0, 1, 2)]), ValueError, "0 to 127; got .*=128"),
-        (lambda: FollowGoals(TRACKERS.goals, fire=1, fire_probability=2.0), ValueError, "got 2.0"),
         (lambda: JoinedWorkers([]), ValueError, "at least one worker; got none"),
         (lambda: OccasionalAction(RepeatActions(2), 1, 1.5), ValueError, "from 0 to 1; got 1.5"),
         (lambda: load_worker({"kind": "magic"}), ValueError, "kind 'magic' are not known"),

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import time
+
 import pytest
 
+import torchrl_hmcts
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.config import config_keys
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
@@ -60,6 +66,80 @@ def test_an_unknown_key_of_an_experiment_is_refused_with_the_nearest(capsys) -> 
     error = capsys.readouterr().err
     assert "hmcts train experiment=waterworld_goals:" in error
     assert "Did you mean: num_learners" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train", "labmaze"], "Write experiment=labmaze"),
+        (["train", "gym"], "Write kit=gym"),
+        (["train", "labmase"], "Did you mean experiment=labmaze?"),
+        (["train", "experiment=labmaze", "--seed", "1"], "without dashes: seed=1"),
+        (["demo", "--num-skills=3"], "without dashes: num_skills=3"),
+        (["sweep", "labmaze"], "Write experiment=labmaze"),
+        (["evaluate", "."], "Write run=."),
+        (["completion"], "hmcts completion bash"),
+        (
+            ["sweep", "experiment=labmaze", "seed=[0,1]", "objective=test.sloved"],
+            "no figure 'test.sloved'. Did you mean: test.solved",
+        ),
+    ],
+)
+def test_a_slip_is_answered_by_the_right_words(capsys, words: list[str], message: str) -> None:
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_version_is_said(capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"hmcts {torchrl_hmcts.__version__}\n"
+
+
+def test_the_first_words_come_before_torch_is_loaded(tmp_path) -> None:
+    program = (
+        "import sys\nfrom torchrl_hmcts.trainers import cli\n"
+        "from torchrl_hmcts.trainers.experiments.registry import Experiment\n"
+        "def stop(self): sys.exit('torch' in sys.modules)\n"
+        "Experiment.function = property(stop)\n"
+        f"cli.main(['train', 'experiment=labmaze', 'out={tmp_path}', 'logger=tensorboard'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stdout.splitlines() == [
+        "hmcts train experiment=labmaze starts, seed 0",
+        f"  output  {tmp_path}",
+        f"  watch   tensorboard --logdir {tmp_path}",
+    ]
+
+
+def test_tab_offers_verbs_experiments_and_keys(capsys) -> None:
+    assert main(["completion", "words", "train", "experiment=lab"]) == 0
+    assert "experiment=labmaze" in capsys.readouterr().out.split()
+    assert main(["completion", "words", "demo", "s"]) == 0
+    assert "seed=" in capsys.readouterr().out.split()
+    assert main(["completion", "words", ""]) == 0
+    assert {"train", "evaluate", "completion"} <= set(capsys.readouterr().out.split())
+
+
+def test_bars_are_lines_without_a_terminal_and_never_show_nan(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(console, "INTERVAL", 0.0)
+    with console.Bar(4, desc="learn", unit="frames", scale=4) as bar:
+        bar.set_postfix(loss=float("nan"), accuracy="0.5", actor="nan")
+        bar.update(2)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith("learn: 50 % (8 of 16 frames)")
+    assert lines[-1].endswith("accuracy=0.5")
+    assert max(map(len, lines)) < 80
+
+
+def test_what_takes_long_gives_signs_of_life(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(console, "INTERVAL", 0.0)
+    with console.alive():
+        console.say("Compiling the search ...")
+        time.sleep(1.3)
+    assert "Compiling the search: 1 s so far" in capsys.readouterr().err
 
 
 def test_ctrl_c_ends_with_the_command_that_continues(tmp_path, capsys, monkeypatch) -> None:

@@ -10,8 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from torchrl.record.loggers import Logger
 
 from torchrl_hmcts.trainers.cli import main
+from torchrl_hmcts.trainers.runs.loggers import ScalarLoggers
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 TRAIN = ["train", "experiment=waterworld_a3c", "toy=true", "seed=3"]
@@ -48,7 +51,10 @@ def test_a_run_is_tested_again_with_other_starts(run: Path, capsys) -> None:
     assert main(["evaluate", f"run={run}"]) == 0
     assert main(["evaluate", f"run={run}", "seed=4"]) == 0
     assert main(["evaluate", f"run={run}", "seed=4"]) == 0  # the same once more: in its place
-    assert "evaluation.json" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "evaluation.json" in said
+    assert "  test: mazes  " in said  # a table, not JSON
+    assert "{" not in said
     same, other = json.loads((run / "evaluation.json").read_text())["evaluations"]
     assert same["changes"] == {}
     assert same["results"]["test"].items() <= metrics["test"].items()  # the very same episodes
@@ -92,7 +98,7 @@ def test_on_a_full_disk_an_evaluation_is_printed(run: Path, tmp_path, monkeypatc
     monkeypatch.setattr("torchrl_hmcts.trainers.saving.files.os.replace", full)
     assert main(["evaluate", f"run={copy}"]) == 0
     said = capsys.readouterr()
-    assert json.loads(said.out)["test"]
+    assert json.loads(said.out[said.out.index("{") :])["test"]
     assert [line.partition(":")[0] for line in said.err.splitlines()] == [
         "Left out evaluation.json",
         "Left out index.html",
@@ -146,11 +152,41 @@ def test_values_go_to_other_loggers_as_well(tmp_path, logger) -> None:
     made = make_logger(DemoConfig(out=str(tmp_path), logger=logger))
     made.log_scalar("entropy", 1.25, step=64)
     made.log_scalar("entropy", float("nan"), step=128)
+    Figure().savefig(tmp_path / "search.png")
+    made.log_pictures(tmp_path, {"search.png": "The search."})
     made.close()
     assert (tmp_path / "log" / "scalars" / "entropy.csv").read_text() == "64,1.25\n"
     files = [p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file()]
     written = [p for p in files if p.parts[0] == logger]
-    assert any(p.name.startswith("events.out") or p.suffix == ".wandb" for p in written)
+    events = [p for p in written if p.name.startswith("events.out") or p.suffix == ".wandb"]
+    content = b"".join((tmp_path / p).read_bytes() for p in events)
+    assert b"train/entropy" in content
+    assert b"pictures/search" in content
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("loss_actor", "loss/loss_actor"),
+        ("critic_1_loss", "loss/critic_1_loss"),
+        ("eval_solved_share", "eval/solved_share"),
+        ("test_frames", "eval/frames"),
+        ("entropy", "train/entropy"),
+    ],
+)
+def test_names_are_in_groups_where_a_page_shows_groups(name: str, shown: str) -> None:
+    class Board(Logger):
+        def __init__(self) -> None:
+            self.names: list[str] = []
+
+        def log_scalar(self, name, value, step=None) -> None:
+            self.names.append(name)
+
+        _create_experiment = log_video = log_hparams = log_histogram = __repr__ = None
+
+    board = Board()
+    ScalarLoggers([board]).log_scalar(name, 1.0, step=0)
+    assert board.names == [shown]
 
 
 def test_an_unknown_logger_is_refused(capsys) -> None:

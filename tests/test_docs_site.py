@@ -89,6 +89,25 @@ def test_short_names_in_docstrings_are_looked_up_in_every_package_of_the_referen
     assert sorted(looked_up) == sorted(PACKAGES)
 
 
+def test_every_public_name_is_named_by_a_guide() -> None:
+    guides = "\n".join(text for page, text in PAGES.items() if not page.startswith("reference"))
+    named = set(re.findall(r"[A-Za-z_]\w+", " ".join(re.findall(r"`([^`\n]+)`", guides))))
+    for package in PACKAGES:
+        public = set(importlib.import_module(f"torchrl_hmcts.{package}").__all__)
+        assert public <= named, f"no guide names {sorted(public - named)}: add docs/guides.md a row"
+
+
+def test_pages_import_public_names_only() -> None:
+    texts = {**PAGES, "README.md": (DOCS.parent / "README.md").read_text()}
+    texts |= {path.stem: path.read_text() for path in TUTORIALS}
+    line = re.compile(r"^\s*from (torchrl_hmcts[\w.]*) import (?:\(([^)]*)\)|(.*))$", re.MULTILINE)
+    for page, text in texts.items():
+        for module, several, one in line.findall(text):
+            names = {name.split()[0] for name in (several or one).split(",") if name.strip()}
+            public = set(importlib.import_module(module).__all__)
+            assert names <= public, f"{page} imports {names - public} of {module}: not public"
+
+
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_a_tutorial_has_a_title_and_a_picture_and_names_only_what_is_public(path: Path) -> None:
     source = path.read_text()

@@ -299,6 +299,7 @@ EXCLUDED = {  # why public names are not fuzzed here
     "DurableRotation AnyTermination",
     "hands its arguments to SkillReward": "SkillRewardHook",
     "searches from any object": "ReferenceSearch",
+    "is built by the kit gym": "FeatureGoal",
     "belongs to an Atari game": "ByteGoal FollowGoals JoinedWorkers OccasionalAction AtariAgent "
     "AtariKit TrainedSource",
     "the arguments of TorchRL's ValueEstimatorBase": "NStepReturn",

@@ -161,8 +161,8 @@ class TestBadInput:
             env.step(action)
 
     def test_an_unknown_render_mode_is_refused(self):
-        with pytest.raises(ValueError, match="got 'human'"):
-            TorchRLGymnasiumEnv(GridworldMazeEnv(), "human")
+        with pytest.raises(ValueError, match="got 'ansi'"):
+            TorchRLGymnasiumEnv(GridworldMazeEnv(), "ansi")
 
     def test_an_env_with_continuous_actions_is_refused(self):
         with pytest.raises(ValueError, match="one Categorical action"):
@@ -172,3 +172,24 @@ class TestBadInput:
         env = TorchRLGymnasiumEnv(GridworldMazeEnv())
         env.reset(seed=0)
         assert env.render() is None
+
+
+def test_a_window_shows_every_step(env_id, monkeypatch):
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gymnasium.make(env_id, render_mode="human").unwrapped
+    plain = gymnasium.make(env_id, render_mode="rgb_array")
+    for each in (env, plain):
+        each.reset(seed=0)
+        each.step(1)
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    assert np.array_equal(shown, plain.render())
+    assert env.render() is None
+    env.close()
+    assert pygame.display.get_surface() is None
+
+
+def test_a_window_without_pygame_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ImportError, match=r"torchrl_hmcts\[gym\]"):
+        TorchRLGymnasiumEnv(GridworldMazeEnv(), "human")

@@ -137,7 +137,9 @@ def test_a_search_before_every_option_takes_the_final_choice() -> None:
     assert policy(ChainEnv(length=4).reset())["action"].item() == 0  # the plan says 1
 
 
-def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
+def test_an_agent_solves_saves_and_is_loaded(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     agent = HMCTS("MountainCar-v0", option_steps=14, novelty_radius=0.06, expansions=300)
     solution = agent.solve(seed=3)
     assert solution.solved
@@ -146,7 +148,9 @@ def test_an_agent_solves_saves_and_is_loaded(tmp_path: Path) -> None:
     again = HMCTS.load(agent.save(tmp_path / "given"))
     assert repr(again) == repr(agent) == "HMCTS(MountainCar-v0, 3 actions, each for 14 base steps)"
     assert again.solve(seed=3) == solution
+    capfd.readouterr()
     agent.learn(640, progress=False)
+    assert capfd.readouterr() == ("", "")
     assert agent.config.num_skills == 8
     assert agent.loss is not None
     again = HMCTS.load(agent.save(tmp_path / "learned"))
@@ -285,6 +289,19 @@ def test_wrong_words_say_what_to_write(
     assert main(["train", "kit=gym", *words, f"out={tmp_path / 'run'}"]) in (1, 2)
     assert message in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_goals_are_found_on_features_that_actions_control() -> None:
+    agent = HMCTS(lambda: Line(), options="goals")
+    goals = agent.kit._fixed.goals  # type: ignore[attr-defined]
+    assert {(g.controlled, g.raising, g.lowering) for g in goals} == {(0, 1, 0)}
+    scale = float(goals[0].features(None, np.array([1.0])).item())  # of one place
+    assert [g.value / scale for g in goals] == pytest.approx([-0.8, 1.6, 4.0, 6.4, 8.8])  # of 0..8
+    solution = agent.solve(seed=0)
+    assert solution.solved
+    assert solution.base_steps == 9
+    with pytest.raises(ValueError, match="are kinds without an order. Use options=actions"):
+        HMCTS("FrozenLake-v1", options="goals")
 
 
 def test_no_skills_no_worker() -> None:

@@ -38,11 +38,15 @@ ROOMS: dict[str, tuple[str, list[str]]] = {
     "modules": (r"modules", ["env parts"]),
     "planners": (r"planners", ["env parts"]),
     "env parts": (r"nesting|carried_state|direct_calls", ["base"]),
-    "base": (r"checks|compiling|processes|", []),
+    "base": (r"checks|compiling|notebook|processes|", []),
 }
 DEPENDENCIES = {"torch", "tensordict", "torchrl", "numpy", "numba"}  # of components
 # What a component may import inside a function, for those who have it.
-OPTIONAL = {"planners.drawing": "matplotlib", "planners.export": "networkx"}
+OPTIONAL = {
+    "notebook": "matplotlib",
+    "planners.drawing": "matplotlib",
+    "planners.export": "networkx",
+}
 # What is still wrong today: lines go, and none comes.
 KNOWN = {
     "envs.gym_envs": "lab mazes",

@@ -176,6 +176,13 @@ def test_a_comparison_shows_means_intervals_and_every_run(tmp_path) -> None:
         assert f'<td class="text">{name}</td>' in page
 
 
+def test_a_folder_of_runs_stands_for_all_of_them(tmp_path, capsys) -> None:
+    for seed in (0, 1):
+        write_run(tmp_path / "runs" / f"a{seed}", seed)
+    assert main(["report", f"{tmp_path}/runs", f"out={tmp_path}/cmp"]) == 0
+    assert "2 runs compared" in (tmp_path / "cmp" / "index.html").read_text()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import numbers
 import operator
@@ -67,8 +68,20 @@ def real_number(
     return number
 
 
+def no_class(owner: str, name: str, value: Any) -> None:
+    """Raise a TypeError if a value is a class, where an object of it is due."""
+    if isinstance(value, type):
+        given = inspect.signature(value.__init__).parameters.values()
+        needed = [p.name for p in [*given][1:] if p.default is p.empty and p.kind == 1]
+        raise TypeError(
+            f"{owner} needs an object for {name}; got the class {value.__name__}. Write "
+            f"{name}={value.__name__}({', '.join(needed)})."
+        )
+
+
 def instance(owner: str, name: str, value: Any, *kinds: Any) -> None:
     """Raise a TypeError if a value is of none of the classes."""
+    no_class(owner, name, value)
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise TypeError(

@@ -24,7 +24,15 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.atari.options import Options
     from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
     from torchrl_hmcts.trainers.experiments.atari.sources import TrainedSource
-    from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+    from torchrl_hmcts.trainers.experiments.goals import make_maze_networks
+    from torchrl_hmcts.trainers.experiments.kits import Kit, make_kit
+    from torchrl_hmcts.trainers.experiments.kits.waterworld import (
+        make_option_env,
+        make_starts,
+        make_training_env,
+    )
+    from torchrl_hmcts.trainers.experiments.settings import DemoConfig, SkillsConfig
+    from torchrl_hmcts.trainers.experiments.skills import learn, solve
     from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
         GoalEpisodes,
         GoalTrack,
@@ -40,6 +48,7 @@ if TYPE_CHECKING:
         ExpertIterationTrainer,
         make_guided_planner,
     )
+    from torchrl_hmcts.trainers.figures.goals import draw_goals
     from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
@@ -75,3 +84,7 @@ def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from tqdm import tqdm
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import MCTSPlanner, Plan
@@ -38,7 +41,7 @@ _OTHER_DRAWS = 1_000_003  # added to the seed of the env to act in, whose draws 
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """One episode: what was planned, and what came of it in an env of its own.
+    """One episode: its plan, and its result in another instance of the env.
 
     Attributes:
         solved (bool, optional): whether the goal was reached; where rewards are collected, whether
@@ -179,7 +182,7 @@ class HMCTS:
 
         Args:
             base_steps: of training. Default: 50,000, or what the kit names.
-            progress: show a bar.
+            progress: show a bar; False prints nothing.
             save_dir: folder of checkpoints. Default: none.
 
         Raises:
@@ -194,7 +197,8 @@ class HMCTS:
         if base_steps is not None:
             changes["train_base_steps"] = base_steps
         self.kit = self._make_kit(dataclasses.replace(self._asked, **changes))
-        self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
+        with _torchrl_quiet():
+            self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
         return self
 
     def _take(self, learned: LearnedSkills) -> None:
@@ -217,7 +221,7 @@ class HMCTS:
             searches: of each iteration.
             iterations: Default 2.
             updates: of the network, in each iteration.
-            progress: show a bar.
+            progress: show a bar; False prints nothing.
 
         Returns:
             The agent.
@@ -242,19 +246,20 @@ class HMCTS:
         scale_by(network, self.planner, self.kit.starts("train", 4))
         guided = self.kit.guide(self.kit.make_planner(self.env), network)
         loss = ExpertIterationLoss(network, value_loss="log" if goal else "smooth_l1")
-        ExpertIterationTrainer(
-            self.env,
-            network,
-            self.planner,
-            planner=guided,
-            loss_module=loss,
-            iterations=iterations,
-            searches_per_iteration=searches,
-            updates_per_iteration=updates,
-            example_kwargs={"roots": not goal},
-            progress=_bar("distil", progress),
-            seed=self.config.seed,
-        ).train()
+        with _torchrl_quiet():
+            ExpertIterationTrainer(
+                self.env,
+                network,
+                self.planner,
+                planner=guided,
+                loss_module=loss,
+                iterations=iterations,
+                searches_per_iteration=searches,
+                updates_per_iteration=updates,
+                example_kwargs={"roots": not goal},
+                progress=_bar("distil", progress),
+                seed=self.config.seed,
+            ).train()
         self._guide(network)
         return self
 
@@ -377,17 +382,34 @@ class HMCTS:
             agent._guide(network)
         return agent
 
+    def _repr_html_(self) -> str:
+        planner = self.__dict__.get("planner")
+        searched = planner is not None and planner.has_searched
+        return notebook.shown(repr(self)) + (planner.last_search._repr_html_() if searched else "")
+
     def __repr__(self) -> str:
         config = self.config
-        name = getattr(config, "id", "") or config.EXPERIMENT
+        name = getattr(config, "id", "") or getattr(self._env, "__name__", config.EXPERIMENT)
         what = "skills" if config.options == "learned" else "actions"
         return (
             f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
         )
 
 
-def _bar(name: str, shown: bool) -> Callable[..., Any]:
-    return partial(tqdm, desc=name, disable=not shown)
+def _bar(name: str, shown: bool) -> Callable[..., Any] | None:
+    return partial(tqdm, desc=name) if shown else None
+
+
+@contextlib.contextmanager
+def _torchrl_quiet() -> Iterator[None]:
+    """Keeps TorchRL's messages that are no warnings to itself."""
+    logger = logging.getLogger("torchrl")
+    level = logger.level
+    logger.setLevel(max(level, logging.WARNING))
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def load_worker(folder: str | Path) -> SkillPolicy:
@@ -408,7 +430,6 @@ def load_worker(folder: str | Path) -> SkillPolicy:
         >>> from torchrl_hmcts.trainers import HMCTS, load_worker
         >>> folder = tempfile.mkdtemp()
         >>> agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
-        Learning 8 skills in 64 base steps ...
         >>> load_worker(agent.save(folder)).in_keys
         ['observation', 'skill']
     """

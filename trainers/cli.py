@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
+from torchrl_hmcts import __version__
 from torchrl_hmcts.trainers.command_line.listing import summaries
 from torchrl_hmcts.trainers.command_line.running import Failure
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVEL_HELP
@@ -78,6 +79,7 @@ Write a page: of one run, of several runs compared, or a figure of the dissertat
     hmcts report runs/one out=page.html       the same in one file that can be sent
     hmcts report runs/a_0 runs/a_1 runs/b_0   runs/report/index.html: groups by config, means over
                                               seeds with least and largest, bootstrap intervals
+    hmcts report runs                         the same of all runs in the folder
     hmcts report figure=3.6                   figures/figure_3.6.png, from measured results
     hmcts report figure=4.10 runs/labmaze_*   the same from your own runs
     hmcts report figure=all                   all whose data are there, and a page of them
@@ -114,6 +116,12 @@ writes  trial_0000/ ... (folders of runs), sweep.json, importances.png and index
 
 _LIST = "List the experiments; the keys of one with their defaults and meaning; or the figures."
 
+_COMPLETION = """\
+Print a script that makes Tab complete verbs, experiments, kits and keys.
+
+    eval "$(hmcts completion bash)"        in ~/.bashrc
+    eval "$(hmcts completion zsh)"         in ~/.zshrc"""
+
 _VERBS = {
     "demo": ("learn four skills and solve random mazes (about a minute)", _DEMO, "train:demo"),
     "train": ("run an experiment, or continue one", _TRAIN, "train:train"),
@@ -122,8 +130,13 @@ _VERBS = {
     "report": ("write the page of runs, or draw a figure", _REPORT, "report:report"),
     "sweep": ("search for good values of an experiment's keys", _SWEEP, "sweep:sweep"),
     "list": ("list experiments, their keys, or figures", _LIST, "listing:show"),
+    "completion": (
+        "print what makes Tab complete in a shell",
+        _COMPLETION,
+        "completion:completion",
+    ),
 }
-_WORDS = {"list": "NAME", "report": "DIR|key=value"}
+_WORDS = {"list": "NAME", "report": "DIR|key=value", "completion": "SHELL"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -142,7 +155,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # in a locale without UTF-8
-    arguments = _parser().parse_args(argv)
+    arguments, unknown = _parser().parse_known_args(argv)
+    if unknown:
+        print(
+            f"hmcts {arguments.verb}: {_without_dashes(unknown, arguments.words)}", file=sys.stderr
+        )
+        return 2
     module, _, name = _VERBS[arguments.verb][2].partition(":")
     run: Callable[[Sequence[str]], int] = getattr(
         importlib.import_module(f"torchrl_hmcts.trainers.command_line.{module}"), name
@@ -162,12 +180,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
+def _without_dashes(unknown: Sequence[str], words: Sequence[str]) -> str:
+    """Say how keys are written that came as options, e.g. ``--seed 1``."""
+    key, equals, value = unknown[0].lstrip("-").partition("=")
+    loose = [word for word in (*unknown[1:], *words) if "=" not in word and word[:1] != "-"]
+    value = value if equals else next(iter(loose), "VALUE")
+    return f"keys are written without dashes: {key.replace('-', '_')}={value}"
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="hmcts",
         description="Hierarchical Monte Carlo tree search over learned skills. Each verb has a "
         "--help of its own.",
     )
+    parser.add_argument("--version", action="version", version=f"hmcts {__version__}")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     for verb, (summary, description, _) in _VERBS.items():
         filled = description.replace("{keys}", DEMO.describe() if "{keys}" in description else "")

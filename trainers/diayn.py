@@ -232,8 +232,9 @@ class DIAYNTrainer(OffPolicyTrainer):
         return self._latest
 
     def progress_figures(self) -> dict[str, str]:
-        names = ("actor_loss", "critic_loss", "discriminator_loss", "discriminator_accuracy")
-        return {name: f"{self._latest[name]:.3f}" for name in names if name in self._latest}
+        names = {"accuracy": "discriminator_accuracy", "actor": "actor_loss"}
+        latest = self._latest
+        return {short: f"{latest[name]:.2f}" for short, name in names.items() if name in latest}
 
     @staticmethod
     def make_loss(

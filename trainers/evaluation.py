@@ -23,7 +23,7 @@ from torchrl_hmcts.planners.simulator import Simulator
 
 @dataclass
 class Execution:
-    """What executing plans led to, one entry per start ``[M]``."""
+    """Results of executing plans, one entry per start ``[M]``."""
 
     solved: np.ndarray
     """Bool, whether the episode met a terminal state."""
@@ -119,7 +119,7 @@ def _follow(
 
 @dataclass
 class Results:
-    """What planning and executing the plans gave, one entry per start ``[M]``.
+    """Results of planning and executing the plans, one entry per start ``[M]``.
 
     ``found`` a plan and ``solved`` by executing it (bool); ``simulated_steps`` base steps that
     the search simulated, ``expansions`` of nodes and ``simulations`` of options it took,

@@ -308,8 +308,8 @@ class ExpertIterationTrainer(OffPolicyTrainer):
         counts, searches = self.collector, self.collector.searches
         figures = {
             "solved": f"{counts.solved[-1]}/{searches}",
-            "base_steps_per_search": f"{counts.base_steps[-1] / searches:.0f}",
+            "steps": f"{counts.base_steps[-1] / searches:.0f}",
         }
         for accuracy in self.history.get("policy_accuracy", [])[-1:]:
-            figures["policy_accuracy"] = f"{accuracy:.3f}"
+            figures["accuracy"] = f"{accuracy:.3f}"
         return figures

@@ -102,8 +102,9 @@ class HMCTSTrainer(OffPolicyTrainer):
             of the last ``retrain_interval`` rounds may go beyond. Default ``None``: no limit.
         save_dir (path, optional): folder of the checkpoints, one after every training. Default
             ``None``: none.
-        progress (callable, optional): ``progress(total=rounds)`` returns a progress bar, e.g.
-            ``tqdm.tqdm``. Default ``None``: quiet.
+        progress (callable, optional): ``progress(total=...)`` returns a progress bar, e.g.
+            ``tqdm.tqdm``, over ``total_frames`` if they are given, else over rounds. Default
+            ``None``: quiet.
         seed (int): all random numbers of a round or training are a function of it and of t.
             Default ``0``.
         **trainer_kwargs: passed to :class:`ResumableTrainer` (``logger``, ``keep_last``, ...).
@@ -187,6 +188,7 @@ class HMCTSTrainer(OffPolicyTrainer):
             seed=seed,
         )
         reward = SkillReward(loss_module.objective) if reward is None else reward
+        self._by_frames = total_frames is not None
         union = {"dataset": self.dataset, "batch_size": batch_size, "fraction": dataset_fraction}
         super().__init__(
             lambda: collector,
@@ -196,7 +198,7 @@ class HMCTSTrainer(OffPolicyTrainer):
             optim_steps_per_batch=1,  # set before every training
             sample=partial(sample_union, reward=reward, **union),
             settings={name: given[name] for name in _KEPT},
-            progress_total=collector.rounds,
+            progress_total=collector.rounds if total_frames is None else total_frames,
             **{name: given[name] for name in _PASSED_ON},
             **{"log_interval": -1, "save_trainer_interval": 0, **trainer_kwargs},
         )
@@ -217,8 +219,8 @@ class HMCTSTrainer(OffPolicyTrainer):
         self.register_module("hmcts", _Progressed(self))
 
     def progress_position(self) -> int:
-        """Return the number of rounds played."""
-        return max(0, self.collector.round)
+        """Return the number of rounds played, or where ``total_frames`` are given base steps."""
+        return int(self.collected_frames) if self._by_frames else max(0, self.collector.round)
 
     def progress_figures(self) -> dict[str, str]:
         return {name: f"{value:,.2f}" for name, value in self.collector.latest.items()}

@@ -58,6 +58,35 @@ def resolve(
     return None
 
 
+_CODE = re.compile(r"(?:[a-z_]+\.)*([A-Za-z_]\w+)(?:\(.*\))?")
+_WORDS = {"learn", "solve"}  # public functions, and methods of an agent as well
+
+
+def link_code(app: Sphinx, doctree: nodes.document) -> None:
+    """Make each public name in the code of a page a link to its reference."""
+    docname = app.env.docname
+    if docname.startswith("auto_reference"):
+        return
+    for literal in list(doctree.findall(nodes.literal)):
+        match = _CODE.fullmatch(literal.astext())
+        path = app.env.public_names.get(match[1]) if match and match[1] not in _WORDS else None
+        inside = (nodes.reference, nodes.title, pending_xref)
+        if path is None or any(isinstance(node, inside) for node in _above(literal)):
+            continue
+        options = {"refdomain": "py", "reftype": "obj", "reftarget": path, "refexplicit": True}
+        link = pending_xref("", refdoc=docname, refwarn=False, **options)
+        literal.replace_self(link)
+        link += literal
+
+
+def _above(node: nodes.Node) -> list[nodes.Node]:
+    found = []
+    while node.parent is not None:
+        node = node.parent
+        found.append(node)
+    return found
+
+
 def signature(
     app: Sphinx,
     what: str,
@@ -114,6 +143,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
     app.connect("builder-inited", remember)
     app.connect("missing-reference", resolve)
+    app.connect("doctree-read", link_code)
     app.connect("autodoc-process-signature", signature)
     app.connect("autodoc-skip-member", skip_foreign)
     app.connect("autodoc-process-docstring", tensorclass_docstring, priority=400)

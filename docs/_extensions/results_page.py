@@ -167,7 +167,9 @@ def beside_the_source(results: Path = RESULTS) -> str:
             ]
         )
     if lab.exists():
-        found = {k: v for k, v in load(lab)["results"].items() if k.endswith("size 9")}
+        found = {
+            k: v for k, v in load(lab)["results"].items() if re.fullmatch(r"diayn \d+ size 9", k)
+        }
         frames = [v for k, v in load(lab)["results"].items() if k.endswith("training")]
         rows.append(
             [

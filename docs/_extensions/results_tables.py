@@ -198,6 +198,17 @@ def worker(data: dict[str, Any]) -> str:
     return of_rows(data["rows"], columns) + note
 
 
+def untrained(data: dict[str, Any]) -> str:
+    columns: Columns = {
+        "worker": "worker",
+        "seeds": "seed",
+        "solved": "solved/starts",
+        "simulated base steps, median": rounded("simulated_steps.median"),
+        "base steps of an episode, median": rounded("episode_steps.median"),
+    }
+    return of_groups(data["rows"], "worker", columns)
+
+
 def objectives(data: list[dict[str, Any]]) -> str:
     columns: Columns = {
         "objective": "objective",
@@ -268,18 +279,41 @@ def training_speed(data: dict[str, Any]) -> str:
 
 
 def peers(data: dict[str, Any]) -> str:
-    figures = data["figures"]
-    batches = sorted({row["batch"] for row in figures})
-    speed = "simulations_per_cpu_second"
-    found = {(row["library"], row["batch"]): row for row in figures if speed in row}
-    rows = []
-    for library in dict.fromkeys(row["library"] for row in figures):
-        cells = []
-        for batch in batches:
-            row = found.get((library, batch))
-            cells.append("" if row is None else f"{row[speed] / 1000:,.0f}K")
-        rows.append([library.split(" [")[0], *cells])
-    return table(["simulations per CPU second", *(f"B = {batch}" for batch in batches)], rows)
+    batches = sorted({row["batch"] for row in data["figures"]})
+    found = {(row["library"], row["batch"]): row for row in data["figures"] if "ratio" in row}
+
+    def cell(library: str, batch: int) -> str:
+        row = found.get((library, batch))
+        if row is None:
+            return ""
+        rate, times = row["simulations_per_cpu_second"] / 1000, row["ratio"]
+        rate = f"{rate / 1000:.2f}M" if rate >= 1000 else f"{rate:.{int(rate < 10)}f}K"
+        return f"{rate}, {times:.2g}x"
+
+    rows = [
+        [library.split(" [")[0], *(cell(library, batch) for batch in batches)]
+        for library in dict.fromkeys(row["library"] for row in data["figures"])
+    ]
+    head = ["simulations per CPU second, and as a multiple of mctx", *(f"B = {b}" for b in batches)]
+    return table(head, rows) + (f"\n{speed(data)}\n" if len(batches) > 1 else "")
+
+
+def speed(data: dict[str, Any]) -> str:
+    """Return what README and pages say about speed, from a file of ``benchmarks/peers.py``."""
+    ratios: dict[str, list[tuple[int, float]]] = {}
+    for row in data["figures"]:
+        if "ratio" in row:
+            ratios.setdefault(row["library"], []).append((row["batch"], row["ratio"]))
+    array, planner = (sorted(v) for k, v in ratios.items() if k.startswith("ours"))
+    low, high = (f"{bound(ratio for _, ratio in array):.0f}" for bound in (min, max))
+    (_, slow), (many, fast) = planner[0], planner[-1]
+    return (
+        f"On one CPU core, with {data['figures'][0]['simulations']} simulations per root, "
+        f"`tree_search` makes {low} to {high} times the simulations per second of mctx's "
+        "`muzero_policy`. "
+        f"`MCTSPlanner` steps a TorchRL env and makes {slow:.1f} times as many with one root, "
+        f"{fast:.0f} times with {many:,}."
+    )
 
 
 def waterworld_plans(data: dict[str, Any]) -> str:
@@ -384,6 +418,7 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             ),
             ("demo/metrics.json",),
         ),
+        Section("Trained, untrained, single actions", "skills/untrained.json", untrained),
         Section("How much training the worker needs", "skills/worker.json", worker),
         Section("Skill objectives", "skills/skill_objectives.json", objectives),
         Section("Skills that are vectors", "skills/skill_vectors.json", objectives),

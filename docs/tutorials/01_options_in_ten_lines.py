@@ -27,7 +27,7 @@ from torchrl.envs import EnvBase
 
 class ValleyEnv(EnvBase):
     batch_locked = False  # the state is in the tensordict
-    _supports_set_state = True  # reset(td, set_state=True) goes on from td
+    _supports_set_state = True  # reset(td, set_state=True) continues from td
 
     def __init__(self):
         super().__init__()
@@ -65,7 +65,7 @@ class ValleyEnv(EnvBase):
 # The ten lines
 # -------------
 #
-# A *worker* carries options out: it reads the option that runs (``"skill"``) and whatever else it
+# A *worker* executes options: it reads the option that runs (``"skill"``) and all else that it
 # needs, and writes the action. Option 0 pushes to the left, option 1 to the right, each until the
 # car comes to rest or 50 steps have passed.
 
@@ -139,8 +139,8 @@ plt.show()
 # TorchRL's losses, correct over options
 # --------------------------------------
 #
-# TorchRL's value estimators can discount by the time between observations. Say where it stands,
-# on the value estimator, after every ``make_value_estimator``. DQN:
+# TorchRL's value estimators can discount by the time between observations. After every
+# ``make_value_estimator``, tell the value estimator which key holds the duration. DQN:
 
 from torch import nn
 from torchrl.modules import QValueActor

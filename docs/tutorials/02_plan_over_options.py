@@ -79,11 +79,11 @@ search.tree.plot(ax=right, option_names=OPTIONS, max_nodes=250)
 plt.show()
 
 # %%
-# Carry it out
-# ------------
+# Execute the plan
+# ----------------
 #
 # The planner is a policy: it reads a state and writes the option to take. ``HierarchicalPolicy``
-# carries a plan out to its end before it plans again, so the whole agent is one ``rollout`` of
+# executes a plan to its end before it plans again, so the whole agent is one ``rollout`` of
 # TorchRL.
 
 from torchrl_hmcts.planners import HierarchicalPolicy
@@ -161,7 +161,7 @@ for axes in (left, right):
 plt.show()
 
 # %%
-# Where to go on: :doc:`/planning` has every part of the planner,
+# What to read next: :doc:`/planning` has every part of the planner,
 # :doc:`/algorithms/mcts_over_options` what it computes, and
 # :doc:`04_swap_the_parts` exchanges some of them.
 

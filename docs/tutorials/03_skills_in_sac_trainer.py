@@ -111,7 +111,7 @@ print(
 
 import matplotlib.pyplot as plt
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.planners.drawing import option_color
+from torchrl_hmcts.planners import option_color
 
 room = WaterworldMazeEnv(torch.zeros(1, 9, 9, dtype=torch.bool), observation=False)
 policy = SkillPolicy(loss.actor_network)  # the same parameters, lean

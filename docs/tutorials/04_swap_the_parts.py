@@ -35,7 +35,7 @@ starts = env.reset(TensorDict(batch_size=[8]))
 # The planner
 # -----------
 #
-# A planner is a policy: a module that reads a state and writes the option. Whatever does so takes
+# A planner is a policy: a module that reads a state and writes the option. All that does so takes
 # the place of tree search. Here is one that tries sequences of options at random and takes the
 # best, in a dozen lines, with the macro env as its simulator:
 
@@ -157,9 +157,8 @@ plt.show()
 
 from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
 from torchrl_hmcts.objectives import METRAEncoderLoss
-from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_training_env
+from torchrl_hmcts.planners import option_color
+from torchrl_hmcts.trainers import DIAYNTrainer, make_training_env
 from torchrl_hmcts.transforms import SkillReward
 
 training_env = make_training_env(num_skills=4)

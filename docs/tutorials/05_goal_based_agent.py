@@ -32,8 +32,7 @@ print("length of the plan:", td["plan_length"][0].item(), "tiles")
 
 import matplotlib.pyplot as plt
 from torchrl_hmcts.envs import maze_pool
-from torchrl_hmcts.trainers import make_tile_planner
-from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers import make_starts, make_tile_planner
 
 tests = make_goal_env(maze_pool("test"), observation=False)
 mazes = tests.base_env
@@ -61,8 +60,7 @@ plt.show()
 # ``ScriptedExpert`` steers towards the next goal and slows down where the path turns. It shows
 # what is possible, and whether the env is right, before anything is trained.
 
-from torchrl_hmcts.trainers import ScriptedExpert, run_goal_episodes
-from torchrl_hmcts.trainers.figures.goals import draw_goals
+from torchrl_hmcts.trainers import ScriptedExpert, draw_goals, run_goal_episodes
 
 episodes = run_goal_episodes(tests, ScriptedExpert(), starts, record=True)
 summary = episodes.summary()
@@ -81,13 +79,13 @@ plt.show()
 # A worker that learns
 # --------------------
 #
-# Any TorchRL agent can be trained in this env. The source's is A3C: asynchronous actor-learners
-# (here one, in this process, so that the page can be built; ``num_learners=2`` starts processes).
+# Any TorchRL agent can be trained in this env. The dissertation's is A3C: asynchronous
+# actor-learners (here one, in this process, so that the page can be built; ``num_learners=2``
+# starts processes).
 # To be quick, this worker reads no walls: its velocity and the goals, which lead around them.
 
 from torchrl_hmcts.objectives import A3CLoss
-from torchrl_hmcts.trainers import A3CTrainer
-from torchrl_hmcts.trainers.experiments.goals import make_maze_networks
+from torchrl_hmcts.trainers import A3CTrainer, make_maze_networks
 
 FRAMES = 60_000
 actor, critic = make_maze_networks(

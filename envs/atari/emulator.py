@@ -213,7 +213,7 @@ class AtariEmulator:
         return self.states.encode(raw, self._held if self.sticky else self._sent, rng)
 
     def set_state(self, row: np.ndarray, seed: int | None = None) -> None:
-        """Go on from a state.
+        """Continue from a state.
 
         Args:
             row: as :meth:`state` returned it, of this or another emulator of the game.
@@ -271,12 +271,12 @@ class AtariEmulator:
 
     @property
     def terminated(self) -> bool:
-        """Whether the game is over."""
+        """True if the game is over."""
         return bool(self.ale.game_over(with_truncation=False))
 
     @property
     def truncated(self) -> bool:
-        """Whether the episode has had its ``max_frames``."""
+        """True if the episode has had its ``max_frames``."""
         return bool(self.ale.game_truncated())
 
     def screen(self) -> np.ndarray:

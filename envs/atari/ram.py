@@ -35,10 +35,10 @@ class AtariRAMEnv(EnvBase):
     episodes load the game again with seeds of their own, so that an episode does not depend on the
     one before.
 
-    ``reset(td, set_state=True)`` goes on from the state in ``td``, also of another env of the same
-    game: exactly, where ``repeat_action_probability`` is 0 or the state has the random generator
-    (``include_rng=True``). Without it, which is what a planner may be given of a game with sticky
-    actions, the coming draws are others.
+    ``reset(td, set_state=True)`` continues from the state in ``td``, also of another env of
+    the same game: exactly, where ``repeat_action_probability`` is 0 or the state has the random
+    generator (``include_rng=True``). Without it, which is what a planner may be given of a
+    game with sticky actions, the coming draws are others.
 
     Writes ``"ram"`` (uint8 ``[128]``), ``"observation"`` (float32 ``[128]``, RAM / 255),
     ``"lives"`` and ``"episode_frame"`` (int64 ``[1]``), and ``"emulator_state"`` (uint8 ``[about

@@ -1,55 +1,16 @@
-"""Workers for Atari games: rules, and a network that reads the RAM.
+"""The worker of chapter 5: a network that reads the RAM.
 
 Letters: H width of a layer, A actions, Z options.
 """
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.envs.gym.shared_network import SharedNetwork, choose
-
-
-class RepeatActions:
-    """Options that take one action all the time.
-
-    Args:
-        actions (int or sequence): the action of each option, an index or an array; a number means
-            all indices below it.
-
-    Raises:
-        TypeError: if it is neither a number nor a sequence.
-        ValueError: if there is no action.
-
-    Reference:
-        Braylan et al., "Frame skip is a powerful parameter for learning to play Atari", 2015.
-
-    Example:
-        >>> from torchrl_hmcts.envs import RepeatActions
-        >>> RepeatActions(4).num_options, RepeatActions([0, 2]).act(None, 1, None)
-        (4, 2)
-    """
-
-    def __init__(self, actions: int | Sequence[Any]) -> None:
-        if isinstance(actions, numbers.Real):
-            actions = range(whole_number("RepeatActions", "actions", actions, least=1))
-        if not isinstance(actions, Sequence):
-            raise TypeError(
-                f"RepeatActions needs a number or a sequence for actions; got {actions!r}."
-            )
-        self.actions = tuple(actions)
-        if not self.actions:
-            raise ValueError("RepeatActions needs at least one action; got actions=().")
-        self.num_options = len(self.actions)
-
-    def act(self, observation: Any, option: int, generator: np.random.Generator) -> Any:
-        """Return the option's action."""
-        return self.actions[option]
 
 
 class SharedMLP(SharedNetwork):

@@ -1,4 +1,4 @@
-"""What of a MiniGrid state is compared: pairs of the agent's pose with all else that changes."""
+"""Features of a MiniGrid state: pairs of the agent's pose with all else that changes."""
 
 from __future__ import annotations
 

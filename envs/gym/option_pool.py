@@ -145,5 +145,6 @@ class OptionPool(ProcessPool):
 
     def __repr__(self) -> str:
         run: Any = self._run
-        kind = type(run.snapshot).__name__
-        return f"OptionPool({run.env}, {self.worker!r}, snapshot={kind})"
+        kind, spec = type(run.snapshot).__name__, run.env.spec
+        name = spec.id if spec is not None else type(run.env.unwrapped).__name__
+        return f"OptionPool({name}, {self.worker!r}, snapshot={kind})"

@@ -86,7 +86,7 @@ class ProcessPool(EnvBase):
         self._step_seconds = real_number(owner, "step_seconds", step_seconds, above=0.0)
         self._make_slots()
         self.on_step: Callable[[TensorDictBase, TensorDictBase], object] | None = None
-        """Called with what was stepped and what came of it, e.g. to keep what a search tries."""
+        """Called with what was stepped and its outcome, e.g. to keep what a search tries."""
         self._set_specs()
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
 

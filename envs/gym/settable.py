@@ -183,7 +183,7 @@ class SettableGymEnv(GymWrapper):
     """A Gymnasium env that a planner can set to any state, right to the bit.
 
     Its state is the entry ``"snapshot"``, uint8 ``[width]``, beside its observations. Any transform
-    of TorchRL goes on top of it, an :class:`~torchrl_hmcts.transforms.OptionTransform` too.
+    of TorchRL can be put on top of it, an :class:`~torchrl_hmcts.transforms.OptionTransform` too.
 
     Args:
         env (str, gymnasium.Env or callable): an id, an env, or a function that makes one. It is

@@ -123,7 +123,7 @@ def fixed_actions(space: gymnasium.Space) -> list[Any]:
 
 @dataclass(frozen=True)
 class Look:
-    """What a short look at an env found: the task it sets, and how far its actions reach.
+    """Result of a short look at an env: the task it sets, and how far its actions reach.
 
     Attributes:
         kind: ``"goal"``, or ``"return"`` where rewards are collected on the way.

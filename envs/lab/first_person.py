@@ -1,4 +1,4 @@
-"""What the player of a lab maze sees, drawn by casting a ray through every column of the picture.
+"""The view of the player of a lab maze, drawn by casting a ray through every column of the picture.
 
 Letters: R rows and C columns of cells (row 0 is the south), h x w pixels, K things to draw.
 """

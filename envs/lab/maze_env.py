@@ -35,7 +35,7 @@ from torchrl_hmcts.envs.lab.read_outs import PAIRS, READ_OUTS, LabReadOuts
 from torchrl_hmcts.envs.lab.states import STATE, TRAILING, check_place, state_specs
 from torchrl_hmcts.envs.lab.view import heading_degrees
 from torchrl_hmcts.envs.mazes.maze_env import MazeEnv
-from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, draw_maze
+from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, draw_goal, draw_maze, draw_walls
 
 CLOCK_PHASE: Mapping[int, tuple[int, int]] = {
     60: (46, -3),
@@ -51,7 +51,7 @@ class LabMazeEnv(MazeEnv):
     r"""Walk through DeepMind Lab's random maze: momentum, friction, and a goal far away.
 
     The level ``demos/random_maze`` with the engine's ground movement, frame by frame: friction,
-    acceleration towards the keys' direction, a slide along whatever is in the way, and a velocity
+    acceleration towards the keys' direction, a slide along what is in the way, and a velocity
     rounded to integers. With the velocity :math:`v`, the wanted direction :math:`w` and a frame of
     :math:`\Delta t` seconds, without contact,
 
@@ -408,6 +408,12 @@ class LabMazeEnv(MazeEnv):
         return self._write_state([_array(tensordict, key, shape).copy() for key in STATE], shape)
 
     # ---------------------------------------------------------------- pictures
+
+    def draw_map(self, axes: Any, tensordict: TensorDictBase) -> None:
+        maze = int(tensordict["maze_index"])
+        draw_walls(axes, self.layout.walls[maze], north_up=True, scale=self.CELL)
+        if self.layout.goal[maze, 0] >= 0:
+            draw_goal(axes, self.layout.goal[maze])
 
     def _draw(self, tensordict: TensorDictBase, options: dict[str, Any]) -> np.ndarray:
         maze, position, _, turned, level = (

@@ -1,4 +1,4 @@
-"""What :class:`LabMazeEnv` writes besides its state.
+"""Entries that :class:`LabMazeEnv` writes besides its state.
 
 Letters: *B batch, n its elements, M mazes, R rows and C columns of cells, K apples.
 """

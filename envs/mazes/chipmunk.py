@@ -1,7 +1,7 @@
 """Many copies of a disc in many mazes, advanced by one Chipmunk space.
 
 Every maze lies in the same :class:`pymunk.Space`, each in a cell of its own on a wide grid (the
-cell depends only on the maze's index, so that a maze's arithmetic is the same whatever else is
+cell depends only on the maze's index, so that a maze's arithmetic does not depend on what else is
 simulated). The discs do not collide with each other. One C call therefore moves any number of
 copies in any number of mazes, and states go in and out as arrays through :mod:`pymunk.batch`.
 
@@ -33,7 +33,7 @@ _ROUNDING = 2.0**20
 
 
 class WallSegment(NamedTuple):
-    """A straight stretch of wall, tiles, and the points its boundary goes on to at convex corners.
+    """A straight stretch of wall, tiles, and the points its boundary leads to at convex corners.
 
     ``before`` equals ``start`` (``after`` equals ``end``) where the corner is concave.
     """

@@ -16,8 +16,10 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import instance, whole_number
 from torchrl_hmcts.envs.mazes.layouts import check_mazes, free_tiles, maze_pool, wall_centers
+from torchrl_hmcts.envs.mazes.rendering import draw_goal, draw_walls
 
 
 class MazeEnv(EnvBase):
@@ -153,6 +155,20 @@ class MazeEnv(EnvBase):
         return self._draw(tensordict, options)
 
     @abstractmethod
+    def draw_map(self, axes: Any, tensordict: TensorDictBase) -> None:
+        """Draw walls and target of a state in axes of matplotlib, in the units of ``"position"``.
+
+        Args:
+            axes: to draw in.
+            tensordict (TensorDictBase): state without batch dimensions; of its entries
+                ``"maze_index"`` is needed.
+        """
+
+    def _repr_html_(self) -> str:
+        first = TensorDict({"maze_index": torch.tensor(0)})
+        return notebook.shown(f"{self!r}, its first maze:", lambda axes: self.draw_map(axes, first))
+
+    @abstractmethod
     def _draw(self, tensordict: TensorDictBase, options: dict[str, Any]) -> Any:
         """Draw a state without batch dimensions."""
 
@@ -199,6 +215,11 @@ class TileMazeEnv(MazeEnv):
         self.mazes = mazes.to(self.device).clone()  # [M, H, W]
         self._wall_centers = wall_centers(self.mazes).flatten(1)  # [M, 2K]
         self._free_tiles = free_tiles(self.mazes)  # [M, F]
+
+    def draw_map(self, axes: Any, tensordict: TensorDictBase) -> None:
+        draw_walls(axes, self.mazes[int(tensordict["maze_index"])].cpu())
+        if "target" in tensordict.keys():
+            draw_goal(axes, tensordict["target"].tolist())
 
     def to(self, device: torch.device | str) -> Any:
         """Move the env, its mazes and its tables to a device, in place."""

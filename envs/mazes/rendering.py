@@ -108,6 +108,35 @@ def draw_maze(
     return image.round().astype(np.uint8)
 
 
+def draw_walls(
+    axes: Any, walls: Any, *, north_up: bool = False, grid: bool = False, scale: float = 1.0
+) -> None:
+    """Draw walls as black squares in axes of matplotlib; a tile is ``scale`` long."""
+    walls = np.asarray(walls)
+    height, width = scale * walls.shape[0], scale * walls.shape[1]
+    axes.imshow(
+        np.where(walls, 0.12, 1.0),
+        cmap="gray",
+        vmin=0,
+        vmax=1,
+        extent=(0, width, 0, height) if north_up else (0, width, height, 0),
+        interpolation="nearest",
+    )
+    axes.set_xticks(range(walls.shape[1] + 1) if grid else [], labels=[])
+    axes.set_yticks(range(walls.shape[0] + 1) if grid else [], labels=[])
+    axes.tick_params(length=0)
+    if grid:
+        axes.grid(color="0.8", linewidth=0.8)
+        axes.set_axisbelow(False)
+    for spine in axes.spines.values():
+        spine.set_linewidth(2.5)
+
+
+def draw_goal(axes: Any, goal: Any) -> None:
+    """Draw the place to reach in axes of matplotlib."""
+    axes.plot(*goal, "o", color=tuple(c / 255 for c in TARGET_COLOR), markersize=11)
+
+
 def _paint_capsule(
     image: np.ndarray, start: np.ndarray, end: np.ndarray, radius: float, rgb: Any
 ) -> None:

@@ -1,4 +1,4 @@
-"""What options really led to, remembered while acting, against a model that errs there.
+"""A memory of what options really led to, against a model that errs there.
 
 Letters: *B batch of the tensordict, m rows, C contexts, N outcomes kept of each, D predicted state
 numbers, f numbers compared.
@@ -27,7 +27,7 @@ class OptionMemory:
     .. math:: o_i = o, \qquad i = \arg\min_j \lVert \phi(s) - \phi(s_j) \rVert, \qquad
         \lVert \phi(s) - \phi(s_i) \rVert \le r
 
-    A plan that failed because the model erred is else made again from the same state, for ever:
+    A plan that failed because the model erred is else made again and again from the same state:
     planner, model and env are deterministic. State entries change by what they changed then.
 
     Args:

@@ -94,11 +94,25 @@ class _Choice:
         return action
 
 
+class _TanhNormal(TanhNormal):
+    """TorchRL's, whose samples have the dtype of the bounds, also where the network's is less."""
+
+    def rsample(self, sample_shape: Any = ()) -> Tensor:
+        return super().rsample(sample_shape).to(self.low.dtype)
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        return super().sample(sample_shape).to(self.low.dtype)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        return super().deterministic_sample.to(self.low.dtype)
+
+
 class _Squashed:
     """An action between bounds ``[D]``, from the 2 D raw parameters of a Gaussian."""
 
     writes = ("loc", "scale")
-    distribution = TanhNormal
+    distribution = _TanhNormal
 
     def __init__(self, spec: Bounded) -> None:
         ends = torch.stack((spec.space.low, spec.space.high)).expand(2, *spec.shape)
@@ -261,7 +275,7 @@ class SkillPolicy(TensorDictModuleBase):
     Args:
         actor (SkillActor): the actor whose parameters are used; later updates are seen.
         deterministic (bool): take the most probable action (of a Gaussian: its mean, squashed)
-            instead of sampling, whatever the exploration type. Default ``False``: sample, unless
+            instead of sampling, under any exploration type. Default ``False``: sample, unless
             TorchRL's ``set_exploration_type`` asks for ``DETERMINISTIC``, ``MODE`` or ``MEAN``,
             which mean the same here.
         generator (torch.Generator, optional): source of the samples. Default ``None``: torch's

@@ -128,7 +128,7 @@ class SkillMLP(nn.Module):
 
     @property
     def stackable(self) -> bool:
-        """Whether the parameters of N copies may be put in stacked, to run all copies at once."""
+        """True if the parameters of N copies may be put in stacked, to run all copies at once."""
         return can_stack(self.trunk)
 
     def extra_repr(self) -> str:
@@ -230,7 +230,7 @@ class FeatureMLP(nn.Sequential):
 
     @property
     def stackable(self) -> bool:
-        """Whether :meth:`run` can be used."""
+        """True if :meth:`run` can be used."""
         return can_stack(self)
 
 

@@ -1,4 +1,4 @@
-"""When options end: conditions for :class:`~torchrl_hmcts.transforms.OptionTransform`.
+"""Conditions under which options end, for :class:`~torchrl_hmcts.transforms.OptionTransform`.
 
 Each is a callable ``termination(td) -> bool [*B]``; ``td`` holds the entries after a base step, the
 option, and under ``"duration"`` the base steps it has taken.
@@ -77,7 +77,7 @@ class AnyTermination:
     .. math:: \text{ends} \iff c_1 \lor c_2 \lor \dots
 
     Every condition is asked every time, so that one that draws random numbers draws as many
-    whatever the others say.
+    independent of the others.
 
     Args:
         *conditions: callables ``condition(td) -> bool [*B]`` or ``[*B, 1]``, at least one.
@@ -240,7 +240,7 @@ class LearnedTermination:
 
     @torch.no_grad()
     def probability(self, td: TensorDictBase) -> Tensor:
-        """Returns the probability that the option ends here, ``[*B]``, whatever ``every`` is."""
+        """Returns the probability that the option ends here, ``[*B]``, with any ``every``."""
         logits = self.network(td.copy()).get(self.termination_logits_key)
         return logits.sigmoid().reshape(td.batch_size)
 

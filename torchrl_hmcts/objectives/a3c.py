@@ -122,7 +122,7 @@ class NStepReturn(TD1Estimator):
         terminated = after.get(keys.terminated, done)
         ends = done.clone()
         ends.select(time, -1).fill_(True)
-        # One value per step, whatever further dimensions a reward has.
+        # One value per step, with any further dimensions of the reward.
         used = (ends & ~terminated).reshape(*tensordict.shape, -1).any(-1)
         value = self._values(tensordict, params)
         following = after.select(*network.in_keys, strict=False)

@@ -280,7 +280,7 @@ class LSDEncoderLoss(EncoderObjective):
             if plain and not is_parametrized(layer, "weight"):
                 raise ValueError(
                     "LSDEncoderLoss needs an encoder that cannot stretch distances, but its layer "
-                    f"{name!r} is a plain Linear, whose weights would grow for ever. Pass "
+                    f"{name!r} is a plain Linear, whose weights would grow without bound. Pass "
                     "SkillEncoder(..., linear=SpectralLinear)."
                 )
         super().__init__(encoder, **settings)

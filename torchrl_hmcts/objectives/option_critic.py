@@ -141,7 +141,7 @@ class OptionTerminationLoss(_OptionLoss):
 
     @torch.no_grad()
     def advantage(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns A(s', o) of transitions ``[*B]``: how much worse than V(s') going on is."""
+        """Returns A(s', o) of transitions ``[*B]``: how much worse than V(s') it is to continue."""
         next_td = self._next_with_option(tensordict)
         if self.qvalue_network is not None:
             self.qvalue_network(next_td)

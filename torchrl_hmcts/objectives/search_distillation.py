@@ -43,7 +43,7 @@ class ExpertIterationLoss(Loss):
             ``state_value`` ``[*B, 1]``, the prior and the value of a planner.
         value_coeff (float): :math:`c_v`. Default ``1.0``.
         value_loss (str): ``"l2"`` (default), ``"smooth_l1"``, ``"log"`` or ``"cross_entropy"``.
-        reduction (str): ``"mean"`` (default; over all examples, whatever their weights), ``"sum"``
+        reduction (str): ``"mean"`` (default; over all examples, not over their weights), ``"sum"``
             or ``"none"``.
 
     Returns:

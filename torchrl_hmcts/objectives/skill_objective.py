@@ -1,4 +1,4 @@
-"""What makes skills different: a representation, its loss, and the reward it gives."""
+"""Objectives that make skills different: a representation, its loss, and the reward it gives."""
 
 from __future__ import annotations
 

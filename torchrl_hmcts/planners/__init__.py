@@ -3,6 +3,7 @@
 from torchrl_hmcts.planners.array_search import Root, Transition, tree_search
 from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
 from torchrl_hmcts.planners.control import GoalPlanner, HierarchicalPolicy
+from torchrl_hmcts.planners.drawing import option_color
 from torchrl_hmcts.planners.evaluation import Evaluation
 from torchrl_hmcts.planners.evaluators import (
     MixedEvaluator,
@@ -67,6 +68,7 @@ __all__ = [
     "ValueEvaluator",
     "WidthNovelty",
     "extract_plans",
+    "option_color",
     "search_examples",
     "tree_search",
 ]

@@ -1,4 +1,4 @@
-"""What evaluators and priors answer: tensors that a search can use, or an error that names them.
+"""Answers of evaluators and priors: tensors that a search can use, or an error that names them.
 
 Letters: m states, A options.
 """

@@ -58,7 +58,7 @@ class Root(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What options did: the answer of a transition function.
+    """Outcomes of options: the answer of a transition function.
 
     Attributes:
         reward (Array): ``[m]`` float32, R.

@@ -1,8 +1,8 @@
-"""How much a search may spend, how often it asks again, and how far it looks beyond a leaf."""
+"""Limits of a search: its spending, its repeated outcomes, and its look beyond a leaf."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 from torchrl_hmcts.checks import NO_LIMIT, instance, real_number, whole_number
@@ -49,6 +49,11 @@ class SearchBudget:
     nodes: int | None = None
     until_plan: bool = True
     improve_expansions: int = 0
+
+    def __repr__(self) -> str:
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        words = [f"{f.name}={given[f.name]}" for f in fields(self) if given[f.name] != f.default]
+        return f"SearchBudget({', '.join(words)})"
 
     def __post_init__(self) -> None:
         limits = ("expansions", "simulations", "base_steps", "seconds", "nodes")

@@ -22,21 +22,22 @@ from torchrl_hmcts.planners.export import (
     plural,
     shown_nodes,
 )
+from torchrl_hmcts.planners.layout import layered_layout
 from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, TreeArrays
 
 Axes = Any  # matplotlib.axes.Axes; matplotlib is loaded by the first picture only
 Color = tuple[float, float, float]
 
-OPTION_COLORS = (
-    (230, 97, 0),
-    (93, 58, 155),
-    (0, 121, 140),
-    (212, 17, 89),
-    (140, 110, 0),
-    (90, 90, 90),
-    (26, 133, 255),
-    (64, 176, 60),
-)  # 0 to 255
+OPTION_COLORS = (  # 0 to 255; apart for the colour-blind, too (tests/test_palette.py)
+    (255, 132, 0),
+    (127, 16, 253),
+    (28, 174, 255),
+    (111, 3, 28),
+    (65, 104, 122),
+    (196, 148, 124),
+    (191, 13, 0),
+    (116, 0, 151),
+)
 _PRUNED, _REFUSED = (0.77, 0.77, 0.77), (0.6, 0.6, 0.6)
 _PLAN = "#ffd23f"
 _INK = "#1f2430"
@@ -45,7 +46,10 @@ _MAX_LEGEND = 16  # options in a legend
 
 
 def option_color(option: int) -> Color:
-    """Return the colour of an option, 0 to 1; colours repeat after eight.
+    """Return the colour of an option in all pictures: red, green and blue, 0 to 1.
+
+    Args:
+        option: its number; colours repeat after eight.
 
     Example:
         >>> option_color(3) == option_color(11)
@@ -201,7 +205,7 @@ def plot_positions(
     """Draw where the options of a search led: every node at its place in the plane.
 
     Straight lines join each node to the one above, in the colour of the option; what was refused is
-    grey, the best plan thick. The blue dot is the root, the green ring the end of the best plan.
+    grey, the best plan thick, with a letter or number for each option. The blue dot is the root.
 
     Args:
         tree: of a finished or interrupted search, whose states are kept.
@@ -209,7 +213,7 @@ def plot_positions(
         key: entry of the state with (x, y), any shape of two numbers; or a callable that makes
             ``[N, 2]`` of the states ``[N]``. Default ``"position"``.
         ax: axes to draw over, whose limits stay if they show something already, e.g. a maze.
-            Default: those of a new figure of pyplot.
+            Default: those of a new figure of pyplot, over the map of an env that has ``draw_map``.
         max_nodes: how many nodes at most: those with most visits, and the best plan. Default: all.
         option_names: one for each of the ``A`` options. Default: their numbers.
         legend: whether to say what the colours mean. Default True.
@@ -239,6 +243,8 @@ def plot_positions(
     points = _positions(tree, root, key, shown.ids)
     if ax is None:
         ax = pyplot.subplots(layout="constrained")[1]
+        if tree.draw_map is not None and tree.states is not None and key == "position":
+            tree.draw_map(ax, tree.states[root, 0])
     fresh = not ax.has_data()
     if fresh:
         ax.set_aspect("equal")
@@ -251,6 +257,11 @@ def plot_positions(
     ):
         rows = np.flatnonzero(chosen & (shown.parents >= 0))
         shown.lines(ax, paths, rows, linewidths=line_width, alpha=alpha, zorder=order)
+    for row in shown.plan[1:]:  # a letter on each segment of the plan
+        name = labels[int(shown.nodes["option"][row])]
+        style = {"weight": "bold", "ha": "center", "va": "center", "zorder": 6, "clip_on": True}
+        box = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": shown.colors[row]}
+        ax.text(*paths[row].mean(0), _letter(name), fontsize=7, bbox=box, **style)
     ax.plot(*points[0], "o", color=_START, markersize=11, zorder=5)
     if len(shown.plan):
         ax.plot(*points[shown.plan[-1]], "o", mec=_END, mew=2.5, mfc="white", ms=7.5, zorder=5)
@@ -266,63 +277,10 @@ def plot_positions(
     return ax
 
 
-def layered_layout(parents: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Place the nodes of a tree across: parents over the middle of their children, no overlaps.
-
-    Nodes of one layer are at least 1 apart, and subtrees as close as that allows. The mean of the
-    layouts packed from the left and from the right: mirrored trees are drawn as mirror images.
-
-    Args:
-        parents: int64 ``[N]``, row of the node above, which comes first; -1 for the root, row 0.
-        order: int64 ``[N]``, all rows, those of siblings from left to right.
-
-    Returns:
-        float64 ``[N]``, the root at 0.
-
-    Reference:
-        Reingold and Tilford, "Tidier drawings of trees", 1981.
-
-    Example:
-        >>> layered_layout(np.array([-1, 0, 0, 1, 1]), np.arange(5))
-        array([ 0. , -0.5,  0.5, -1. ,  0. ])
-    """
-    return (_pack(parents, order) - _pack(parents, order[::-1])) / 2.0
-
-
-def _pack(parents: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Place subtrees from left to right, each as far to the left as it goes."""
-    below: list[list[int]] = [[] for _ in parents]
-    for row in order.tolist():
-        if parents[row] >= 0:
-            below[parents[row]].append(row)
-    offsets = np.zeros(len(parents))  # from the node above
-    edges: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # left and right outline, by layer
-    for row in reversed(range(len(parents))):
-        rows = below[row]
-        if not rows:
-            edges[row] = np.zeros(1), np.zeros(1)
-            continue
-        left, right = edges.pop(rows[0])
-        places = [0.0]
-        for child in rows[1:]:
-            child_left, child_right = edges.pop(child)
-            common = min(len(right), len(child_left))
-            gaps = np.full(common, 1.3)  # between cousins; 1 between sisters
-            gaps[0] = 1.0
-            place = float((right[:common] - child_left[:common] + gaps).max())
-            left = np.concatenate((left, child_left[len(left) :] + place))
-            right = np.concatenate((child_right + place, right[len(child_right) :]))
-            places.append(place)
-        middle = (places[0] + places[-1]) / 2.0
-        offsets[rows] = np.array(places) - middle
-        edges[row] = (
-            np.concatenate(([0.0], left - middle)),
-            np.concatenate(([0.0], right - middle)),
-        )
-    across = np.zeros(len(parents))
-    for row in range(1, len(parents)):
-        across[row] = across[parents[row]] + offsets[row]
-    return across
+def _letter(name: str) -> str:
+    """The number of an option, or the first letter of its name."""
+    number = name.rpartition(" ")[2]
+    return number if number.isdigit() else name[:1].upper()
 
 
 def _draw_curves(
@@ -344,11 +302,14 @@ def _draw_curves(
 def _draw_nodes(ax: Axes, shown: _Shown, points: np.ndarray, diameters: np.ndarray) -> Any:
     """Draw the nodes, each once; return what a colour bar is made of."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import Normalize, PowerNorm
 
     values, inner = shown.nodes["value"].astype(float), ~shown.pruned & ~shown.terminal
     scale = values[inner] if inner.any() else values
-    colors = ScalarMappable(Normalize(float(scale.min()), float(scale.max())), "Blues")
+    low, high = float(scale.min()), float(scale.max())
+    crowded = np.median(scale) - low < 0.1 * (high - low)  # a linear scale would leave all white
+    norm = PowerNorm(0.4, low, high) if crowded else Normalize(low, high)
+    colors = ScalarMappable(norm, "Blues")
     thin = np.clip(diameters / 12.0, 0.3, 0.9)
     rims = np.where(shown.rewarded, np.maximum(1.6, thin), thin)
     for chosen, marker, area in ((inner, "o", 1.0), (shown.terminal, "s", 0.8)):

@@ -12,6 +12,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_hmcts.checks import no_class
 from torchrl_hmcts.planners.answers import check_priors, check_values
 from torchrl_hmcts.planners.random_streams import with_seeds
 
@@ -53,6 +54,7 @@ class NodeEvaluator:
         self.num_options = num_options
         self._parts = [part for part in (leaf_evaluator, option_prior) if part is not None]
         for name, part in (("leaf_evaluator", leaf_evaluator), ("option_prior", option_prior)):
+            no_class("MCTSPlanner", name, part)
             if part is not None and not callable(part):
                 raise TypeError(f"{name} must be callable on a tensordict; got {part!r}.")
 

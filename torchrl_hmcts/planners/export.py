@@ -77,7 +77,7 @@ def most_visited_path(tree: TreeArrays, root: int) -> list[int]:
 def shown_nodes(tree: TreeArrays, root: int, max_nodes: int | None) -> np.ndarray:
     """Return the most visited nodes, in ascending order, each with the node above it.
 
-    The best plan is among them whatever its visits, as far as ``max_nodes`` allows.
+    The best plan is among them, with any visits, as far as ``max_nodes`` allows.
     """
     count = check_root(tree, root)
     if max_nodes is not None and max_nodes < 1:

@@ -18,7 +18,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.checks import instance, real_number, whole_number
+from torchrl_hmcts import notebook
+from torchrl_hmcts.checks import instance, no_class, real_number, whole_number
 from torchrl_hmcts.nesting import option_gamma
 from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
 from torchrl_hmcts.planners.evaluation import Evaluator, NodeEvaluator
@@ -46,6 +47,21 @@ _WRITTEN = (
     *("plan_found", "root_value", "root_visits"),
     *("num_simulations", "num_expansions", "num_simulated_steps"),
 )
+# Where people look for what is an argument of another part.
+_ELSEWHERE = {
+    **{
+        name: f"budget=SearchBudget({name.removeprefix('num_')}=...)"
+        for limit in ("simulations", "expansions", "base_steps", "seconds", "nodes")
+        for name in (limit, f"num_{limit}")
+    },
+    **dict.fromkeys(("c", "c_puct", "exploration"), "tree_policy=UCT(c=...) or PUCT(c=...)"),
+    **dict.fromkeys(("value", "value_net"), "leaf_evaluator=ValueEvaluator(module)"),
+    **dict.fromkeys(("policy", "prior"), "option_prior=ModulePrior(module)"),
+    **dict.fromkeys(
+        ("worker", "max_steps", "num_options"),
+        "env=TransformedEnv(env, OptionTransform(worker, num_options, max_steps))",
+    ),
+}
 _PARTS = {part.name for part in fields(SearchSettings)}
 
 
@@ -64,7 +80,7 @@ class MCTSPlanner(TensorDictModuleBase):
     are closed and never simulated again.
 
     Root ``b`` of a call with seed ``s`` draws its random numbers (root noise, Gumbel, rollouts,
-    sampled choices) from ``s + b``, so that it has the same tree whatever is searched beside it
+    sampled choices) from ``s + b``, so that its tree does not depend on the roots beside it
     (with more than one wave in flight only where it is alone: waves are of all roots together).
 
     Args:
@@ -185,6 +201,7 @@ class MCTSPlanner(TensorDictModuleBase):
         self._gumbel_choice = final_choice is None and self.settings.is_gumbel
         if final_choice is None:
             final_choice = BestPlan() if chance is None else MostVisited()
+        no_class("MCTSPlanner", "final_choice", final_choice)
         if not hasattr(final_choice, "choose"):
             raise TypeError(
                 f"final_choice needs choose(search), e.g. BestPlan(); got {final_choice}."
@@ -196,7 +213,35 @@ class MCTSPlanner(TensorDictModuleBase):
         self.set_seed(seed)
         self.in_keys = list(self.simulator.root_keys)
         self.out_keys = [self.option_key, *_WRITTEN]
-        self.last_search: Search | None = None
+        self._last_search: Search | None = None
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> MCTSPlanner:  # before __init__ refuses a name
+        for name in kwargs:
+            if name in _ELSEWHERE:
+                raise TypeError(f"MCTSPlanner has no {name}. Write {_ELSEWHERE[name]}.")
+        return super().__new__(cls, *args, **kwargs)
+
+    @property
+    def last_search(self) -> Search:
+        """The latest search, also while it runs and after an interruption.
+
+        Raises:
+            RuntimeError: if there was none; :attr:`has_searched` tells.
+        """
+        if self._last_search is None:
+            raise RuntimeError(
+                "The planner has not searched yet. Write planner.plan(env.reset()) first."
+            )
+        return self._last_search
+
+    @last_search.setter
+    def last_search(self, search: Search | None) -> None:
+        self._last_search = search
+
+    @property
+    def has_searched(self) -> bool:
+        """True if there is a :attr:`last_search`."""
+        return self._last_search is not None
 
     def __getattr__(self, name: str) -> Any:
         if name in _PARTS:
@@ -269,6 +314,7 @@ class MCTSPlanner(TensorDictModuleBase):
         search = Search(num_roots, self.num_options, self.settings, capacity=capacity)
         search.seed(self._draw_seed() if seed is None else seed)
         self._plant(search, root, None)
+        search.tree.draw_map = getattr(self.simulator.given_env, "draw_map", None)
         self.last_search = search
         return search
 
@@ -409,6 +455,10 @@ class MCTSPlanner(TensorDictModuleBase):
     def choose(self, search: Search) -> np.ndarray:
         """Return the option to take in each root of a search, int64 ``[B]``."""
         return gumbel_choice(search) if self._gumbel_choice else self.final_choice.choose(search)
+
+    def _repr_html_(self) -> str:
+        tree = self._last_search.tree if self._last_search is not None else None
+        return notebook.shown(repr(self)) + (tree._repr_html_() if tree is not None else "")
 
     def __repr__(self) -> str:
         return (

@@ -18,7 +18,7 @@ from torchrl_hmcts.checks import instance, nested_keys, real_number, whole_numbe
 
 
 class NoveltyTest(Protocol):
-    """What a planner asks of a novelty test; write your own with these members.
+    """Protocol of a novelty test; write your own with these members.
 
     A method ``statistics() -> dict`` is optional: its counts join those of the search.
 
@@ -86,7 +86,7 @@ class _Counted:
 
     @property
     def num_refused(self) -> int:
-        """How many of the tests refused a state."""
+        """Number of the states that were refused."""
         return int(self._tally[0])
 
     def statistics(self) -> dict[str, int]:

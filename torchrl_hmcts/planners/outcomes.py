@@ -1,4 +1,4 @@
-"""What came of options, as arrays, and the refusal of what no search can use.
+"""Outcomes of options, as arrays, and the refusal of what no search can use.
 
 Letters: ``m`` outcomes of one wave, or roots; ``A`` options, ``F`` novelty features, ``K`` bytes.
 """
@@ -13,7 +13,7 @@ from torchrl_hmcts.planners.tree import LARGEST, MOST_BASE_STEPS
 
 
 class Outcomes(NamedTuple):
-    """What came of a wave's triples."""
+    """Outcomes of a wave's triples."""
 
     rewards: np.ndarray  # [m] float32, R
     discounts: np.ndarray  # [m] float32, D: gamma ** duration, 0 after a terminal state
@@ -27,7 +27,7 @@ class Outcomes(NamedTuple):
 
 
 class RootStates(NamedTuple):
-    """What is known of roots before they are searched."""
+    """Knowledge of roots before they are searched."""
 
     values: np.ndarray  # [m] float32
     done: np.ndarray  # [m] bool

@@ -5,11 +5,15 @@ Letters: *B batch of roots, L length of the longest plan.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from tensordict import TensorClass, TensorDictBase
 from torch import Tensor
 
+from torchrl_hmcts import notebook
+from torchrl_hmcts.planners.drawing import option_color
 from torchrl_hmcts.planners.search import Search
 from torchrl_hmcts.planners.tree import KeepsDocstring
 
@@ -40,6 +44,31 @@ class Plan(TensorClass, metaclass=KeepsDocstring):
     returns: Tensor
     durations: Tensor
     states: TensorDictBase
+
+    def __repr__(self) -> str:
+        if self.batch_size:
+            found = f"{int(self.found.sum())} of {self.found.numel()} found"
+            return f"Plan(batch_size={list(self.batch_size)}, {found})"
+        if not self.found:
+            return "Plan(found=False)"
+        options = self.options[: int(self.lengths)].tolist()
+        steps, value = int(self.durations), float(self.returns)
+        return f"Plan(options={options}, {steps} base steps, return {value:.4g})"
+
+    def _repr_html_(self) -> str:
+        if self.batch_size or not self.found:
+            return notebook.shown(repr(self))
+        options = self.options[: int(self.lengths)].tolist()
+        size = (0.4 * len(options) + 0.2, 0.5)
+
+        def draw(axes: Any) -> None:  # a box for each option
+            colors = [option_color(option) for option in options]
+            axes.barh(0, 1, left=range(len(options)), color=colors, edgecolor="white")
+            for i, option in enumerate(options):
+                axes.text(i + 0.5, 0, str(option), color="white", ha="center", va="center")
+            axes.set_axis_off()
+
+        return notebook.shown(repr(self), draw, figsize=size, layout=None)
 
 
 def extract_plans(search: Search) -> Plan:

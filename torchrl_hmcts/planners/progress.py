@@ -1,4 +1,4 @@
-"""What is told of a search while it runs."""
+"""Reports of a search while it runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchrl_hmcts.planners.search import Search
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """What a progress display is told after every wave.
+    """Report to a progress display after every wave.
 
     Attributes:
         num_roots (int): roots of the search.

@@ -31,7 +31,7 @@ from torchrl_hmcts.planners.tree_view import SearchTree
 
 
 class Wave:
-    """What to simulate next: take ``options[i]`` in node ``nodes[i]`` of root ``roots[i]``."""
+    """Triples to simulate next: take ``options[i]`` in node ``nodes[i]`` of root ``roots[i]``."""
 
     def __init__(self, records: np.ndarray, *, detached: bool = False) -> None:
         self.records = records  # [m] of tree.WAVE
@@ -93,6 +93,13 @@ class Search:
         self.rollouts: dict[int, np.random.Generator] = {}
         self._room = 1  # nodes of the largest tree, at most
         self._root_kernels.limit(self.tree.roots, NO_LIMIT)
+
+    def __repr__(self) -> str:
+        plans = int((self.best_node >= 0).sum())
+        return f"Search({self.tree!r}, plans of {plans} of {self.num_roots} roots)"
+
+    def _repr_html_(self) -> str:
+        return self.tree._repr_html_()
 
     def __getstate__(self) -> dict[str, Any]:  # a module can be neither copied nor sent
         return {**self.__dict__, "_kernels": None, "_root_kernels": None}
@@ -323,7 +330,7 @@ class Search:
 
     @property
     def revisits_exhausted(self) -> bool:
-        """Whether an exhausted root still spends its simulations on what it knows."""
+        """True if an exhausted root still spends its simulations on what it knows."""
         return self.settings.revisit and bool((self.roots["limit"] != NO_LIMIT).all())
 
     def allowed(self) -> np.ndarray:

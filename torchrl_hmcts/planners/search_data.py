@@ -1,4 +1,4 @@
-"""What a finished search teaches: states with the options and values it found for them.
+"""Examples from finished searches: states with the options and values it found for them.
 
 Letters: B roots, N nodes a root has room for, A options, K examples, r rewarded nodes.
 """
@@ -86,7 +86,7 @@ def search_examples(
 
     Args:
         search: as a planner's ``search(td)`` returns it.
-        roots: take all roots, whatever was found from them. Default True.
+        roots: take all roots, also those from which nothing was found. Default True.
         plans: take every node from which the tree holds a plan, those of the best plan among them.
             Default True.
         min_visits: take all expanded nodes visited so often, too. Default: none.

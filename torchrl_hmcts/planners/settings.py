@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from torchrl_hmcts.checks import instance, whole_number
+from torchrl_hmcts.checks import instance, no_class, whole_number
 from torchrl_hmcts.planners.budget import ProgressiveWidening, TreeRollout
 from torchrl_hmcts.planners.novelty import NoveltyTest
 from torchrl_hmcts.planners.transpositions import Transpositions
@@ -96,6 +96,8 @@ class SearchSettings:
                 f"A search needs waves_in_flight >= 1, with leaves_per_wave * waves_in_flight <= "
                 f"255; got waves_in_flight={waves}, leaves_per_wave={leaves}."
             )
+        for name in ("tree_policy", "novelty"):
+            no_class("A search", name, getattr(self, name))
         if not callable(self.tree_policy) and not isinstance(self.tree_policy, CompiledPolicy):
             raise TypeError(
                 f"A search needs a tree policy: UCT(), PUCT(), Gumbel(), TorchRLScore(...) or a "
@@ -108,7 +110,10 @@ class SearchSettings:
         ):
             instance("A search", name, getattr(self, name), kind, type(None))
         if self.novelty is not None and not hasattr(self.novelty, "accept"):
-            raise TypeError(f"novelty needs the members of NoveltyTest; got {self.novelty!r}.")
+            raise TypeError(
+                f"novelty needs the members of NoveltyTest; got {self.novelty!r}. Write "
+                f'novelty=RadiusNovelty("position", radius) or WidthNovelty("features").'
+            )
         if self.rollout is not None and (self.expand != "one" or self.is_gumbel):
             raise ValueError(
                 f"A TreeRollout continues from the one option that was simulated; got "
@@ -123,12 +128,12 @@ class SearchSettings:
 
     @property
     def is_gumbel(self) -> bool:
-        """Whether the search follows a schedule of simulations."""
+        """True if the search follows a schedule of simulations."""
         return isinstance(self.tree_policy, Gumbel)
 
     @property
     def revisit(self) -> bool:
-        """Whether descents land on what they know: chance never closes, Gumbel counts visits."""
+        """True if descents land on what they know: chance never closes, Gumbel counts visits."""
         return self.exhausted == "revisit" or self.chance is not None or self.is_gumbel
 
     def check_simulations(self, num_simulations: int | None) -> None:

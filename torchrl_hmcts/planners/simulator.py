@@ -103,6 +103,10 @@ class Simulator:
 
     def root(self, td: TensorDictBase) -> TensorDictBase:
         """Return the root states in one batch dimension, after checking them."""
+        if not isinstance(td, TensorDictBase):
+            what = type(td).__name__
+            how = "planner.plan(env.reset())" if isinstance(td, EnvBase) else "a TensorDict"
+            raise TypeError(f"MCTSPlanner plans from a state; got a {what}. Write {how}.")
         check_state(td, self.root_keys)
         flat: TensorDictBase = td.flatten() if len(td.batch_size) != 1 else td
         return flat
@@ -140,7 +144,7 @@ class Simulator:
         return self._completed(states, after)
 
     def send(self, states: TensorDictBase, options: np.ndarray) -> Any:
-        """Begin what :meth:`step` does; :meth:`receive` returns what comes of it, in any order."""
+        """Begin what :meth:`step` does; :meth:`receive` returns its outcome, in any order."""
         if not self.works_beside:
             return self.step(states, options)
         self._choose(states, options)

@@ -114,7 +114,7 @@ class Transpositions:
 
     @property
     def num_found(self) -> int:
-        """How many of the states that were looked up were known."""
+        """Number of the states that were looked up and known."""
         return int(self._tally[0])
 
     def statistics(self) -> dict[str, int]:

@@ -12,7 +12,7 @@ linked by ``sibling`` and ``Q`` is their mean, weighted by how often each was dr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -136,17 +136,19 @@ FORBIDDEN = 2  # the mask does not allow the option
 
 
 class KeepsDocstring(_TensorClassMeta):
-    """Metaclass of a ``TensorClass`` that keeps its docstring, as tensordict's own does not."""
+    """Metaclass of a ``TensorClass`` that keeps its docstring and repr; tensordict's does not."""
 
     def __new__(mcs, name: str, bases: Any, namespace: dict[str, Any], **kwargs: Any) -> Any:
         cls = super().__new__(mcs, name, bases, namespace, **kwargs)
-        if "__doc__" in namespace:
-            cls.__doc__ = namespace["__doc__"]
+        for kept in {"__doc__", "__repr__"} & set(namespace):
+            setattr(cls, kept, namespace[kept])
         return cls
 
 
 class TreeArrays:
     """The arrays of a :class:`SearchTree`, without its views."""
+
+    draw_map: Callable[[Any, TensorDictBase], None] | None = None  # of the env that is searched
 
     def __init__(self, num_roots: int, num_options: int, capacity: int = 64) -> None:
         self.num_roots = whole_number("A search", "num_roots", num_roots)
@@ -167,7 +169,7 @@ class TreeArrays:
         self._flat: tuple[TensorDictBase, dict[NestedKey, Any]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:  # a copy of the columns would not share memory
-        return {**self.__dict__, "_flat": None}
+        return {**self.__dict__, "_flat": None, "draw_map": None}
 
     @property
     def num_nodes(self) -> np.ndarray:

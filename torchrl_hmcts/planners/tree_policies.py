@@ -33,7 +33,7 @@ from torchrl_hmcts.planners.tree import (
 
 
 class NodeStatistics(TensorClass, metaclass=KeepsDocstring):
-    """What a tree policy may look at: the nodes where descents of a wave stand, ``[d]``.
+    """Statistics that a tree policy may read: the nodes where descents of a wave stand, ``[d]``.
 
     Visits include the options that are being simulated in the same wave. The value of an option
     that was never tried is 0; ``allowed`` says which ones may be chosen.

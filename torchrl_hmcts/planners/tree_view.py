@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorClass, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.planners import drawing, export
 from torchrl_hmcts.planners.tree import KeepsDocstring, TreeArrays
 
@@ -98,6 +99,14 @@ class SearchTree(TreeArrays):
     to_torchrl = export.to_torchrl
     plot = drawing.plot_tree
     plot_positions = drawing.plot_positions
+
+    def __repr__(self) -> str:
+        nodes = f"{int(self.num_nodes.sum()):,} nodes"
+        return f"SearchTree({nodes}, roots={self.num_roots}, options={self.num_options})"
+
+    def _repr_html_(self) -> str:
+        text = self.summary() if self.num_roots == 1 else repr(self)
+        return notebook.shown(text, lambda axes: self.plot(ax=axes, max_nodes=100), figsize=(8, 4))
 
     def view(self) -> TreeView:
         """Return the trees as tensors; nothing is copied."""

@@ -1,4 +1,4 @@
-"""How a check finds that a part breaks its contract, and says it.
+"""Frame of the checks: a part breaks its contract, and the error says how.
 
 Letters: *B batch of a tensordict, m rows.
 """

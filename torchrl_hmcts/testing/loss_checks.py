@@ -46,7 +46,7 @@ LOSS_CHECKS = (
 
 
 class MakeLoss(Protocol):
-    """What :func:`check_loss` asks of a function that makes a loss."""
+    """Protocol of a function that makes a loss, for :func:`check_loss`."""
 
     def __call__(self, name: Rename, **kwargs: Any) -> LossModule:
         """Return a loss whose networks read and write ``name(key)`` for every key.

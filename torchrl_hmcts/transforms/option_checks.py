@@ -1,4 +1,4 @@
-"""What an OptionTransform needs of the env below it and of its worker, found out when attached."""
+"""Checks of the env below an OptionTransform and of its worker, when it is attached."""
 
 from __future__ import annotations
 

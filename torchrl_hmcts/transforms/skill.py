@@ -39,7 +39,7 @@ class SkillTransform(EnvTransform):
 
     Since a new skill is drawn between two steps, stepping must go through
     ``env.step_and_maybe_reset`` or ``env.rollout`` (collectors do); a bare ``env.step`` followed by
-    ``step_mdp`` keeps the skill for ever. For the same reason the transform goes outside of
+    ``step_mdp`` always keeps the skill. For the same reason the transform goes outside of
     ``SerialEnv`` and ``ParallelEnv``.
 
     Args:

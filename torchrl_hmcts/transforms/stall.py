@@ -1,4 +1,4 @@
-"""How long an entry has not moved: the base steps an option is stuck."""
+"""Base steps for which an entry has not moved: an option is stuck."""
 
 from __future__ import annotations
 

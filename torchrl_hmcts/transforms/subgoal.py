@@ -24,7 +24,7 @@ from torchrl_hmcts.transforms.env_transform import EnvTransform, count_spec
 
 @runtime_checkable
 class PlansGoals(Protocol):
-    """What :class:`SubgoalTransform` asks of a manager; a plain function of the same form will do.
+    """Protocol of a manager for :class:`SubgoalTransform`; a plain function will do, too.
 
     An attribute ``in_keys`` is optional: the entries the manager reads. With it only those are
     handed over.

@@ -38,7 +38,7 @@ _GRACE_SECONDS = 5.0
 
 @dataclass
 class LearnerSettings:
-    """What every learner needs to know; it travels to the processes by cloudpickle."""
+    """Settings of every learner; it travels to the processes by cloudpickle."""
 
     make_env: Callable[[], EnvBase]  # [*B]
     loss_module: LossModule  # a copy becomes the learner's own
@@ -124,7 +124,7 @@ class ActorLearner:
 
     @property
     def done(self) -> bool:
-        """Whether there is nothing left to do."""
+        """True if there is nothing left to do."""
         return bool(self.shared.stop[0]) or self.frames >= self.settings.total_frames
 
     def update(self) -> None:

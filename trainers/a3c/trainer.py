@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.processes import share
 from torchrl_hmcts.trainers.a3c.actor_learner import (
@@ -268,6 +269,13 @@ class A3CTrainer:
     def seconds(self) -> float:
         """Time spent in ``train()`` so far, that before a checkpoint included."""
         return self.log.seconds
+
+    def __repr__(self) -> str:
+        done = f"{self.frames:,} of {self.settings.total_frames:,} base steps"
+        return f"A3CTrainer({type(self.loss_module).__name__}, {done})"
+
+    def _repr_html_(self) -> str:
+        return notebook.shown(repr(self), lambda axes: notebook.draw_losses(axes, self.history))
 
     @property
     def history(self) -> dict[str, list[float]]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
-from torchrl_hmcts.trainers.command_line.words import parse_config, split_words
+from torchrl_hmcts.trainers.command_line.words import no_bare_words, parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import load_config, recognise
 from torchrl_hmcts.trainers.runs.config import home
 from torchrl_hmcts.trainers.saving.files import finite, left_out
@@ -26,6 +26,7 @@ def evaluate(words: Sequence[str]) -> int:
     """Test a run's newest checkpoint again and add the figures to its ``evaluation.json``."""
     with told("evaluate", *WRONG_WORDS):
         own, rest = split_words(words, ["run"])
+        no_bare_words(rest, "run")
         if "run" not in own:
             raise ValueError("say which run: run=DIR, the folder that a training wrote.")
         run = read_run(home(own["run"]))
@@ -38,12 +39,18 @@ def evaluate(words: Sequence[str]) -> int:
         for key in ("resume", "overwrite"):
             if key in changes:
                 raise ValueError(f"{key} is for hmcts train; an evaluation changes no run.")
-        function = experiment.evaluation
+        experiment.check_evaluation()
         changed.check_inputs()
     if is_locked(run.path):
         print(f"{run.path} is still running: its newest checkpoint is tested.", file=sys.stderr)
     with told("evaluate", ValueError), printing(own.get("log_level", "info")):
-        results = function(changed)
+        print(f"hmcts evaluate tests the newest checkpoint of {run.path}", flush=True)
+        function = experiment.evaluation  # loads torch
+        from torchrl_hmcts.trainers.runs.console import alive, figures_table
+
+        with alive():
+            results = function(changed)
+        print(figures_table(results))
     evaluation: dict[str, Any] = {
         "changes": changes,
         "results": results,
@@ -51,9 +58,12 @@ def evaluate(words: Sequence[str]) -> int:
         "versions": versions(),
         "machine": machine(),
     }
-    print(json.dumps(finite(results), indent=1))
+    written = False
     with left_out("evaluation.json"):
         print(f"Figures: {add_evaluation(run.path, evaluation)}")
+        written = True
+    if not written:
+        print(json.dumps(finite(results), indent=1))
     with left_out("index.html"):
         from torchrl_hmcts.trainers.figures.run_page import write_run_page
 

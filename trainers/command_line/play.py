@@ -63,10 +63,10 @@ def _write_page(agent: HMCTS, solution: Solution, folder: Path, seed: int) -> Pa
 
     pictures = Pictures(folder)
     pictures.captions["play.gif"] = "The episode."
-    drawing, search = agent.kit.map(agent.kit.make_env("test")), agent.planner.last_search
-    if drawing is not None and search is not None:
+    drawing = agent.kit.map(agent.kit.make_env("test"))
+    if drawing is not None and agent.planner.has_searched:
         with pictures.one("search.png", agent.kit.captions["search.png"]) as path:
-            plot_search(drawing, search, path)
+            plot_search(drawing, agent.planner.last_search, path)
     rows = [
         ("solved", solution.solved),
         ("reward", solution.reward),

@@ -9,7 +9,7 @@ from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, Failure, pr
 from torchrl_hmcts.trainers.command_line.words import folders_of, split_words
 from torchrl_hmcts.trainers.experiments.registry import recognise
 from torchrl_hmcts.trainers.runs.config import home
-from torchrl_hmcts.trainers.saving.run_folder import read_run
+from torchrl_hmcts.trainers.saving.run_folder import is_run, read_run
 
 _OWN = ("figure", "out", "results")
 
@@ -33,7 +33,7 @@ def _pages(own: dict[str, str], folders: list[str]) -> None:
             "say which runs, e.g. hmcts report runs/one (or several, to compare them), or which "
             "figure of the dissertation, e.g. figure=3.6 (all: hmcts list figures)."
         )
-    runs = [recognise(read_run(folder)) for folder in folders]
+    runs = [recognise(read_run(run)) for folder in folders for run in runs_in(folder)]
     if len(runs) > 1:
         from torchrl_hmcts.trainers.figures.comparison_page import write_comparison
 
@@ -45,6 +45,20 @@ def _pages(own: dict[str, str], folders: list[str]) -> None:
     if out is not None and not out.lower().endswith((".html", ".htm")):
         out = str(Path(out) / "index.html")
     print(f"Page: {write_run_page(runs[0], out)}")
+
+
+def runs_in(folder: str) -> list[str]:
+    """Return a folder of a run, or the runs that a folder holds.
+
+    Example:
+        >>> runs_in("runs/one")
+        ['runs/one']
+    """
+    if is_run(folder):
+        return [folder]
+    inside = sorted(path.parent for path in Path(folder).glob("*/run.json"))
+    inside += sorted(path.parent for path in Path(folder).glob("*/metrics.json"))
+    return [str(path) for path in dict.fromkeys(inside)] or [folder]
 
 
 def _figure(own: dict[str, str], folders: list[str]) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import os
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 from torchrl_hmcts.trainers.experiments.registry import Experiment
 from torchrl_hmcts.trainers.runs.config import ExperimentError
-from torchrl_hmcts.trainers.runs.run import open_run
+from torchrl_hmcts.trainers.runs.run import free_folder, open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled
 
@@ -109,20 +110,41 @@ def run_experiment(
     resume: list[str] = []  # how to continue, once there is a run
     try:
         with told(name, resume=resume), printing(log_level), signals_handled():
-            _ = experiment.function
+            announced = free_folder(config, experiment.name) if fresh else config.out
+            if announced != config.out:
+                print(f"{config.out} holds a run already; this one goes to {announced}.")
+            from torchrl_hmcts.trainers.runs.console import alive
+
+            print(_announcement(name, config, announced), flush=True)
+            _ = experiment.function  # loads torch
             with open_run(config, experiment=experiment.name, command=words, fresh=fresh) as run:
                 resume.append(run.resume_command)
-                if run.config.out != config.out:
-                    print(f"{config.out} holds a run already; this one goes to {run.config.out}.")
+                if run.config.out != announced:  # another run has just taken that folder
+                    print(f"{announced} holds a run already; this one goes to {run.config.out}.")
                 config = run.config
                 if config.resume and not run.resumes:
                     print("The run was stopped before its first checkpoint: it begins again.")
-                experiment(config)
+                with alive():
+                    experiment(config)
     except KeyboardInterrupt as error:
         how = f"{_saved(config.out)} Continue with: {resume[0]}" if resume else "nothing was begun."
         print(f"\nhmcts {name}: stopped. {how}", file=sys.stderr)
         return error.status if isinstance(error, Stopped) else 130
     return 0
+
+
+def _announcement(name: str, config: Any, out: str) -> str:
+    """Say what starts, where its files go, and how to watch it, before torch is loaded."""
+    logger = getattr(config, "logger", "csv")
+    watch = f"hmcts report {shlex.quote(out)}   (the page so far, from another terminal)"
+    if logger == "tensorboard":
+        watch = f"tensorboard --logdir {shlex.quote(out)}"
+    elif logger == "wandb" and os.environ.get("WANDB_MODE", "offline") != "online":
+        watch = f"W&B is offline: afterwards wandb sync {shlex.quote(out)}/wandb/offline-run-*"
+    elif logger == "wandb":
+        watch = "the page that wandb names below"
+    what = "continues" if config.resume else "starts"
+    return f"hmcts {name} {what}, seed {config.seed}\n  output  {out}\n  watch   {watch}"
 
 
 def _saved(out: str) -> str:

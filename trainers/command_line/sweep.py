@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
-from torchrl_hmcts.trainers.command_line.words import parse_config, split_words
+from torchrl_hmcts.trainers.command_line.words import no_bare_words, parse_config, split_words
 from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, find_experiment
 from torchrl_hmcts.trainers.runs.config import read_value
 from torchrl_hmcts.trainers.saving.files import left_out, write_json
@@ -24,6 +24,7 @@ def sweep(words: Sequence[str]) -> int:
     """Run trials until as many as asked for are finished, and write the page of the sweep."""
     with told("sweep", *WRONG_WORDS):
         own, rest = split_words(words, _OWN)
+        no_bare_words(rest)
         if "experiment" not in own:
             raise ValueError(
                 f"say which experiment, e.g. experiment={next(iter(EXPERIMENTS))} "
@@ -42,6 +43,7 @@ def sweep(words: Sequence[str]) -> int:
         objective = own.get("objective", experiment.objective)
         if not objective:
             raise ValueError("say what to improve, e.g. objective=test.solved.")
+        experiment.check_figure(objective.removeprefix("-"))
         prune = read_value("prune", own.get("prune", "true"), "bool")
         plan = Sweep(
             experiment.name,
@@ -55,7 +57,7 @@ def sweep(words: Sequence[str]) -> int:
         study = plan.study()  # before any trial: says what is wrong with storage or folder
     level = own.get("log_level", "info")
     line = ["hmcts", "sweep", *words]
-    # Optuna says what came of each trial; what the trials say is for those who ask for it.
+    # Optuna reports each trial; what the trials say is for those who ask for it.
     quiet = contextlib.redirect_stdout(io.StringIO())
     try:
         with (
@@ -78,8 +80,8 @@ def sweep(words: Sequence[str]) -> int:
 
 
 def _page(plan: Any, study: Any, line: Sequence[str]) -> str:
-    """Write what came of a sweep; return a sentence on the best trial."""
-    from torchrl_hmcts.trainers.figures.sweep_page import write_sweep_page
+    """Write the results of a sweep; return a sentence on the best trial."""
+    from torchrl_hmcts.trainers.figures.sweep_page import best_words, write_sweep_page
     from torchrl_hmcts.trainers.runs.sweep import importances, trial_rows
 
     rows, shares = trial_rows(study), importances(study)
@@ -100,7 +102,4 @@ def _page(plan: Any, study: Any, line: Sequence[str]) -> str:
         )
     if not rows or rows[0]["value"] is None:
         return f"No trial has finished. Page: {page}"
-    best = rows[0]
-    values = " ".join(f"{key}={value}" for key, value in best["params"].items())
-    name = plan.objective.removeprefix("-")
-    return f"Best of {len(rows)} trials: {name} = {best['value']:.6g} with {values}\nPage: {page}"
+    return f"{best_words(rows, plan.objective)}\nPage: {page}"

@@ -15,7 +15,12 @@ from torchrl_hmcts.trainers.command_line.running import (
     run_experiment,
     told,
 )
-from torchrl_hmcts.trainers.command_line.words import expand, parse_config, split_words
+from torchrl_hmcts.trainers.command_line.words import (
+    expand,
+    no_bare_words,
+    parse_config,
+    split_words,
+)
 from torchrl_hmcts.trainers.experiments.registry import (
     DEMO,
     EXPERIMENTS,
@@ -43,6 +48,7 @@ def train(words: Sequence[str]) -> int:
         own, rest = split_words(words, ["experiment", "kit"])
         many = "-m" in rest
         rest = [word for word in rest if word != "-m"]
+        no_bare_words(rest, "resume")
         resumed = [word.partition("=")[2] for word in rest if _names_folder(word)]
         if len(resumed) > 1:
             raise ValueError(f"one run at a time; got resume={resumed[0]} and {resumed[1]}.")

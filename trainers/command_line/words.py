@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from itertools import product
 from typing import Any
 
-from torchrl_hmcts.trainers.experiments.registry import Experiment
+from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, KITS, Experiment
 from torchrl_hmcts.trainers.runs.config import home, key_kinds, parse_overrides, unknown_key
 
 LOG_LEVELS = ("debug", "info", "warning", "error")
@@ -52,6 +54,7 @@ def parse_config(
         chosen = [word for word in chosen if word not in made]
     if not chosen:
         return config
+    print("Reading the parts ...", file=sys.stderr, flush=True)  # before torch is loaded
     first = [word for word in chosen if word.startswith("objective")]
     if 0 < len(first) < len(chosen):  # the default of the loss depends on it
         config = parse_config(experiment, first, config)
@@ -133,6 +136,36 @@ def split_words(words: Sequence[str], own: Sequence[str]) -> tuple[dict[str, str
     if level not in LOG_LEVELS:
         raise ValueError(f"log_level is one of {', '.join(LOG_LEVELS)}; got {level!r}.")
     return found, rest
+
+
+def no_bare_words(words: Sequence[str], folder: str = "") -> None:
+    """Refuse a word that lacks its key, and say with which key to write it.
+
+    Args:
+        words: of a command.
+        folder: key of a folder, e.g. ``"run"``.
+
+    Raises:
+        ValueError: if a word is the name of an experiment, of a kit, or a folder.
+
+    Example:
+        >>> no_bare_words(["labmaze"])
+        Traceback (most recent call last):
+        ...
+        ValueError: 'labmaze' is no key=value. Write experiment=labmaze.
+    """
+    for word in words:
+        if "=" in word:
+            continue
+        keys = {"experiment": word in EXPERIMENTS, "kit": word in KITS}
+        keys |= {folder: os.path.isdir(home(word))} if folder else {}
+        for key, fits in keys.items():
+            if fits:
+                raise ValueError(f"{word!r} is no key=value. Write {key}={word}.")
+        near = get_close_matches(word, [*EXPERIMENTS, *KITS], n=1, cutoff=0.7)
+        if near:
+            key = "experiment" if near[0] in EXPERIMENTS else "kit"
+            raise ValueError(f"{word!r} is no key=value. Did you mean {key}={near[0]}?")
 
 
 def folders_of(words: Sequence[str], own: Sequence[str]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -17,7 +16,6 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
-from tqdm import tqdm
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
@@ -34,6 +32,7 @@ from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
     make_tile_planner,
 )
 from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
@@ -86,7 +85,7 @@ def _run(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
         eval_interval=config.eval_interval,
         logger=logger,
         save_dir=run.checkpoints,
-        progress=lambda total: tqdm(total=total, desc="train", unit="step", disable=None),
+        progress=partial(console.Bar, desc="learn", unit="base steps"),
         seed=config.seed,
     )
     kept = [key for key in config.KEPT if key != "toy"]
@@ -94,17 +93,16 @@ def _run(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
     if run.resumes:
         trainer.load(run.checkpoints)
     name = "the worker of the goal-based agent" if _with_goals(config) else "A3C without goals"
-    print(f"Training {name}, {config.total_frames:,} base steps ...", flush=True)
+    console.say(f"Training {name}, {config.total_frames:,} base steps ...")
     begin = time.perf_counter()
     history = trainer.train()
     train_seconds = time.perf_counter() - begin
-    logger.close()
     save_worker(run.path, loss, trainer.frames)
     steps = {True: history["eval_frames"], False: history["frames"]}
     curves = {k: (steps[k.startswith("eval_")], values) for k, values in history.items()}
     run.write_curves(curves, "base_steps")
 
-    print(f"Testing in {config.test_mazes} mazes it has never seen ...", flush=True)
+    console.say(f"Testing in {config.test_mazes} mazes it has never seen ...")
     policy = loss.actor_network
     sampled = play_mazes(policy, tests, starts, seed=config.seed)
     greedy = play_mazes(policy, tests, starts, deterministic=True)
@@ -136,7 +134,9 @@ def _run(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
             )
         if _with_goals(config):
             _draw_episode(policy, tests, starts, greedy, pictures)
-    print(json.dumps({k: metrics[k] for k in ("train_seconds", "test", "test_greedy")}, indent=1))
+        logger.log_pictures(run.path, pictures.captions)
+    logger.close()
+    print(console.figures_table({k: metrics[k] for k in ("train_seconds", "test", "test_greedy")}))
     return metrics
 
 

@@ -11,7 +11,7 @@ from torchrl_hmcts.trainers.runs.config import ExperimentError
 
 @dataclass
 class GymConfig(SkillsConfig):
-    """What ``hmcts train kit=gym env.id=NAME`` does: the agent over the kit ``gym``.
+    """Keys of ``hmcts train kit=gym env.id=NAME``: the agent over the kit ``gym``.
 
     Example:
         >>> GymConfig(id="PointMaze_Large-v3").num_skills
@@ -26,7 +26,8 @@ class GymConfig(SkillsConfig):
     """Keywords of gymnasium.make: make.KEY=VALUE, e.g. make.maze_map=[[1,1],[1,1]]."""
     options: str = "learned"
     """"learned": the manager plans over skills; "actions": over primitive actions, each repeated;
-    "directions": the same, where actions lie within bounds."""
+    "directions": the same, where actions lie within bounds; "goals": over values that features are
+    brought to, of the features that actions control."""
     task: str = "auto"
     """"goal": plan until it is reached; "return": collect rewards, with a search before every
     option; "auto": found by a short look at the env."""
@@ -62,7 +63,7 @@ class GymConfig(SkillsConfig):
     LEAST = {"curve_points": 0, "option_steps": 0, "skill_steps": 0, "processes": 0}
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("updates_per_step",)
     CHOICES = SkillsConfig.CHOICES | {
-        "options": ("learned", "actions", "directions"),
+        "options": ("learned", "actions", "directions", "goals"),
         "task": ("auto", "goal", "return"),
         "keep": ("last",),
     }
@@ -92,7 +93,7 @@ class GymConfig(SkillsConfig):
 
 @dataclass
 class AntConfig(GymConfig):
-    """What ``hmcts train kit=ant env.id=NAME`` does: the kit ``gym`` where the robot is an ant.
+    """Keys of ``hmcts train kit=ant env.id=NAME``: the kit ``gym`` where the robot is an ant.
 
     Its defaults are what was chosen by hand for the ant mazes. Skills are learned by LSD on the
     displacement that a skill brings, without a reward of the env.

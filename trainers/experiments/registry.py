@@ -7,6 +7,7 @@ import importlib
 import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from fnmatch import fnmatch
 from typing import Any
 
 from torchrl_hmcts.trainers.runs.config import config_keys
@@ -28,6 +29,8 @@ class Experiment:
             minus before it, smaller is better. Default: none, the user has to name one.
         progress: logged value by which a sweep gives up trials early. Default: none.
         kit: its name in ``hmcts train kit=NAME``. Default: none.
+        figures: names of the figures that a run gives, nested ones joined by dots. Default:
+            unknown.
 
     Example:
         >>> find_experiment("waterworld_goals").config_class(seed=3).seed
@@ -42,6 +45,7 @@ class Experiment:
     objective: str = ""
     progress: str = ""
     kit: str = ""
+    figures: tuple[str, ...] = ()
 
     @property
     def config_class(self) -> Any:
@@ -50,25 +54,37 @@ class Experiment:
 
     @property
     def function(self) -> Callable[[Any], dict[str, Any]]:
-        """What runs it; loads torch and all that the experiment needs."""
+        """The function that runs it; loads torch and all that the experiment needs."""
         run: Callable[[Any], dict[str, Any]] = _load(self.run)
         return run
 
-    @property
-    def evaluation(self) -> Callable[[Any], dict[str, Any]]:
-        """What evaluates a run again.
-
-        Raises:
-            ValueError: if the experiment has nothing of the kind.
-        """
+    def check_evaluation(self) -> None:
+        """Raise a ValueError if runs of the experiment cannot be evaluated again."""
         if not self.evaluate:
             raise ValueError(
                 f"Runs of {self.name} cannot be evaluated again. Experiments whose runs can: "
                 + ", ".join(e.name for e in ALL_EXPERIMENTS.values() if e.evaluate)
                 + "."
             )
+
+    @property
+    def evaluation(self) -> Callable[[Any], dict[str, Any]]:
+        """The function that evaluates a run again.
+
+        Raises:
+            ValueError: if the experiment has nothing of the kind.
+        """
+        self.check_evaluation()
         evaluate: Callable[[Any], dict[str, Any]] = _load(self.evaluate)
         return evaluate
+
+    def check_figure(self, name: str) -> None:
+        """Raise a ValueError if runs of the experiment give no figure of that name."""
+        if self.figures and not any(fnmatch(name, known) for known in self.figures):
+            near = difflib.get_close_matches(name, self.figures, n=4, cutoff=0.3) or self.figures
+            raise ValueError(
+                f"Runs of {self.name} have no figure {name!r}. Did you mean: {', '.join(near)}?"
+            )
 
     def __call__(self, config: Any) -> dict[str, Any]:
         """Run the experiment; return its figures."""
@@ -84,6 +100,34 @@ class Experiment:
         return "\n".join(lines)
 
 
+def _spreads(part: str, *names: str) -> list[str]:
+    return [f"{part}.{name}.{of}" for name in names for of in ("mean", "median", "p95")]
+
+
+_LAB_FIGURES = (
+    *("train_seconds", "training_frames", "training_base_steps", "training_rounds"),
+    *("worker_training_frames", "training_cpu_seconds", "seconds", "wrong_model.*"),
+    *("test.mazes", "test.found", "test.solved", "test.frames_over_script"),
+    *("test.expansions_max", "test.second_searches", "test.size", "test.plan_cpu_seconds_batched"),
+    *_spreads("test", "frames", "script_frames", "plan_options", "expansions"),
+    *_spreads("test", "simulated_frames", "path_cells", "plan_cpu_seconds"),
+)
+_OF_MAZES = ("mazes", "solved", "solved_share")
+_OF_EPISODES = ("base_steps_mean", "base_steps_median", "base_steps_max", "base_steps_mean_all")
+_A3C_FIGURES = (
+    *("train_base_steps", "train_seconds"),
+    *(f"{part}.{n}" for part in ("test", "test_greedy") for n in (*_OF_MAZES, *_OF_EPISODES)),
+)
+_GOALS_FIGURES = (
+    *_A3C_FIGURES,
+    *("test.num_plans_mean", "test.num_goals_met_mean", "test.num_divergences_mean"),
+)
+_ATARI_FIGURES = (
+    *("score_max", "score_final", "score_mean", "frames", "base_steps", "option_steps", "c"),
+    *("frames_finding_options", "frames_tuning", "frames_per_decision"),
+    *("seconds", "seconds_of_this_part"),
+)
+
 _SKILLS = (".skills:run_skills", ".skills:evaluate_skills")
 _GOALS = (".goals:run_goals", ".goals:evaluate_goals", "test.solved_share", "eval_solved_share")
 
@@ -95,12 +139,14 @@ EXPERIMENTS = {
             "chapter 3's goal-based agent: tree search over tiles sets goals, A3C reaches them",
             ".settings:WaterworldGoalsConfig",
             *_GOALS,
+            figures=_GOALS_FIGURES,
         ),
         Experiment(
             "waterworld_a3c",
             "chapter 3's comparison: A3C alone on the same mazes, network and budget",
             ".settings:WaterworldA3CConfig",
             *_GOALS,
+            figures=_A3C_FIGURES,
         ),
         Experiment(
             "labmaze",
@@ -110,6 +156,7 @@ EXPERIMENTS = {
             objective="test.solved",
             progress="test_solved",
             kit="labmaze",
+            figures=_LAB_FIGURES,
         ),
         Experiment(
             "atari",
@@ -119,6 +166,7 @@ EXPERIMENTS = {
             ".atari.run:evaluate_atari",
             objective="score_max",
             kit="atari",
+            figures=_ATARI_FIGURES,
         ),
     )
 }

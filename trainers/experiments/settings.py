@@ -19,6 +19,9 @@ class SkillsConfig(RunConfig):
     ``objective``, ``loss``, ``trainer`` and ``planner`` hold what differs from the kit's own: by
     keyword, with ``"_component_"`` the path of a class where another one is chosen.
 
+    Raises:
+        ValueError: if a value is out of its range or does not fit the others.
+
     Example:
         >>> SkillsConfig(planner={"waves_in_flight": 2}).planner
         {'waves_in_flight': 2}
@@ -123,7 +126,7 @@ class SkillsConfig(RunConfig):
 
 @dataclass
 class DemoConfig(SkillsConfig):
-    """What ``hmcts demo`` does: the agent over the kit ``waterworld``.
+    """Keys of ``hmcts demo``: the agent over the kit ``waterworld``.
 
     Raises:
         ValueError: if a number is out of its range, or ``train_base_steps`` is no multiple of 64.
@@ -174,7 +177,7 @@ class DemoConfig(SkillsConfig):
 
 @dataclass
 class LabMazeConfig(SkillsConfig):
-    """What ``hmcts train experiment=labmaze`` does: the agent over the kit ``labmaze``.
+    """Keys of ``hmcts train experiment=labmaze``: the agent over the kit ``labmaze``.
 
     A frame is a 60th of a second of the game. A base step of the worker is ``frames_per_step``
     frames with one action.
@@ -285,7 +288,7 @@ class LabMazeConfig(SkillsConfig):
 
 @dataclass
 class WaterworldA3CConfig(RunConfig):
-    """What ``hmcts train experiment=waterworld_a3c`` does; each field is a key.
+    """Keys of ``hmcts train experiment=waterworld_a3c``.
 
     Example:
         >>> WaterworldA3CConfig(seed=1).total_frames
@@ -354,7 +357,7 @@ class WaterworldA3CConfig(RunConfig):
 
 @dataclass
 class WaterworldGoalsConfig(WaterworldA3CConfig):
-    """What ``hmcts train experiment=waterworld_goals`` does; each field is a key.
+    """Keys of ``hmcts train experiment=waterworld_goals``.
 
     Example:
         >>> WaterworldGoalsConfig().goal_divergence_threshold

@@ -16,7 +16,6 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
-from tqdm import tqdm
 
 from torchrl_hmcts.modules import (
     SkillDiscriminator,
@@ -40,6 +39,7 @@ from torchrl_hmcts.trainers.experiments.kits import (
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, SkillsConfig
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.trainers.parts import build, merged, named
+from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
@@ -80,15 +80,14 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
         save_dir=run.checkpoints,
         logger=logger,
         resume=run.resumes,
-        progress=lambda total: tqdm(
-            total=total if total < 2**31 - 1000 else None, desc="train", unit="step", disable=None
+        progress=partial(
+            console.Bar, desc="learn", unit=kit.unit.split()[-1], scale=config.frames_per_step
         ),
     )
-    logger.close()
     if learned.loss is not None:
         save_worker(run.path, learned.loss, learned.worker_step)
     train_seconds = time.perf_counter() - begin
-    trial = solve(kit, learned.worker, say=print)
+    trial = solve(kit, learned.worker, say=console.say)
     metrics: dict[str, Any] = {
         "seed": config.seed,
         "train_seconds": round(train_seconds, 2),
@@ -98,8 +97,10 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
     metrics["seconds"] = round(time.perf_counter() - begin, 2)
     run.write_curves(kit.curves(learned), kit.curve_steps)
     with run.finish(metrics, config, title=kit.title) as pictures:
-        print("Drawing ...", flush=True)
+        console.say("Drawing ...")
         kit.draw(pictures, learned, trial)
+        logger.log_pictures(run.path, pictures.captions)
+    logger.close()
     print(kit.table(metrics))
     return metrics
 
@@ -126,7 +127,7 @@ def evaluate_skills(config: SkillsConfig) -> dict[str, Any]:
         worker = SkillPolicy(loss.actor_network, deterministic=True)
     return {
         "checkpoint": checkpoint,
-        "test": kit.figures(solve(kit, worker)),
+        "test": kit.figures(solve(kit, worker, say=console.say)),
         **kit.extras(worker),
     }
 
@@ -147,13 +148,18 @@ def learn(
     Args:
         kit: whose env it learns in.
         save_dir: folder of the checkpoints. Default: none are written.
-        progress: makes a progress bar, e.g. ``tqdm.tqdm``.
+        progress: makes a progress bar, e.g. ``tqdm.tqdm``. Default: nothing is printed.
         logger: of TorchRL; gets the training's values and, as ``test_solved`` and ``test_frames``,
             those of the tests on the way. Default: none.
         resume: continue from the newest checkpoint in ``save_dir``.
 
     Reference:
         Dissertation, algorithm 3 and figures 4.6 to 4.10.
+
+    Example:
+        >>> from torchrl_hmcts.trainers import DemoConfig, make_kit
+        >>> learn(make_kit(DemoConfig(options="actions"))).steps  # given options need no training
+        0
     """
     config = kit.config
     begin = time.process_time()
@@ -163,7 +169,8 @@ def learn(
     if given is not None:
         return LearnedSkills(given, None, {}, RoundRecords(), 0, 0, 0, 0.0)
     frames = config.train_steps * config.frames_per_step
-    print(f"Learning {config.num_skills} skills in {frames:,} {kit.unit} ...", flush=True)
+    if progress is not None:
+        console.say(f"Learning {config.num_skills} skills in {frames:,} {kit.unit} ...")
     loss = make_loss(kit)
     common = {"save_dir": save_dir, "progress": progress, "logger": logger, "seed": config.seed}
     common |= {"total_frames": config.train_steps, **config.trainer}
@@ -411,26 +418,32 @@ def solve(
         kit: of the experiment.
         worker: executes the options.
         say: told what is done, e.g. ``print``. Default: nobody is.
+
+    Example:
+        >>> from torchrl_hmcts.trainers import DemoConfig, make_kit
+        >>> kit = make_kit(DemoConfig(options="actions", option_steps=20, mazes=2))
+        >>> solve(kit, kit.given_worker()).results.solved.tolist()
+        [True, True]
     """
     kit.prepare(worker)
     config = kit.config
     starts = kit.starts("test", config.mazes)
     planner = kit.make_planner(kit.make_simulator(worker))
-    say("Compiling the search (a moment; about half a minute the first time) ...", flush=True)
+    say("Compiling the search (a moment; about half a minute the first time) ...")
     begin = time.perf_counter()
     kit.make_planner(kit.make_simulator(worker)).plan(starts[:1])
     compile_seconds = time.perf_counter() - begin
-    say(f"Solving {config.mazes} {kit.start_name} ...", flush=True)
+    say(f"Solving {config.mazes} {kit.start_name} ...")
     cpu = time.process_time()
-    quiet = None if say is print else True
-    results = _solve(kit, worker, planner, starts, quiet)
+    shown = say is console.say
+    results = _solve(kit, worker, planner, starts, shown)
     again, other = np.flatnonzero(~results.found), kit.second_try()
     if other is None:
         again = again[:0]
     elif len(again):  # nothing has been executed there yet
         second_planner = other.make_planner(other.make_simulator(worker))
         some = starts[torch.from_numpy(again)]
-        second = _solve(other, worker, second_planner, some, quiet)
+        second = _solve(other, worker, second_planner, some, shown)
         results = with_second_search(results, again, second)
     seconds = time.process_time() - cpu
     return Trial(starts, planner, results, len(again), compile_seconds, seconds)
@@ -441,15 +454,20 @@ def _solve(
     worker: TensorDictModuleBase,
     planner: MCTSPlanner,
     starts: TensorDictBase,
-    quiet: bool | None,
+    shown: bool,
 ) -> Results:
     """Plan and act from a group of starts after the other."""
     real = kit.make_options(kit.make_env("test"), worker)
     parts: list[Results] = []
-    bar = tqdm(starts.split(kit.group), desc="plan and act", unit="group", disable=quiet)
-    for some in bar:
+    name = kit.start_name.split()[-1] if len(kit.start_name.split()) == 1 else "starts"
+    bar = console.Bar(len(starts), desc="solve", unit=name) if shown else None
+    for some in starts.split(kit.group):
         parts.append(kit.act(planner, real, some))
-        bar.set_postfix(solved=int(sum(part.solved.sum() for part in parts)))
+        if bar is not None:
+            bar.set_postfix(refresh=False, solved=int(sum(part.solved.sum() for part in parts)))
+            bar.update(len(some))
+    if bar is not None:
+        bar.close()
     return Results.concatenate(parts)
 
 
@@ -459,7 +477,7 @@ def with_second_search(first: Results, again: np.ndarray, second: Results) -> Re
     Args:
         first: of all starts.
         again: indices of those that were searched again.
-        second: what came of these.
+        second: the results of these.
     """
     columns = {k: v.copy() for k, v in vars(first).items()}
     for name in ("simulated_steps", "expansions", "simulations"):

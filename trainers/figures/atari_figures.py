@@ -37,7 +37,7 @@ def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: s
 def write_atari_gif(
     recorder: AtariOptionPool, options: Sequence[int], path: Path, *, real_steps: int = 450
 ) -> tuple[int, float]:
-    """Carry the options of an episode out once more and write what the screen shows."""
+    """Execute the options of an episode once more and write what the screen shows."""
     env = AtariRAMEnv(recorder.game, repeat_action_probability=0.0)
     pictures = []
     shown, score = 0, 0.0

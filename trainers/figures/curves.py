@@ -43,6 +43,22 @@ def common_steps(curves: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
     return common, np.stack([np.interp(common, steps, values) for steps, values in curves])
 
 
+def says_something(steps: Sequence[float], values: Sequence[float]) -> bool:
+    """Return whether a curve is worth a panel: it is neither constant nor a straight line.
+
+    Example:
+        >>> says_something([0, 1, 2], [5.0, 5.0, 5.0]), says_something([0, 1, 2], [0.0, 2.0, 1.0])
+        (False, True)
+    """
+    x, y = np.asarray(steps, float), np.asarray(values, float)
+    if len(x) < 2:
+        return False
+    if len(x) == 2:
+        return bool(np.ptp(y) > 0)
+    rest = y - np.polyval(np.polyfit(x, y, 1), x)
+    return bool(np.abs(rest).max() > 1e-6 * max(float(np.abs(y).max()), 1e-12))
+
+
 def draw_band(
     axes: Axes, curves: Sequence[Points], *, color: str, smooth: bool = False, **line: Any
 ) -> None:

@@ -12,11 +12,11 @@ from matplotlib.patches import Rectangle
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
-from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, TARGET_COLOR
+from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, TARGET_COLOR, draw_walls
 from torchrl_hmcts.planners import Search
 from torchrl_hmcts.planners.drawing import option_color
 from torchrl_hmcts.trainers.figures.animation import steps_to_show, write_gif
-from torchrl_hmcts.trainers.figures.maps import draw_walls, legend_below
+from torchrl_hmcts.trainers.figures.maps import legend_below
 from torchrl_hmcts.trainers.figures.pictures import save_figure
 
 _TRAIL_COLOR = (147, 178, 245)  # the player's blue, pale

@@ -22,13 +22,13 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.envs import LabMazeEnv, WaterworldMazeEnv, draw_first_person
+from torchrl_hmcts.envs.mazes.rendering import draw_goal, draw_walls
 from torchrl_hmcts.planners import Plan, Search
 from torchrl_hmcts.planners.drawing import OPTION_COLORS, option_color
 from torchrl_hmcts.trainers.figures.animation import steps_to_show, write_gif
 from torchrl_hmcts.trainers.figures.pictures import save_figure
 
 _MAX_NODES = 600  # of a tree in a picture
-_GOAL = "#16a34a"
 
 Path2D = tuple[np.ndarray, np.ndarray]
 """Points ``[P, 2]`` and the colours 0 to 255 of the lines between them, ``[P - 1, 3]``."""
@@ -74,9 +74,7 @@ class WaterworldMap:
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
         """Draw walls, and the target if the state has one."""
-        draw_walls(axes, self.env.mazes[int(state["maze_index"])])
-        if "target" in state.keys():
-            axes.plot(*state["target"].tolist(), "o", color=_GOAL, markersize=11)
+        self.env.draw_map(axes, state)
 
     def points(self, states: TensorDictBase) -> Tensor:
         """Return the positions."""
@@ -119,7 +117,7 @@ class LabMap:
         layout, maze = self.env.layout, int(state["maze_index"])
         draw_walls(axes, layout.walls[maze], north_up=True)
         if layout.goal[maze, 0] >= 0:
-            axes.plot(*(layout.goal[maze] / self.env.CELL), "o", color=_GOAL, markersize=9)
+            draw_goal(axes, layout.goal[maze] / self.env.CELL)
 
     def points(self, states: TensorDictBase) -> Tensor:
         """Return the positions, in cells."""
@@ -340,28 +338,6 @@ def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 
         above.set_axis_off()
         LabMap(env).background(below, TensorDict({"maze_index": torch.tensor(maze)}))
     save_figure(figure, path)
-
-
-def draw_walls(axes: Axes, walls: Any, *, north_up: bool = False, grid: bool = False) -> None:
-    """Draw walls as black squares, (x, y) in tiles."""
-    walls = np.asarray(walls)
-    height, width = walls.shape
-    axes.imshow(
-        np.where(walls, 0.12, 1.0),
-        cmap="gray",
-        vmin=0,
-        vmax=1,
-        extent=(0, width, 0, height) if north_up else (0, width, height, 0),
-        interpolation="nearest",
-    )
-    axes.set_xticks(range(width + 1) if grid else [], labels=[])
-    axes.set_yticks(range(height + 1) if grid else [], labels=[])
-    axes.tick_params(length=0)
-    if grid:
-        axes.grid(color="0.8", linewidth=0.8)
-        axes.set_axisbelow(False)
-    for spine in axes.spines.values():
-        spine.set_linewidth(2.5)
 
 
 def legend_below(figure: Figure, legend: Legend, *, ncols: int) -> None:

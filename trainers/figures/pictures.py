@@ -15,8 +15,8 @@ from torchrl_hmcts.trainers.saving.files import left_out, replacing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLORS = ("#1d4ed8", "#e66100", "#00798c", "#5d3a9b", "#d41159", "#8c6e00", "#5a5a5a")
-"""Of curves and groups of runs, in their order; the colour-blind can tell them apart."""
+COLORS = ("#7f10fd", "#ff8400", "#41687a", "#bf0d00", "#1caeff", "#6f031c", "#c49474")
+"""Of curves and groups of runs, in their order; apart for the colour-blind (test_palette.py)."""
 STAMP = {"Source": "torchrl_hmcts"}
 """Metadata of our PNGs, by which :func:`refuse_foreign` knows them."""
 PAGE_MARK = '<meta name="generator" content="torchrl_hmcts">'

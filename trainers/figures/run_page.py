@@ -23,6 +23,13 @@ from torchrl_hmcts.trainers.figures.pictures import Pictures, refuse_foreign
 from torchrl_hmcts.trainers.saving.files import left_out, write_json
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder, is_run, read_run, shown_path
 
+_LEADING = 4  # curves that a page leads with; the others are folded
+_DECIDING = (  # the first of these that a run has
+    *("solved", "eval_solved_share", "score", "discriminator_accuracy", "frames"),
+    *("eval_episode_steps", "state_coverage_total", "actor_loss", "loss_actor", "critic_loss"),
+    *("qvalue_loss_0", "loss_discriminator", "discriminator_loss", "episode_return"),
+)
+
 Keys = Mapping[str, tuple[Any, str]]
 """Default and meaning of each key of an experiment."""
 
@@ -102,12 +109,13 @@ def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
     """Return what stands on the page of a run."""
     panels = []
     with left_out("the curves of the page"):
-        from torchrl_hmcts.trainers.figures.curves import panel  # loads matplotlib
+        from torchrl_hmcts.trainers.figures.curves import panel, says_something  # loads matplotlib
 
+        told = {n: c for n, c in run.curves.items() if says_something(c.steps, c.values)}
+        rank = {name: i for i, name in enumerate(_DECIDING)}
         panels += [
             drawing(panel(name, [[(curve.steps, curve.values)]], curve.step_label), name)
-            for name, curve in run.curves.items()
-            if len(curve.steps) > 1
+            for name, curve in sorted(told.items(), key=lambda item: rank.get(item[0], len(rank)))
         ]
     files = run.pictures.items()
     facts = {**facts_of(run), "status": run.status}
@@ -122,7 +130,8 @@ def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
         ),
         Section("Figures", columns=result_tables(run.metrics)),
         Section("Evaluated again", inside=[_evaluation(e) for e in run.evaluations]),
-        Section("Curves", panels=panels),
+        Section("Curves", panels=panels[:_LEADING]),
+        Section("All other curves", panels=panels[_LEADING:], folded=True),
         Section("Config", tables=config_tables(run)),
         Section("Continue it with", code=resume),
         Section(

@@ -42,10 +42,7 @@ def write_sweep_page(
 
             evaluator = PedAnovaImportanceEvaluator()
             _save(path, plot_param_importances, study, evaluator=evaluator, target_name=name)
-    lead = "No trial has finished."
-    if best is not None:
-        values = " ".join(f"{key}={value}" for key, value in best["params"].items())
-        lead = f"Best: {name} = {best['value']:.6g} with {values}"
+    lead = "No trial has finished." if best is None else best_words(rows, objective)
     keys = list(dict.fromkeys(key for row in rows for key in row["params"]))
     cells = []
     for row in rows:
@@ -64,6 +61,29 @@ def write_sweep_page(
     ]
     write_sections(folder / "index.html", f"Sweep of {experiment}", sections)
     return folder / "index.html"
+
+
+def best_words(rows: Sequence[Mapping[str, Any]], objective: str) -> str:
+    """Say which trials of a sweep were best; several that are equal are all named.
+
+    Args:
+        rows: the trials, the best first.
+        objective: by which.
+
+    Example:
+        >>> rows = [{"trial": i, "value": v, "params": {"x": i}} for i, v in ((2, 9.0), (0, 9.0))]
+        >>> print(best_words(rows, "solved"))
+        Best of 2 trials: solved = 9, reached by 2 trials:
+          trial 2: x=2
+          trial 0: x=0
+    """
+    best = [row for row in rows if row["value"] == rows[0]["value"]]
+    values = [" ".join(f"{key}={v}" for key, v in row["params"].items()) for row in best]
+    lead = f"Best of {len(rows)} trials: {objective.removeprefix('-')} = {rows[0]['value']:.6g}"
+    if len(best) == 1:
+        return f"{lead} with {values[0]}"
+    lines = [f"  trial {row['trial']}: {text}" for row, text in zip(best, values, strict=True)]
+    return "\n".join([f"{lead}, reached by {len(best)} trials:", *lines])
 
 
 def _save(path: Path, draw: Callable[..., Any], study: Study, **options: Any) -> None:

@@ -27,7 +27,7 @@ _NUMBERS: Mapping[str, tuple[type, type, str]] = {  # plain type, all that count
 
 
 class ExperimentError(ValueError):
-    """What an experiment was asked for does not fit what is there; the message says it all."""
+    """An experiment was asked for what does not fit what is there; the message says it all."""
 
 
 @dataclass

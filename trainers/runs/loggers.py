@@ -1,4 +1,4 @@
-"""Where the values of a training go while it runs: CSV files always, others on request."""
+"""Loggers of a training while it runs: CSV files always, others on request."""
 
 from __future__ import annotations
 
@@ -56,13 +56,25 @@ class ScalarLoggers(Logger):
         """
         if not math.isfinite(value):
             return
-        self._each(lambda logger: logger.log_scalar(name, float(value), step=step))
+        self._each(lambda logger: logger.log_scalar(_grouped(logger, name), float(value), step))
         for observer in self.observers:
             observer(name, float(value), -1 if step is None else step)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Log a video where that is possible."""
         self._each(lambda logger: logger.log_video(name, video, step=step, **kwargs))
+
+    def log_pictures(self, folder: Path, captions: Mapping[str, str]) -> None:
+        """Log the pictures and films of a run's page where that is possible.
+
+        Args:
+            folder: of the run.
+            captions: by file, PNG or GIF.
+        """
+        for name, caption in captions.items():
+            path = folder / name
+            if path.is_file():
+                self._each(lambda logger, path=path, words=caption: _picture(logger, path, words))
 
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
         """Log the configuration."""
@@ -102,6 +114,33 @@ class ScalarLoggers(Logger):
 
     def __repr__(self) -> str:
         return f"ScalarLoggers({self.loggers})"
+
+
+def _grouped(logger: Logger, name: str) -> str:
+    """The name of a value: in a group where a page shows groups; files keep the plain name."""
+    if isinstance(logger, CSVLogger) or "/" in name:
+        return name
+    if name.startswith(("eval_", "test_")):
+        return f"eval/{name.partition('_')[2]}"
+    words = name.split("_")
+    return f"{'loss' if 'loss' in words else 'train'}/{name}"
+
+
+def _picture(logger: Logger, path: Path, caption: str) -> None:
+    tag, experiment = f"pictures/{path.stem}", logger.experiment
+    if type(logger).__name__ == "WandbLogger":
+        import wandb
+
+        film = path.suffix == ".gif"
+        kind = wandb.Video(str(path), format="gif") if film else wandb.Image(str(path))
+        experiment.log({tag: kind})
+    elif type(logger).__name__ == "TensorboardLogger":
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        # Its page shows all that a browser does, films included; the bytes go in as they are.
+        image = Summary.Image(colorspace=3, encoded_image_string=path.read_bytes())
+        value = Summary.Value(tag=tag, image=image)
+        experiment.file_writer.add_summary(Summary(value=[value]), 0)
 
 
 def _close(logger: Logger) -> None:
@@ -144,7 +183,8 @@ def make_logger(config: Any) -> ScalarLoggers:
         offline = os.environ.get("WANDB_MODE", "offline") != "online"
         loggers.append(WandbLogger(exp_name=out.name, offline=offline, save_dir=str(out)))
     made = ScalarLoggers(loggers, _OBSERVERS.get())
-    made.log_hparams({**asdict(config), "out": out.name})
+    keys = {**asdict(config), "out": out.name}  # TensorBoard takes no dicts
+    made.log_hparams({k: str(v) if isinstance(v, dict) else v for k, v in keys.items()})
     return made
 
 

@@ -132,7 +132,7 @@ def open_run(
 ) -> Iterator[Run]:
     """Take a folder for a run, and note in its ``run.json`` how what is done there ends.
 
-    Whatever can be refused is refused before anything is written: packages and inputs that are
+    All that can be refused is refused before anything is written: packages and inputs that are
     missing, a folder in use, one that holds a run (unless ``config`` says ``resume`` or
     ``overwrite``), a run with other settings to resume. A run that is open already, with this very
     configuration, stays the same run: the command line opens it for the function of an experiment.
@@ -202,6 +202,22 @@ def _take(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool
         except (FolderRefused, FolderInUse):
             if not fresh:
                 raise
+    raise AssertionError("names never end")
+
+
+def free_folder(config: Any, experiment: str) -> str:
+    """Return the first of ``out``, ``out_2``, ... in which a run loses nothing.
+
+    Args:
+        config: of the run.
+        experiment: its name.
+    """
+    for out in _names(config.out):
+        try:
+            _check_folder(dataclasses.replace(config, out=out), experiment)
+        except FolderRefused:
+            continue
+        return out
     raise AssertionError("names never end")
 
 

@@ -149,7 +149,7 @@ class Sweep:
 
     @property
     def folder(self) -> Path:
-        """Where the trials and what is noted of them go."""
+        """The folder of the trials and of what is noted of them."""
         return Path(self.config.out)
 
     def study(self) -> optuna.Study:

@@ -13,6 +13,7 @@ from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
@@ -129,6 +130,14 @@ class ResumableTrainer(Trainer):
             self.register_module("running_episodes", self._episodes)
             generators = GeneratorStates(env=collector.env, policy=collector.policy)
             self.register_module("generators", generators)
+
+    def __repr__(self) -> str:
+        total = "" if self.total_frames > 2**60 else f" of {self.total_frames:,}"
+        loss, name = type(self.loss_module).__name__, type(self).__name__
+        return f"{name}({loss}, {self.collected_frames:,}{total} base steps)"
+
+    def _repr_html_(self) -> str:
+        return notebook.shown(repr(self), lambda axes: notebook.draw_losses(axes, self.history))
 
     @property
     def history(self) -> dict[str, list[float]]:

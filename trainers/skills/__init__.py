@@ -1,3 +1,3 @@
-"""What the trainers of skills are made of: data, rounds, curves, coverage, control, growth."""
+"""Parts of the trainers of skills: data, rounds, curves, coverage, control, growth."""
 
 __all__: list[str] = []  # what is public is exported by torchrl_hmcts.trainers

@@ -6,10 +6,11 @@ Letters: S states, A actions, F features.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 
@@ -18,7 +19,7 @@ from torchrl_hmcts.planners.simulator import Simulator
 
 @dataclass(frozen=True)
 class Controllability:
-    r"""What the actions do to each feature.
+    r"""Effects of the actions on each feature.
 
     Attributes:
         effects: float64 ``[A, F]``, mean change of a feature by an action minus its mean change
@@ -82,6 +83,31 @@ class Controllability:
         order = np.argsort(-effect, kind="stable")
         found: np.ndarray = order[effect[order] > self.min_effect]
         return found
+
+
+def random_states(pool: Any, count: int, seed: int) -> TensorDictBase:
+    """Return states on the way of random options, of as many episodes as it takes.
+
+    Args:
+        pool: of options, e.g. an :class:`OptionPool`.
+        count: of the states.
+        seed: of the options.
+
+    Returns:
+        The states ``[count]``, without rewards and flags.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    states: list[TensorDictBase] = []
+    td = pool.reset(TensorDict(batch_size=[1]))
+    keys = [key for key in td.keys(True, True) if key not in pool.done_keys]
+    while len(states) < count:
+        option = torch.randint(pool.num_options, (1,), generator=generator)
+        td = pool.step(td.select(*keys).set("option", option))["next"]
+        if td["done"].any():
+            td = pool.reset(TensorDict(batch_size=[1]))
+        else:
+            states.append(td.select(*keys))
+    return torch.cat(states)  # type: ignore[call-overload,no-any-return]
 
 
 def probe_controllability(

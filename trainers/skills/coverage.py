@@ -1,4 +1,4 @@
-"""How much of the state space training has seen.
+"""The share of the state space that training has seen.
 
 Letters: n base steps of a batch, D size of the watched entry, C distinct cells.
 """

@@ -22,7 +22,7 @@ RECORDED = ("round", "training_steps", "solved", "found", "simulated_steps", "ex
 
 
 class RoundRecords:
-    """What each round of planning and acting cost, in the order in which they were played.
+    """Costs of each round of planning and acting, in the order in which they were played.
 
     Args:
         columns: int64 ``[rounds]``: ``round`` its number t; ``training_steps`` base steps its

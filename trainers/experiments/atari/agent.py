@@ -29,7 +29,7 @@ from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
 
 @dataclass(frozen=True)
 class AtariSearch:
-    """How the agent searches.
+    """Settings of the agent's search.
 
     Attributes:
         ratio: simulated base steps per base step of an option, after which no new leaf is selected;

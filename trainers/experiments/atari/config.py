@@ -10,7 +10,7 @@ from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_
 
 @dataclass
 class AtariConfig(RunConfig):
-    """What ``hmcts train experiment=atari`` does.
+    """Keys of ``hmcts train experiment=atari``.
 
     A base step is 4 frames of the game. All emulated frames count: real, simulated, and those spent
     on finding options.

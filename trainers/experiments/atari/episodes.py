@@ -22,6 +22,7 @@ from torchrl_hmcts.trainers.experiments.atari.memory import TrialMemory
 from torchrl_hmcts.trainers.experiments.atari.options import Options
 from torchrl_hmcts.trainers.experiments.atari.sources import make_source
 from torchrl_hmcts.trainers.experiments.atari.trials import Tuned, tune_search
+from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, read_state
 
@@ -223,7 +224,10 @@ class AtariRun:
             "decisions": agent.decisions,
         }
         self.scores.append(row)
-        print(f"episode {len(self.scores)}: {row}", flush=True)
+        console.note(
+            f"Episode {len(self.scores)}: score {agent.score:g} in {row['real_frames']:,} frames, "
+            f"{row['frames']:,} emulated so far"
+        )
         return self.num_frames
 
     # ---------------------------------------------------------------- results

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import torch
-from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, SerialEnv, SignTransform, TransformedEnv, UnaryTransform
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv, OptionWorker
@@ -116,18 +114,3 @@ class AtariKit:
         """
         seed = self.seed if episode is None else self.seed * 10_000 + episode
         return seed + (_STICKY_SEED if sticky else 0)
-
-
-def random_states(pool: AtariOptionPool, count: int, seed: int) -> TensorDictBase:
-    """Return states ``[count]`` on the way of random options, of several episodes."""
-    generator = torch.Generator().manual_seed(seed)
-    states: list[TensorDictBase] = []
-    td = pool.reset(TensorDict(batch_size=[1]))
-    while len(states) < count:
-        option = torch.randint(pool.num_options, (1,), generator=generator)
-        td = pool.step(td.select("emulator_state").set("option", option))["next"]
-        if td["done"].any():
-            td = pool.reset(TensorDict(batch_size=[1]))
-        else:
-            states.append(td.select("emulator_state", "ram", "observation"))
-    return torch.cat(states)  # type: ignore[call-overload,no-any-return]

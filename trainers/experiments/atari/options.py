@@ -82,7 +82,7 @@ class Options:
 
 
 class OptionSource(Protocol):
-    """What gives a game its options, e.g. a :class:`RuleSource` or one of your own."""
+    """Protocol of what gives a game its options, e.g. a :class:`RuleSource` or one of your own."""
 
     def find(self, kit: AtariKit) -> Options:
         """Return the options of a game."""
@@ -94,8 +94,7 @@ def plain_worker(worker: Any) -> dict[str, Any]:
     if isinstance(worker, RepeatActions):
         return {"kind": "repeat", "actions": list(worker.actions)}
     if isinstance(worker, FollowGoals):
-        rest = {"fire": worker.fire, "fire_probability": worker.fire_probability}
-        return {"kind": "goals", "goals": [asdict(goal) for goal in worker.goals], **rest}
+        return {"kind": "goals", "goals": [asdict(goal) for goal in worker.goals]}
     if isinstance(worker, SharedMLP):
         return {
             "kind": "network",
@@ -118,8 +117,10 @@ def load_worker(part: dict[str, Any]) -> OptionWorker:
     if kind == "repeat":
         return RepeatActions(part["actions"])
     if kind == "goals":
-        goals = [ByteGoal(**goal) for goal in part["goals"]]
-        return FollowGoals(goals, fire=part["fire"], fire_probability=part["fire_probability"])
+        worker = FollowGoals([ByteGoal(**goal) for goal in part["goals"]])
+        if part.get("fire") is None:
+            return worker
+        return OccasionalAction(worker, part["fire"], part["fire_probability"])  # of 0.9 and before
     if kind == "network":
         worker = SharedMLP(part["num_options"], part["num_actions"], hidden=part["hidden"])
         worker.weights.copy_(part["weights"])
@@ -146,6 +147,8 @@ def goals_of(worker: OptionWorker) -> list[ByteGoal | int]:
     """Return what each option of a rule worker is for: a goal, or the action it repeats."""
     if isinstance(worker, JoinedWorkers):
         return [goal for part in worker.workers for goal in goals_of(part)]
+    if isinstance(worker, OccasionalAction):
+        return goals_of(worker.worker)
     if isinstance(worker, FollowGoals):
         return list(worker.goals)
     if isinstance(worker, RepeatActions):

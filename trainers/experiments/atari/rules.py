@@ -14,12 +14,23 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.checks import real_number, whole_number
-from torchrl_hmcts.envs import ByteGoal, FollowGoals, JoinedWorkers, OptionWorker, RepeatActions
+from torchrl_hmcts.envs import (
+    ByteGoal,
+    FollowGoals,
+    JoinedWorkers,
+    OccasionalAction,
+    OptionWorker,
+    RepeatActions,
+)
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariSearch
-from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit, random_states
+from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 from torchrl_hmcts.trainers.experiments.atari.options import Options
 from torchrl_hmcts.trainers.experiments.atari.trials import play_trial
-from torchrl_hmcts.trainers.skills.controllability import Controllability, probe_controllability
+from torchrl_hmcts.trainers.skills.controllability import (
+    Controllability,
+    probe_controllability,
+    random_states,
+)
 
 CANDIDATES = ("best", "goals", "actions", "action_sets", "repeat")
 _HOLD_STEPS = 3  # for which an action is held in a probe
@@ -286,7 +297,10 @@ def make_goals(
                     goal = ByteGoal(c, b, offset, up[0], down[0], staying)
                     sign = "-" if offset < 0 else "+"
                     name = f"{c} -> {b} {sign} {abs(offset)}" + (" firing" if fires else "")
-                    rules.append(Rule(name, FollowGoals([goal], fire=fire)))
+                    worker = FollowGoals([goal])
+                    rules.append(
+                        Rule(name, worker if fire is None else OccasionalAction(worker, fire))
+                    )
     if len(rules) > settings.max_goals:  # evenly, so that every controllable byte is tried
         rows = np.linspace(0, len(rules) - 1, settings.max_goals).astype(int)
         rules = [rules[i] for i in rows.tolist()]

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun, load_run, trials_file
 from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP
 from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
 from torchrl_hmcts.trainers.saving.files import left_out, write_csv
@@ -58,10 +58,14 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
         title = f"{config.game} by planning over options, {config.protocol}"
         with folder.finish(metrics, title=title) as pictures:
             draw(run, pictures)
-    print(
-        f"{config.game}: {len(run.scores)} episodes, best {metrics['score_max']:g}, last "
-        f"{metrics['score_final']:g}, {run.num_frames:,} frames."
-    )
+    rows = [
+        ("game", config.game),
+        ("episodes", str(len(run.scores))),
+        ("best score", f"{metrics['score_max']:g}"),
+        ("last score", f"{metrics['score_final']:g}"),
+        ("emulated frames", f"{run.num_frames:,}"),
+    ]
+    print(console.table(rows))
     return metrics
 
 
@@ -78,7 +82,7 @@ def _play(run: AtariRun, folder: Run) -> None:
             path, state = load_run(folder.path)
             run.load_state_dict(state)
             rotation.continue_from(path)
-    with tqdm(total=run.config.frames, unit=" frames", unit_scale=True, disable=None) as bar:
+    with console.Bar(run.config.frames, desc="play", unit="frames") as bar:
         try:
             run.play(
                 lambda: rotation.save(checkpoint, step=run.num_frames),

@@ -15,13 +15,10 @@ from torch import Tensor
 from torchrl_hmcts.envs import OccasionalAction, OptionWorker, SharedMLP
 from torchrl_hmcts.modules import SkillMLP
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.atari.kit import (
-    FRAMES_PER_STEP,
-    AtariKit,
-    random_states,
-)
+from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP, AtariKit
 from torchrl_hmcts.trainers.experiments.atari.options import Options, Training
 from torchrl_hmcts.trainers.experiments.atari.rules import RuleSearch, RuleSource
+from torchrl_hmcts.trainers.skills.controllability import random_states
 
 SLOW: dict[str, Any] = {
     "critic_lr": 3e-4,

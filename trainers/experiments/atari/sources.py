@@ -1,4 +1,4 @@
-"""Where the agent's options come from: rules, or a network and how it was trained."""
+"""Sources of the agent's options: rules, or a network and how it was trained."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TrainedSource:
     with :math:`\mu_z` the option's own worker, in states on the way of random options of that
     worker, and in a second round of the network itself, labelled by the worker (DAgger). The
     network samples its actions, so that it keeps some noise, and takes FIRE in 5 % of its steps,
-    where a game has it: one that has forgotten it waits for ever where a game waits for it.
+    where a game has it: one that has forgotten it never starts a game that waits for it.
 
     ``"fine_tuned"`` trains a distilled network further by soft actor-critic, with the goals' reward
     of :class:`OptionGoals` plus the sign of the game's. The critics learn alone first, and the

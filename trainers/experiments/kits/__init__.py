@@ -53,7 +53,7 @@ Curve = tuple[Any, Sequence[float]]  # steps and values
 
 
 class Kit:
-    """What an experiment must know of an environment.
+    """Base class of kits: all that an experiment must know of an environment.
 
     A split is ``"train"``, ``"curve"`` (tried while it learns) or ``"test"``.
 

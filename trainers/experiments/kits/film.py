@@ -1,4 +1,4 @@
-"""What happens inside the options of a pool, base step by base step."""
+"""A film of the options of a pool, base step by base step."""
 
 from __future__ import annotations
 

@@ -34,6 +34,7 @@ from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, SearchBudget
 from torchrl_hmcts.trainers.evaluation import Results, spread
 from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
 from torchrl_hmcts.trainers.experiments.kits import Kit, Trial
+from torchrl_hmcts.trainers.experiments.kits.feature_goals import find_goals
 from torchrl_hmcts.trainers.experiments.kits.film import Film
 from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
@@ -251,9 +252,25 @@ class GymKit(Kit):
     def given_worker(self) -> TensorDictModuleBase | None:
         if self.config.options == "learned":
             return None
-        if self._moves:
+        if self._moves and self.config.options != "goals":
             space: Any = self.gym_env.action_space
             self._fixed = GridMoves(int(space.n))
+            self.config = dataclasses.replace(self.config, num_skills=self._fixed.num_options)
+            return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+        if self.config.options == "goals":
+            if self.look.discrete:
+                raise ValueError(
+                    f"options=goals brings a feature to a value between others; those of "
+                    f"{self.config.id} are kinds without an order. Use options=actions."
+                )
+            make = partial(make_task, self._env, self.look, False, self.config.make)
+            self._fixed = find_goals(
+                make,
+                self.look.features,
+                self.starts("train", 10),
+                option_steps=self.config.option_steps,
+                seed=self.config.seed,
+            )
             self.config = dataclasses.replace(self.config, num_skills=self._fixed.num_options)
             return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         actions = fixed_actions(self.gym_env.action_space)
@@ -341,7 +358,7 @@ class GymKit(Kit):
 
     @property
     def replans(self) -> bool:  # type: ignore[override]
-        """Whether it plans again after every option, rather than execute one plan."""
+        """True if it plans again after every option, rather than execute one plan."""
         return self.look.stochastic or self.look.kind == "return"
 
     def act(
@@ -371,7 +388,7 @@ class GymKit(Kit):
             self._fill(planner.final_choice, planner, start)
         results = self.act_by(policy, real, start)
         results.simulated_steps = np.array([pool.num_steps - before])
-        if planner.last_search is not None:
+        if planner.has_searched:
             results.plans = [extract_plans(planner.last_search)[0]]
         return results
 
@@ -451,7 +468,7 @@ class GymKit(Kit):
 
     @property
     def can_be_solved(self) -> bool:  # type: ignore[override]
-        """Whether there is a goal to reach, or a return that the env asks for."""
+        """True if there is a goal to reach, or a return that the env asks for."""
         return self.look.kind == "goal" or self.threshold is not None
 
     @cached_property

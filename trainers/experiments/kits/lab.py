@@ -28,6 +28,7 @@ from torchrl_hmcts.trainers.experiments.kits import Curve, Kit, LearnedSkills, T
 from torchrl_hmcts.trainers.experiments.kits.lab_script import ShortestPathScript
 from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.saving.files import replacing
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import (
@@ -252,7 +253,7 @@ class LabMazeKit(Kit):
         }
 
     def extras(self, worker: TensorDictModuleBase) -> dict[str, Any]:
-        print("Solving mazes whose clock and friction are not the model's ...", flush=True)
+        console.say("Solving mazes whose clock and friction are not the model's ...")
         robust = list(wrong_models(self.config.robust_error).items())[:2]
         return {"wrong_model": {k: self.solve_with_wrong_model(worker, **v) for k, v in robust}}
 

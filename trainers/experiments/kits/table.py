@@ -1,4 +1,4 @@
-"""What states of a small random env are worth, by what its simulator has shown so far."""
+"""Values of the states of a small random env, from what its simulator has shown so far."""
 
 from __future__ import annotations
 

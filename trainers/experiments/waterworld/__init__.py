@@ -1,3 +1,3 @@
-"""What the experiments in Waterworld's mazes are made of: envs, networks, tests, an expert."""
+"""Parts of the experiments in Waterworld's mazes: envs, networks, tests, an expert."""
 
 __all__: list[str] = []  # what is public is exported by torchrl_hmcts.trainers

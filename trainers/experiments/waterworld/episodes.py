@@ -22,7 +22,7 @@ from torchrl_hmcts.trainers.evaluation import spread
 
 @dataclass
 class MazeTest:
-    """What an agent did in test mazes, one episode each."""
+    """Results of an agent in test mazes, one episode each."""
 
     solved: Tensor  # bool [S], reached the target in time
     base_steps: Tensor  # int64 [S], length of the episode
@@ -73,7 +73,7 @@ def play_mazes(
             entry ``"start"`` (int64, from which of the starts).
 
     Returns:
-        What came of it.
+        Their results.
 
     Example:
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv

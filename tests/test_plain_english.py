@@ -1,0 +1,75 @@
+"""Pages and docstrings are in plain English: a list of mannerisms has a budget near zero."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MANNERISMS = re.compile(
+    r"\b(go(es|ing|ne)? on\b|went on\b|anew\b|carr(y|ies|ied|ying) (it |them |\w+ plans? )?out\b"
+    r"|whatever\b|said there|the source'?s?\b(?! (code|of options|text))|for ever\b|in earnest\b"
+    r"|what c[oa]mes? of\b|say where it|is the most that|thereof\b|upon\b)",
+    re.IGNORECASE,
+)
+FIRST = ("README.md", "docs/getting_started.md", "docs/index.md", "docs/glossary.md")
+PACKAGES = ("envs", "modules", "objectives", "planners", "testing", "trainers", "transforms")
+WORDS_A_MANNERISM = 2_000
+
+
+def found(text: str) -> list[str]:
+    return [match[0] for match in MANNERISMS.finditer(text)]
+
+
+def docstrings(folder: str) -> str:
+    parts = []
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+                parts.append(ast.get_docstring(node) or "")
+    return "\n".join(parts)
+
+
+@pytest.mark.parametrize("name", FIRST)
+def test_the_first_pages_have_no_mannerism(name: str) -> None:
+    assert found((ROOT / name).read_text(encoding="utf-8")) == []
+
+
+def test_all_pages_have_one_in_two_thousand_words_at_most() -> None:
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("docs/tutorials/*")]
+    text = "\n".join(p.read_text(encoding="utf-8") for p in pages if "auto_" not in str(p))
+    assert len(found(text)) * WORDS_A_MANNERISM <= len(text.split()), found(text)
+
+
+@pytest.mark.parametrize("folder", ["torchrl_hmcts", "envs", "trainers"])
+def test_docstrings_have_one_in_two_thousand_words_at_most(folder: str) -> None:
+    text = docstrings(folder)
+    assert len(found(text)) * WORDS_A_MANNERISM <= len(text.split()), found(text)
+
+
+def test_the_list_finds_what_it_names_and_spares_code() -> None:
+    said = "Carried out anew, it goes on whatever the source says."
+    assert len(found(said)) == 5
+    assert found("the source of options, the source code, carry the state") == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_public_docstrings_begin_with_a_noun_or_a_verb(package: str) -> None:
+    module = importlib.import_module(f"torchrl_hmcts.{package}")
+    wrong = []
+    for name in module.__all__:
+        value = getattr(module, name)
+        members = {name: value}
+        if inspect.isclass(value):
+            own = {k: v for k, v in vars(value).items() if not k.startswith("_")}
+            members |= {f"{name}.{k}": v for k, v in own.items()}
+        for full, member in members.items():
+            doc = inspect.getdoc(member) if callable(member) or isinstance(member, property) else ""
+            if re.match(r"(What|Where|How|Whether|Why)\b", doc or ""):
+                wrong.append(full)
+    assert not wrong
