@@ -164,7 +164,7 @@ def draw_skills(seed: int, path: Path) -> None:
         for option in range(pool.num_options):
             film.clear()
             pool.step(start.clone().set("option", torch.tensor([option])))
-            x, y = (np.array(film.points) - start["features"][0].numpy()).T
+            x, y, _ = (np.array(film.points) - start["features"][0].numpy()).T
             axes.plot(x, y, color=option_color(option // 2), label=f"skill {option // 2}")
         axes.set_title(name, fontsize=10, loc="left")
         axes.set_aspect("equal")
@@ -179,7 +179,7 @@ def draw_plan(agent: HMCTS, start: int, path: Path) -> None:
     figure = Figure(figsize=(8.4, 6.4), layout="constrained")
     axes = figure.subplots()
     begin = agent.start(start)
-    way = agent.kit.film(agent.worker, agent.planner, begin).states[0]["features"]
+    way = agent.kit.film(agent.worker, agent.planner, begin).states[0]["features"][:, :2]
     model, _ = find_physics(agent.kit.gym_env)
     for i in range(model.ngeom):
         geom = model.geom(i)
@@ -187,7 +187,7 @@ def draw_plan(agent: HMCTS, start: int, path: Path) -> None:
             corner, size = geom.pos[:2] - geom.size[:2], 2 * geom.size[:2]
             axes.add_patch(Rectangle(tuple(corner), *size, color="0.2"))
     tree: Any = agent.planner.last_search.tree  # type: ignore[union-attr]
-    places = tree.states["features"][0, : int(tree.num_nodes[0])]
+    places = tree.states["features"][0, : int(tree.num_nodes[0]), :2]
     axes.plot(*places.T.numpy(), ".", color="0.6", markersize=4, label="states the search held")
     axes.plot(*way.T.numpy(), color=option_color(0), label="executed", linewidth=2)
     goal = begin["desired_goal"][0].tolist()
