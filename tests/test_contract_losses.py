@@ -38,6 +38,7 @@ from torchrl_hmcts.objectives import (
     DIAYNLoss,
     DiscreteSkillSACLoss,
     ExpertIterationLoss,
+    GoalCloningLoss,
     IntraOptionQLoss,
     LSDEncoderLoss,
     METRAEncoderLoss,
@@ -104,6 +105,10 @@ def one_hot() -> TensorDict:
 
 def continuous() -> TensorDict:
     return transitions(torch.linspace(-0.8, 0.8, 2 * N).reshape(N, 2))
+
+
+def goals() -> TensorDict:
+    return continuous().set("goal", torch.linspace(-2.0, 3.0, 2 * N).reshape(N, 2))
 
 
 def segments(*, one_hot_action: bool = False) -> TensorDict:
@@ -264,6 +269,11 @@ def skill_prior(name: Callable, **kwargs: Any) -> SkillPriorLoss:
     return SkillPriorLoss(LearnedSkillPrior(Z, [0.3, -0.2, 0.0]), **kwargs)
 
 
+def goal_cloning(name: Callable, **kwargs: Any) -> GoalCloningLoss:
+    actor = TensorDictModule(nn.Linear(2, 2), [name("goal")], [name("action")])
+    return GoalCloningLoss(actor, **kwargs)
+
+
 @dataclass
 class Case:
     """A loss, data for it, and what is expected of it."""
@@ -328,6 +338,7 @@ CASES = {
         examples,
         {"loss_policy": ["network_params"], "loss_value": ["network_params"]},
     ),
+    "goal_cloning": Case(goal_cloning, goals, {"loss_actor": ["actor_network_params"]}),
     "skill_prior": Case(skill_prior, discrete, {"loss_skill_prior": ["prior."]}),
 }
 OBJECTIVES = ["discriminator", "metra", "lsd", "dads"]

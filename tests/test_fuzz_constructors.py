@@ -295,7 +295,8 @@ EXCLUDED = {  # why public names are not fuzzed here
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
     "SkillWorker GridView MujocoBatch HMCTS "
-    "AttributeSnapshot ReplaySnapshot SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
+    "LandmarkEnv LandmarkModel GoalCloningLoss AttributeSnapshot ReplaySnapshot SettableGymEnv "
+    "Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",
     "hands its arguments to SkillReward": "SkillRewardHook",
     "searches from any object": "ReferenceSearch",

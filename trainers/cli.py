@@ -114,6 +114,17 @@ writes  trial_0000/ ... (folders of runs), sweep.json, importances.png and index
         folder; the same command continues it, a trial that was stopped first, also where the folder
         was moved"""
 
+_DATA = f"""\
+Record the episodes of a dataset as OGBench's script does, with draws of our own.
+
+    hmcts data id=pointmaze-giant-stitch-v0                in data/ogbench/pointmaze-giant-stitch-v0
+    hmcts data id=pointmaze-giant-stitch-v0 seed=1 out=DIR episodes=100
+
+needs   the extra `gym`; about two minutes for a million steps
+writes  memory-mapped tensors (observation, action, done), which TorchRL's storages read
+
+  {LOG_LEVEL_HELP}"""
+
 _LIST = "List the experiments; the keys of one with their defaults and meaning; or the figures."
 
 _COMPLETION = """\
@@ -129,6 +140,7 @@ _VERBS = {
     "play": ("show an agent acting", _PLAY, "play:play"),
     "report": ("write the page of runs, or draw a figure", _REPORT, "report:report"),
     "sweep": ("search for good values of an experiment's keys", _SWEEP, "sweep:sweep"),
+    "data": ("record the episodes of an OGBench dataset", _DATA, "data:data"),
     "list": ("list experiments, their keys, or figures", _LIST, "listing:show"),
     "completion": (
         "print what makes Tab complete in a shell",

@@ -1,5 +1,6 @@
 """Networks of the worker: actors and critics conditioned on skills, and what tells skills apart."""
 
+from torchrl_hmcts.modules.landmarks import LandmarkEnv, LandmarkModel, find_jumps
 from torchrl_hmcts.modules.objective_networks import (
     SkillDiscriminator,
     SkillDynamics,
@@ -31,6 +32,8 @@ __all__ = [
     "ConcatSkillMLP",
     "FixedSkillPrior",
     "GrowingSkillPrior",
+    "LandmarkEnv",
+    "LandmarkModel",
     "LearnedSkillPrior",
     "LearnedTermination",
     "OptionMemory",
@@ -49,6 +52,7 @@ __all__ = [
     "StallTermination",
     "TerminationNetwork",
     "UnitSphere",
+    "find_jumps",
     "spread_skills",
 ]
 

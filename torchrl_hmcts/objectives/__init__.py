@@ -11,6 +11,7 @@ from torchrl_hmcts.objectives.discovery import (
     SkillDynamicsLoss,
 )
 from torchrl_hmcts.objectives.durations import use_durations
+from torchrl_hmcts.objectives.goal_cloning import GoalCloningLoss
 from torchrl_hmcts.objectives.option_critic import IntraOptionQLoss, OptionTerminationLoss
 from torchrl_hmcts.objectives.option_model_loss import OptionModelLoss
 from torchrl_hmcts.objectives.search_distillation import ExpertIterationLoss
@@ -23,6 +24,7 @@ __all__ = [
     "DIAYNLoss",
     "DiscreteSkillSACLoss",
     "ExpertIterationLoss",
+    "GoalCloningLoss",
     "IntraOptionQLoss",
     "LSDEncoderLoss",
     "METRAEncoderLoss",

@@ -8,13 +8,14 @@ from torchrl_hmcts.trainers.command_line.running import Failure
 from torchrl_hmcts.trainers.experiments.registry import ALL_EXPERIMENTS, DEMO, EXPERIMENTS, KITS
 from torchrl_hmcts.trainers.runs.config import key_kinds
 
-VERBS = ("demo", "train", "evaluate", "play", "report", "sweep", "list", "completion")
+VERBS = ("demo", "train", "evaluate", "play", "report", "sweep", "data", "list", "completion")
 _OWN = {
     "train": ["experiment=", "kit=", "resume=", "log_level="],
     "evaluate": ["run=", "log_level="],
     "play": ["run=", "seed=", "out="],
     "report": ["figure=", "out=", "results="],
     "sweep": ["experiment=", "trials=", "objective=", "storage=", "prune=", "out="],
+    "data": ["id=", "out=", "seed=", "episodes="],
     "list": [*ALL_EXPERIMENTS, "figures"],
 }
 _SCRIPT = """\

@@ -187,6 +187,15 @@ ANT = Experiment(
     objective="test.solved",
     kit="ant",
 )
+OGBENCH = Experiment(
+    "ogbench",
+    "OGBench's point mazes, offline: options and their model from recorded episodes",
+    ".ogbench.config:OGBenchConfig",
+    ".ogbench.run:run_ogbench",
+    ".ogbench.run:evaluate_ogbench",
+    objective="test.solved",
+    kit="ogbench",
+)
 DEMO = Experiment(
     "demo",
     "learn four skills and solve random mazes",
@@ -195,7 +204,13 @@ DEMO = Experiment(
     objective="solved",
     kit="waterworld",
 )
-ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS, "gym": GYM, "ant": ANT}
+ALL_EXPERIMENTS = {
+    "demo": DEMO,
+    **EXPERIMENTS,
+    "gym": GYM,
+    "ant": ANT,
+    "ogbench": OGBENCH,
+}
 """The experiments of ``hmcts train``, the demo and the gym kit: all that leave a run's folder."""
 KITS = {e.kit: e for e in ALL_EXPERIMENTS.values() if e.kit}
 """The experiments that ``hmcts train kit=NAME`` runs, by kit."""

@@ -1,4 +1,4 @@
-"""Means over seeds with bootstrap intervals; S seeds."""
+"""Means and shares with their intervals; S seeds."""
 
 from __future__ import annotations
 
@@ -46,3 +46,27 @@ def bootstrap(
     draws = np.random.default_rng(0).integers(len(sample), size=(_RESAMPLES, len(sample)))
     low, high = np.quantile(statistic(sample[draws]), [0.025, 0.975])
     return float(statistic(sample[None])[0]), float(low), float(high)
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    r"""Return the 95 % interval of a share, Wilson's.
+
+    .. math:: \frac{1}{1 + z^2 / n} \left(\hat p + \frac{z^2}{2n}
+        \pm z \sqrt{\frac{\hat p (1 - \hat p)}{n} + \frac{z^2}{4n^2}}\right), \qquad z = 1.96
+
+    Args:
+        successes: of the trials.
+        trials: n, 1 or more.
+
+    Reference:
+        Wilson, "Probable inference, the law of succession, and statistical inference", 1927.
+
+    Example:
+        >>> wilson(50, 50)
+        (0.9287, 1.0)
+    """
+    z, share = 1.959964, successes / trials
+    middle = share + z**2 / (2 * trials)
+    half = z * np.sqrt(share * (1 - share) / trials + (z / (2 * trials)) ** 2)
+    low, high = ((middle + sign * half) / (1 + z**2 / trials) for sign in (-1, 1))
+    return round(float(low), 4), round(float(high), 4)

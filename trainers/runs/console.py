@@ -13,7 +13,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from tqdm import tqdm
@@ -94,6 +94,23 @@ class Bar(tqdm):
         super().close()
         if _State.bar is self:
             _State.bar = None
+
+
+def counted(desc: str, unit: str) -> Callable[[Sequence[Any]], Iterator[Any]]:
+    """Return what goes through a sequence with a bar.
+
+    Args:
+        desc, unit: as of :class:`Bar`.
+    """
+
+    def through(steps: Sequence[Any]) -> Iterator[Any]:
+        bar = Bar(len(steps), desc=desc, unit=unit)
+        for step in steps:
+            yield step
+            bar.update()
+        bar.close()
+
+    return through
 
 
 def _quiet() -> bool:

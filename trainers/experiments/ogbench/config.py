@@ -1,0 +1,75 @@
+"""Configuration of the ``ogbench`` experiment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
+from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
+
+
+@dataclass
+class OGBenchConfig(RunConfig):
+    """What ``hmcts train kit=ogbench env.id=NAME`` does: learn from recorded episodes, then act.
+
+    The defaults were chosen on pointmaze-teleport-navigate, seed 0, and are the same everywhere.
+
+    Example:
+        >>> OGBenchConfig(id="pointmaze-giant-stitch-v0").episodes
+        50
+    """
+
+    id: str = "pointmaze-medium-navigate-v0"
+    """Name of OGBench's dataset: the maze, and how it was recorded (navigate or stitch)."""
+    data: str = ""
+    """Recorded episodes: a folder of `hmcts data`, or OGBench's own NAME.npz. Default:
+    data/ogbench/NAME, recorded there (minutes) if it is not yet."""
+    out: str = "runs/ogbench"
+    """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
+    num_places: int = 2
+    """Numbers of an observation, its first ones, that say where the agent is."""
+    radius: float = 1.5
+    """Least distance of two landmarks, in units of the maze, whose corridors are 4 wide."""
+    jump_factor: float = 10.0
+    """Median steps from which on a recorded step is a jump, whose outcomes are left to chance."""
+    goal_steps: int = 30
+    """Base steps by which a goal of the worker lies ahead, at most."""
+    progress_coeff: float = 2.0
+    """How much more the worker clones an action that led to the goal fast; 0: not at all."""
+    updates: int = 4_000
+    """Updates of the worker."""
+    batch_size: int = 512
+    """Transitions of an update."""
+    learning_rate: float = 1e-3
+    """Adam's, falling to 0 in a straight line."""
+    gamma: float = 0.9995
+    """Discount per base step. An episode has a thousand: what is less likely must not win by being
+    faster."""
+    simulations: int = 200
+    """Options that a search simulates before each option that is taken."""
+    episodes: int = 50
+    """Episodes of each of the five tasks."""
+
+    EXPERIMENT = "ogbench"
+    TOY = {"updates": 200, "episodes": 1}
+    KEPT = ("seed", "toy", "id", "data", "radius", "jump_factor", "goal_steps", "updates")
+    PATHS = ("out", "data")
+    ABOVE_ZERO = ("radius", "learning_rate", "jump_factor")
+    LEAST = {"progress_coeff": 0}
+
+    def check_inputs(self) -> None:
+        """Check that there is such a dataset, and OGBench.
+
+        Raises:
+            ExperimentError: if the name is unknown, or the recorded episodes are missing.
+            ModuleNotFoundError: if OGBench is not installed.
+        """
+        super().check_inputs()
+        try:
+            split_name(self.id)
+        except ValueError as error:
+            raise ExperimentError(str(error)) from None
+        need_package("ogbench")
+        if self.data and not Path(self.data).exists():
+            raise ExperimentError(f"data={self.data} does not exist; record it: hmcts data.")

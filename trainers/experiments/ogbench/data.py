@@ -1,0 +1,170 @@
+"""Recorded episodes: made as OGBench makes them, or read from its files.
+
+Letters: T recorded steps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.trainers.experiments.ogbench.names import Recipe, split_name
+
+Cell = tuple[int, int]
+_SIDES = ((-1, 0), (0, -1), (1, 0), (0, 1))
+
+
+def _identity(steps: Any) -> Any:
+    return steps
+
+
+def record(
+    name: str, *, seed: int = 0, episodes: int = 0, progress: Callable[[Any], Any] = _identity
+) -> TensorDict:
+    """Record a dataset as OGBench's script does; its draws are other ones.
+
+    An episode begins in a cell that is drawn from all. The point walks to the centre of the next
+    cell on the shortest way to a goal, with noise on every action. ``"navigate"`` draws a new goal
+    among crossings, corners and dead ends wherever one is reached; ``"stitch"`` has one goal, four
+    cells away.
+
+    Args:
+        name: of the dataset.
+        seed: of all draws.
+        episodes: how many. Default: as many as OGBench records for training.
+        progress: wraps the range of the episodes, e.g. ``tqdm``.
+
+    Returns:
+        ``"observation"`` and ``"action"``, float32 ``[T, 2]``, and ``"done"``, bool ``[T, 1]``: the
+        episode's last step.
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    recipe = split_name(name)
+    env = make_gym(recipe.env, terminate_at_goal=False, max_episode_steps=recipe.steps)
+    env.action_space.seed(seed)
+    env.reset(seed=seed)  # the draws of NumPy's global generator too
+    count = episodes or recipe.episodes
+    observations = np.empty((count * recipe.steps, 2), np.float32)
+    actions, ends = np.empty_like(observations), np.zeros((len(observations), 1), np.bool_)
+    at = 0
+    with env:  # its draws, for all episodes
+        oracle = _Oracle(env.unwrapped, recipe, np.random.default_rng(seed))
+        for _ in progress(range(count)):
+            for observation, action in oracle.episode(env):
+                observations[at], actions[at] = observation, action
+                at += 1
+            ends[at - 1] = True
+    parts = {"observation": observations, "action": actions, "done": ends}
+    return TensorDict({k: torch.from_numpy(v[:at]) for k, v in parts.items()}, [at])
+
+
+class _Oracle:
+    """Walks from cell to cell towards a goal."""
+
+    def __init__(self, env: Any, recipe: Recipe, draws: np.random.Generator) -> None:
+        self.env, self.recipe, self.draws = env, recipe, draws
+        free = env.maze_map == 0
+        self.cells = [(int(i), int(j)) for i, j in np.argwhere(free)]
+        self.corners = [cell for cell in self.cells if not _is_hallway(free, cell)]
+        self.steps = {cell: _steps_from(free, cell) for cell in self.cells}
+        self.centres: dict[tuple[Cell, Cell], np.ndarray] = {}
+
+    def episode(self, made: gymnasium.Env) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        env, recipe = self.env, self.recipe
+        begin, goal = self._draw(self.cells), self._draw(self.corners)
+        if recipe.kind == "stitch":
+            goal = self._draw([c for c in self.cells if self.steps[begin][c] == 4] or [begin])
+        options = {"task_info": {"init_ij": begin, "goal_ij": goal}}
+        observation, _ = made.reset(options=options)
+        over = False
+        while not over:
+            place = env.get_xy()
+            way = self.centre(env.xy_to_ij(place), env.xy_to_ij(env.cur_goal_xy)) - place
+            way = way / (np.linalg.norm(way) + 1e-6) + self.draws.normal(0, recipe.noise, 2)
+            action = np.clip(way, -1, 1)
+            after, _, terminated, truncated, info = made.step(action)
+            yield observation, action
+            observation, over = after, terminated or truncated
+            if info["success"] and recipe.kind == "navigate":
+                env.set_goal(self._draw(self.corners))
+
+    def _draw(self, cells: list[Cell]) -> Cell:
+        return cells[self.draws.integers(len(cells))]
+
+    def centre(self, here: Cell, goal: Cell) -> np.ndarray:
+        """The centre of the next cell on the shortest way."""
+        if (here, goal) not in self.centres:
+            left = self.steps[goal]
+            near = [(here[0] + i, here[1] + j) for i, j in _SIDES]
+            best = min((here, *(c for c in near if left[c] >= 0)), key=lambda c: left[c])
+            self.centres[here, goal] = np.array(self.env.ij_to_xy(best))
+        return self.centres[here, goal]
+
+
+def _is_hallway(free: np.ndarray, cell: Cell) -> bool:
+    """Whether a cell has nothing but two free sides, opposite ones."""
+    up, left, down, right = (bool(free[cell[0] + i, cell[1] + j]) for i, j in _SIDES)
+    return (up, left, down, right) in ((True, False, True, False), (False, True, False, True))
+
+
+def _steps_from(free: np.ndarray, cell: Cell) -> np.ndarray:
+    """Cells of the shortest way from a cell to each; -1: none."""
+    steps = np.full(free.shape, -1)
+    steps[cell], waiting = 0, deque([cell])
+    while waiting:
+        here = waiting.popleft()
+        for i, j in _SIDES:
+            near = (here[0] + i, here[1] + j)
+            if free[near] and steps[near] < 0:
+                steps[near] = steps[here] + 1
+                waiting.append(near)
+    return steps
+
+
+def load(path: str | Path) -> TensorDictBase:
+    """Read recorded episodes: a folder that :func:`save` wrote, or a file of OGBench's.
+
+    Args:
+        path: folder, or ``.npz``.
+
+    Returns:
+        As of :func:`record`.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+        ValueError: if it holds something else.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        found = TensorDict.load_memmap(path)
+        if not {"observation", "action", "done"} <= set(found.keys()):
+            raise ValueError(f"{path} holds no recorded episodes: {sorted(found.keys())}.")
+        return found
+    with np.load(path) as arrays:
+        names = {"observation": "observations", "action": "actions", "done": "terminals"}
+        if missing := sorted(set(names.values()) - set(arrays)):
+            raise ValueError(f"{path} is no file of OGBench's: it lacks {', '.join(missing)}.")
+        parts = {key: torch.from_numpy(np.asarray(arrays[name])) for key, name in names.items()}
+    ends = parts.pop("done").bool().reshape(-1, 1)
+    floats = {key: part.float() for key, part in parts.items()}
+    return TensorDict({**floats, "done": ends}, [len(ends)])
+
+
+def save(data: TensorDictBase, folder: str | Path) -> None:
+    """Write recorded episodes as memory-mapped tensors, which TorchRL's storages read.
+
+    Args:
+        data: of :func:`record`.
+        folder: made if absent.
+    """
+    data.memmap(folder)

@@ -1,0 +1,201 @@
+"""``hmcts train kit=ogbench``: learn from recorded episodes, then act in OGBench's five tasks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.objectives import GoalCloningLoss
+from torchrl_hmcts.trainers.evaluation import spread
+from torchrl_hmcts.trainers.experiments.ogbench.agent import (
+    LandmarkAgent,
+    fit_model,
+    learn,
+    make_worker,
+)
+from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
+from torchrl_hmcts.trainers.experiments.ogbench.data import load, record, save
+from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
+from torchrl_hmcts.trainers.figures.intervals import wilson
+from torchrl_hmcts.trainers.runs.console import counted
+from torchrl_hmcts.trainers.runs.run import open_run
+from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
+from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
+
+_FOLDER = Path("data") / "ogbench"
+_TASKS = 5
+
+
+def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
+    """Run ``hmcts train kit=ogbench env.id=NAME``; return its figures.
+
+    Args:
+        config: of the run.
+
+    Returns:
+        The figures. Nothing of the simulator's state is read: the agent sees what a step returns.
+
+    Reference:
+        Park et al., "OGBench: Benchmarking offline goal-conditioned RL", 2024, arXiv 2410.20092.
+    """
+    with open_run(config) as run:
+        config = run.config.sized()
+        torch.set_num_threads(1)
+        data = recorded(config)
+        begin = time.process_time()
+        if run.resumes:
+            loss, curves = _loss(data, config), {}
+            load_networks(loss, run.path)
+        else:
+            loss, curves = learn(data, config, progress=counted("learn", "updates"))
+            run.checkpoints.mkdir(exist_ok=True)
+            name = f"checkpoint-{config.updates:012d}.torchrl"
+            plain_checkpoint(loss_module=loss).save(run.checkpoints / name)
+        seconds = time.process_time() - begin
+        save_worker(run.path, loss, config.updates)
+        steps = curves.pop("updates", [])
+        run.write_curves({k: (steps, v) for k, v in curves.items()}, "updates")
+        agent = LandmarkAgent(fit_model(data, config), loss.actor_network, config)
+        episodes = play_tasks(agent, config, progress=counted("act", "episodes"))
+        metrics = {
+            "seed": config.seed,
+            "recorded_steps": len(data),
+            "landmarks": agent.model.num_landmarks,
+            "train_cpu_seconds": round(seconds, 1),
+            "test": summary(episodes),
+        }
+        with run.finish(metrics, config, title=f"Offline: {config.id}") as pictures:
+            words = "Landmarks and options (grey), places of jumps (red), an episode of each task."
+            with pictures.one("search.png", words) as path:
+                from torchrl_hmcts.trainers.figures.landmarks import plot_landmarks
+
+                plot_landmarks(
+                    agent.model, [e["places"] for e in episodes[:: config.episodes]], path
+                )
+    return metrics
+
+
+def evaluate_ogbench(config: OGBenchConfig) -> dict[str, Any]:
+    """Act again with what a run has learned.
+
+    Args:
+        config: of the run, whose folder is ``out``; changed keys change the test.
+    """
+    config = config.sized()
+    torch.set_num_threads(1)
+    data = recorded(config)
+    loss = _loss(data, config)
+    checkpoint = load_networks(loss, config.out)
+    agent = LandmarkAgent(fit_model(data, config), loss.actor_network, config)
+    return {"checkpoint": checkpoint.name, "test": summary(play_tasks(agent, config))}
+
+
+def _loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
+    worker = make_worker(data, config)
+    return GoalCloningLoss(worker, progress_coeff=config.progress_coeff).eval()
+
+
+def recorded(config: OGBenchConfig) -> TensorDictBase:
+    """Return the recorded episodes of a run; record them where there are none yet.
+
+    Args:
+        config: of the run.
+    """
+    path = Path(config.data) if config.data else _FOLDER / config.id
+    if not config.data and not path.exists():
+        print(f"Recording {config.id} in {path} ...", flush=True)
+        save(record(config.id, progress=counted("record", "episodes")), path)
+    return load(path)
+
+
+def play_tasks(
+    agent: LandmarkAgent,
+    config: OGBenchConfig,
+    *,
+    progress: Callable[[Any], Any] = iter,
+) -> list[dict[str, Any]]:
+    """Act in every episode of every task; an episode is drawn by its number and the run's seed.
+
+    Args:
+        agent: acts.
+        config: of the run.
+        progress: wraps the episodes.
+
+    Returns:
+        Of each episode ``task``, ``solved``, ``steps``, ``options``, ``cpu_seconds``,
+        ``plan_seconds`` (of each option) and ``places`` (``[steps + 1, 2]``).
+    """
+    env = make_gym(split_name(config.id).env)
+    numbers = [(task, i) for task in range(1, _TASKS + 1) for i in range(config.episodes)]
+    return [
+        {"task": task, **act_once(env, agent, task, (config.seed, task, number))}
+        for task, number in progress(numbers)
+    ]
+
+
+def act_once(
+    env: gymnasium.Env, agent: LandmarkAgent, task: int, seeds: Sequence[int]
+) -> dict[str, Any]:
+    """Act in one episode.
+
+    Args:
+        env: of OGBench, as :func:`make_gym` makes it.
+        agent: acts.
+        task: 1 to 5.
+        seeds: what start, goal and chance are drawn from.
+
+    Returns:
+        As of :func:`play_tasks`, for one episode.
+    """
+    seed = int(np.random.SeedSequence(seeds).generate_state(1)[0])
+    env.seed_globals(seed)  # type: ignore[attr-defined]
+    begin = time.process_time()
+    observation, info = env.reset(seed=seed, options={"task_id": task})
+    agent.begin(info["goal"])
+    places, plans, over, info = [observation[:2]], [], False, {"success": 0.0}
+    while not over:
+        options, before = agent.num_options, time.process_time()
+        action = agent.act(observation)
+        if agent.num_options > options:
+            plans.append(time.process_time() - before)
+        observation, _, terminated, truncated, info = env.step(action)
+        places.append(observation[:2])
+        over = terminated or truncated
+    return {
+        "solved": bool(info["success"]),
+        "steps": len(places) - 1,
+        "options": agent.num_options,
+        "cpu_seconds": time.process_time() - begin,
+        "plan_seconds": plans,
+        "places": np.array(places),
+    }
+
+
+def summary(episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of episodes: shares solved with 95 % intervals, steps and seconds.
+
+    Args:
+        episodes: of :func:`play_tasks`.
+    """
+    tasks = sorted({e["task"] for e in episodes})
+    by_task = [np.mean([e["solved"] for e in episodes if e["task"] == task]) for task in tasks]
+    solved = [e for e in episodes if e["solved"]]
+    plans = [seconds for e in episodes for seconds in e["plan_seconds"]]
+    return {
+        "episodes": len(episodes),
+        "solved": round(float(np.mean(by_task)), 4),
+        "solved_interval": wilson(len(solved), len(episodes)),
+        "solved_by_task": [round(float(share), 4) for share in by_task],
+        "steps": spread([e["steps"] for e in solved]),
+        "options": spread([e["options"] for e in solved]),
+        "plan_cpu_seconds": spread(plans),
+        "episode_cpu_seconds": spread([e["cpu_seconds"] for e in episodes]),
+    }

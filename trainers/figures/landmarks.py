@@ -1,0 +1,45 @@
+"""Landmarks of a learned option model, and the ways that an agent took over them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from torchrl_hmcts.modules import LandmarkModel
+from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
+
+_JUMP = "#bf0d00"
+
+
+def plot_landmarks(model: LandmarkModel, ways: Sequence[np.ndarray], path: Path) -> None:
+    """Draw landmarks and options, and a way for each task.
+
+    Args:
+        model: of places with two numbers.
+        ways: places ``[steps, 2]`` of each episode.
+        path: of the picture.
+    """
+    places = model.places.numpy()
+    starts, options = np.nonzero(model.targets.numpy() >= 0)
+    lines = places[np.stack([starts, model.targets.numpy()[starts, options]], 1)]
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    axes = figure.add_subplot()
+    axes.add_collection(LineCollection(list(lines), colors="#d4d8e0", linewidths=0.5, zorder=0))
+    jumps = model.is_jump.numpy()
+    axes.scatter(*places[~jumps].T, s=6, color="#71717a", zorder=1)
+    axes.scatter(*places[jumps].T, s=60, color=_JUMP, marker="*", zorder=3)
+    for task, (way, color) in enumerate(zip(ways, COLORS, strict=False), 1):
+        broken = np.linalg.norm(np.diff(way, axis=0), axis=1) > float(model.jump)
+        shown = np.insert(way, np.flatnonzero(broken) + 1, np.nan, axis=0)
+        axes.plot(*shown.T, color=color, linewidth=1.8, zorder=2)
+        axes.annotate(f"{task}", way[0], color=color, fontsize=13, fontweight="bold", zorder=4)
+        axes.scatter(*way[-1], s=40, color=color, marker="s", zorder=4)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x")
+    axes.set_ylabel("y")
+    axes.set_title("Number: where a task begins; square: where its episode ended", fontsize=10)
+    save_figure(figure, path)
