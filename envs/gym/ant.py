@@ -106,24 +106,24 @@ def goal_rings(env: gymnasium.Env, observation: Any) -> np.ndarray:
 
 
 class Turn(NamedTuple):
-    """A body or an action after 0 to 3 quarter turns: its number i is ``sign * x[index[q, i]]``."""
+    """A body or an action after 0 to 3 quarter turns: its number i is ``sign * x[source[q, i]]``."""
 
-    index: np.ndarray  # int64 [4, n]
+    source: np.ndarray  # int64 [4, n]
     sign: np.ndarray  # float32 [4, n]
 
     @classmethod
     def of(cls, quarter: np.ndarray) -> Turn:
         """Return the turns of a signed permutation ``[n, n]``, that of one quarter."""
         powers = np.stack([np.linalg.matrix_power(quarter, q) for q in range(4)])
-        index = np.abs(powers).argmax(-1)
-        sign = np.take_along_axis(powers, index[..., None], -1)[..., 0]
-        return cls(index, sign.astype(np.float32))
+        source = np.abs(powers).argmax(-1)
+        sign = np.take_along_axis(powers, source[..., None], -1)[..., 0]
+        return cls(source, sign.astype(np.float32))
 
     def __call__(self, x: np.ndarray, quarters: Any) -> np.ndarray:
         """Turn ``[*B, n]`` by ``[*B]`` quarters, or all by a number of them."""
         if isinstance(quarters, int):
-            return x[..., self.index[quarters]] * self.sign[quarters]
-        turned: np.ndarray = np.take_along_axis(x, self.index[quarters], -1)
+            return x[..., self.source[quarters]] * self.sign[quarters]
+        turned: np.ndarray = np.take_along_axis(x, self.source[quarters], -1)
         return turned * self.sign[quarters].astype(x.dtype)
 
 

@@ -107,9 +107,9 @@ class AntConfig(GymConfig):
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     num_skills: int = 3
     """Skills of the worker; each is taken as it is and after half a turn of the body."""
-    option_steps: int = 25
+    option_steps: int = 25  # type: ignore[misc]
     """Actions of an option, of 0.1 seconds; it ends sooner where the ant lies on its back."""
-    skill_steps: int = 100
+    skill_steps: int = 100  # type: ignore[misc]
     """Actions of a mini-episode in training."""
     novelty_radius: float = 3.0
     """Metres within which a state counts as visited."""

@@ -227,7 +227,7 @@ class AntKit(GymKit):
     def maker(self, name: Any) -> Any:
         config = self.config
         slow = isinstance(AntView(make_gym(name, **config.make)).task, RoboticsAntMaze)
-        self._gait = {
+        self._gait: dict[str, Any] = {
             "repeat": config.repeat or (2 if slow else 1),
             "strength": config.strength or (0.3 if slow else 1.0),
         }
