@@ -59,7 +59,9 @@ def make_agent(name: Any, kind: str, seed: int, *, untrained: bool = False) -> H
     if untrained:
         folder = RUNS / f"{kind}-{seed}-untrained"
         folder.mkdir(parents=True, exist_ok=True)
-        save_worker(folder, make_loss(HMCTS(first, kit="ant", seed=seed, **shape).kit), 0)
+        fresh = HMCTS(first, kit="ant", options="learned", seed=seed, **shape)
+        save_worker(folder, make_loss(fresh.kit), 0)
+        shape = {**shape, "expansions": 100}  # there will be no plan
     return HMCTS(name, kit="ant", seed=seed, worker=str(folder), **shape)
 
 

@@ -106,7 +106,7 @@ def goal_rings(env: gymnasium.Env, observation: Any) -> np.ndarray:
 
 
 class Turn(NamedTuple):
-    """A body or an action after 0 to 3 quarter turns: its number i is ``sign * x[source[q, i]]``."""
+    """Turns by 0 to 3 quarters: number i becomes ``sign[q, i] * x[source[q, i]]``."""
 
     source: np.ndarray  # int64 [4, n]
     sign: np.ndarray  # float32 [4, n]
