@@ -28,7 +28,7 @@ EPISODES = {
     "CartPole-v1": 10,
     "MountainCar-v0": 10,
     "Acrobot-v1": 10,
-    "LunarLander-v3": 5,
+    "LunarLander-v3": 10,
     "Taxi-v4": 10,
     "CliffWalking-v1": 10,
     "FrozenLake-v1": 100,

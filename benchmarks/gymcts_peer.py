@@ -10,7 +10,8 @@ Single actions, a search before every move, 10 seeds. What acts:
   terminates, so a truncation is told to it as a termination; its second wrapper resets the env
   without a seed, so its env resets to one seed.
 - ``ours, rollouts``: the same search, UCT and a random rollout to the end from each new node,
-  ``RolloutEvaluator``, eight leaves a wave.
+  ``RolloutEvaluator``, eight leaves a wave; two where seconds count, so that no wave takes longer
+  than they are.
 - ``ours, options``: actions repeated for some steps, whose rollouts stay in the tree,
   ``TreeRollout(20)``; at most as many simulations, each of which is one option. It stops at a plan.
 
@@ -22,6 +23,7 @@ Seconds are those of the processor.
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.metadata
 import json
 import os
@@ -44,7 +46,7 @@ class Task(NamedTuple):
     """An env, what is spent on a move, and what counts as solved."""
 
     keywords: dict[str, Any]
-    simulations: int | None  # a move; None: too slow to be tried
+    simulations: int  # a move
     seconds: float  # a move
     moves: int
     repeats: int  # steps of our options
@@ -60,11 +62,8 @@ TASKS: dict[str, Task] = {
     "CliffWalking-v1": Task({"max_episode_steps": 40}, 30, 0.05, 40, 1, lambda r: r > -40),
     "CartPole-v1": Task({"max_episode_steps": 100}, 10, 0.02, 100, 2, lambda r: r >= 100),
     "MiniGrid-Empty-5x5-v0": Task({}, 10, 0.1, 15, 2, positive),
-    "MiniGrid-FourRooms-v0": Task({}, None, 0.3, 12, 4, positive),
+    "MiniGrid-FourRooms-v0": Task({"max_steps": 50}, 10, 0.1, 50, 4, positive),
 }
-
-
-ROLLOUTS = {"FrozenLake-v1", "MiniGrid-Empty-5x5-v0"}  # elsewhere ours takes too long for a table
 
 
 class Counted(gymnasium.Wrapper):
@@ -99,7 +98,7 @@ def theirs(name: str, wrapper: Any, seed: int, seconds: float | None) -> dict[st
     while not agent.search_root_node.terminal and len(actions) < task.moves:
         root, until = agent.search_root_node, time.process_time() + (seconds or 0.0)
         while True:  # the first call of a root makes its children, which takes two
-            count = (task.simulations or 0) if seconds is None else 1 if root.children else 2
+            count = task.simulations if seconds is None else 1 if root.children else 2
             agent.vanilla_mcts_search(search_start_node=root, num_simulations=count)
             simulations += count
             if seconds is None or time.process_time() >= until:
@@ -122,14 +121,14 @@ def ours(name: str, options: bool, seed: int, seconds: float | None) -> dict[str
     torch.manual_seed(seed)
     actions = RepeatActions(int(make_gym(name, **task.keywords).action_space.n))
     settings: dict[str, Any] = {"max_steps": task.repeats if options else 1, "num_processes": 0}
-    model, real = (
-        OptionPool(name, actions, seed=seed, **settings, **task.keywords) for _ in range(2)
-    )
-    count = (task.simulations if seconds is None else 16) or 0
+    make = functools.partial(make_gym, name, **task.keywords)
+    model, real = (OptionPool(make, actions, seed=seed, **settings) for _ in range(2))
+    at_once = 16 if options else 2  # simulations between two looks at the clock
+    count = task.simulations if seconds is None else at_once
     planner = MCTSPlanner(
         model,
         expand="one",
-        leaves_per_wave=8,
+        leaves_per_wave=min(8, count),
         rollout=TreeRollout(20) if options else None,
         leaf_evaluator=None if options else RolloutEvaluator(max_options=task.moves),
         budget=SearchBudget(simulations=count, until_plan=options),
@@ -166,6 +165,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("ids", nargs="*", default=list(TASKS))
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--budgets", nargs="+", default=["simulations", "seconds"])
+    parser.add_argument("--players", nargs="*", help="default: all four")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -183,12 +184,10 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for name in args.ids:
         task = TASKS[name]
-        for seconds in (None, task.seconds):
-            if seconds is None and task.simulations is None:
-                continue
-            for player, play in players.items():
-                if player == "ours, rollouts" and name not in ROLLOUTS:
-                    continue
+        for budget in args.budgets:
+            seconds = task.seconds if budget == "seconds" else None
+            for player in args.players or players:
+                play = players[player]
                 runs = [play(name, seed, seconds) for seed in range(args.seeds)]
                 total = {key: sum(run[key] for run in runs) for key in runs[0]}
                 rows.append(

@@ -63,7 +63,7 @@ def test_three_batches_train_every_network_log_the_curves_and_store_what_is_read
     assert history["optim_steps"] == [3, 6, 9]
     (bar,) = bars
     assert (bar.total, bar.n, bar.closed) == (192, 192, True)
-    assert "discriminator_accuracy" in bar.figures
+    assert "accuracy" in bar.figures
     stored = trainer.replay_buffer.storage[:]
     assert len(stored) == 192
     assert ("next", "displacement") in stored.keys(True)

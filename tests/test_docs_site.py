@@ -28,6 +28,7 @@ RUN_ELSEWHERE = {
     "algorithms/a3c.md": "test_a3c_trainer.py",
     "algorithms/goal_based_agent.md": "test_goal_planning.py",
 }
+VERBS = {"demo", "train", "evaluate", "play", "report", "sweep", "data", "list", "completion"}
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
@@ -170,7 +171,7 @@ def commands() -> list[tuple[str, str]]:
 def test_every_command_of_the_pages_is_understood(page: str, command: str) -> None:
     pytest.importorskip("omegaconf")
     _, verb, *words = command.split()
-    assert verb in {"demo", "train", "evaluate", "play", "sweep", "report", "list"}
+    assert verb in VERBS
     if verb not in {"demo", "train"} or not words:  # the bare verb is a name, no command
         return
     own, keys = split_words(words, ["experiment", "kit"])

@@ -17,7 +17,13 @@ from torchrl_hmcts.envs import OptionPool, RepeatActions, SettableGymEnv
 from torchrl_hmcts.envs.gym.features import WithFeatures, whole_observation
 from torchrl_hmcts.envs.gym.snapshots import ReplaySnapshot, redraw
 from torchrl_hmcts.envs.gym.task import TaskEnv, fixed_actions, look_at
-from torchrl_hmcts.planners import HierarchicalPolicy, HighestValue, MCTSPlanner, SearchBudget
+from torchrl_hmcts.planners import (
+    HierarchicalPolicy,
+    HighestValue,
+    MCTSPlanner,
+    MostVisited,
+    SearchBudget,
+)
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import HMCTS, load_worker
 from torchrl_hmcts.trainers.cli import main
@@ -174,6 +180,16 @@ def test_rewards_are_collected_with_a_search_before_every_option() -> None:
     assert 1 + 2 + 3 + 4 + 5 + 6 + 7 + 8 + 9 < solution.reward <= 36 + 7 + 8 + 7 + 8
     with pytest.raises(ValueError, match=r"gymnasium\.register"):
         agent.save("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("name", "backup"), [("CartPole-v1", "mean"), ("Pendulum-v1", "max")], ids=str
+)
+def test_where_it_pays_to_live_on_the_mean_over_rollouts_counts(name: str, backup: str) -> None:
+    planner = HMCTS(name).planner
+    assert planner.backup == backup
+    chooses = MostVisited if backup == "mean" else HighestValue
+    assert isinstance(planner.final_choice, chooses)
 
 
 @pytest.mark.parametrize(("threshold", "solved"), [(20.0, True), (99.0, False)])

@@ -34,6 +34,7 @@ MAX_WHEEL_BYTES = 1_000_000
 EXTRAS = {
     "envs": ("atari", "gym"),
     "trainers": ("train", "atari", "scale", "wandb"),
+    "torchrl_hmcts/notebook.py": ("train",),
     "torchrl_hmcts/planners/drawing.py": ("train",),
 }
 

@@ -10,13 +10,22 @@ import pytest
 README = Path(__file__).parents[1] / "README.md"
 
 
-def test_every_python_block_of_the_readme_runs(capsys):
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:gymnasium_robotics")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # without a display
+@pytest.mark.filterwarnings("ignore:failed to load GLFW")
+def test_every_python_block_of_the_readme_runs(capsys, tmp_path, monkeypatch):
+    pytest.importorskip("gymnasium_robotics")
+    monkeypatch.chdir(tmp_path)  # it writes a film and a folder
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-    assert len(blocks) >= 2
+    assert len(blocks) >= 1
     namespace: dict = {}
     for block in blocks:
         exec(compile(block, str(README), "exec"), namespace)  # noqa: S102
-    assert "solved True" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Learning 4 skills in 9,984 base steps ..." in README.read_text()
+    assert "Learning 4 skills in 9,984 base steps ..." in said
+    assert "Solution(solved=True, reward=1.0" in said
+    assert (tmp_path / "maze.gif").stat().st_size > 1000
 
 
 def test_pictures_and_links_of_the_readme_exist():

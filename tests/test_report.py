@@ -42,7 +42,7 @@ def write_run(path: Path, seed: int = 0, *, finished: bool = True, **config: obj
         "status": "finished" if finished else "stopped",
     }
     (path / "run.json").write_text(json.dumps(record))
-    rows = [f"eval_solved_share,{t},{0.1 * seed + t / 4_000}" for t in (0, 2_000, 4_000)]
+    rows = [f"eval_solved_share,{t},{0.1 * seed + (t / 4_000) ** 2}" for t in (0, 2_000, 4_000)]
     (path / "curves.csv").write_text("name,frames,value\n" + "\n".join(rows) + "\n")
     if finished:
         test = {"solved": 10 + seed, "frames": {"mean": 100.0 + seed, "median": 90.0, "p95": 1.0}}
@@ -53,6 +53,22 @@ def write_run(path: Path, seed: int = 0, *, finished: bool = True, **config: obj
     captions = {"learning.png": "The test curve.", "episode.gif": "An episode."}
     (path / "page.json").write_text(json.dumps({"title": "A3C", "pictures": captions}))
     return path
+
+
+def test_a_page_leads_with_four_curves_and_leaves_straight_lines_out(tmp_path) -> None:
+    run = write_run(tmp_path / "one")
+    names = ("actor_loss", "alpha", "critic_loss", "entropy", "eval_solved_share", "grad_norm")
+    rows = [f"{name},{t},{t * t}" for name in names for t in (0, 1, 2)]
+    rows += [f"optim_steps,{t},{4 * t}" for t in (0, 1, 2)] + [f"lr,{t},0.1" for t in (0, 1, 2)]
+    (run / "curves.csv").write_text("name,frames,value\n" + "\n".join(rows) + "\n")
+    assert main(["report", str(run)]) == 0
+    page = (run / "index.html").read_text()
+    leading, _, folded = page.partition("All other curves")
+    drawn = [name for name in names if f'alt="{name}' in leading]
+    assert drawn == ["actor_loss", "alpha", "critic_loss", "eval_solved_share"]
+    assert 'alt="entropy' in folded
+    assert "optim_steps" not in page
+    assert 'alt="lr' not in page
 
 
 def sources(page: str) -> list[str]:

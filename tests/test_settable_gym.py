@@ -307,6 +307,7 @@ def test_attributes_that_are_changed_in_place_are_noticed_and_restored() -> None
         lambda: counts["left"].__setitem__(0, False),
         lambda: counts["grid"].__setitem__((0, 1), 2.0),
         lambda: env.shared.__setitem__(0, np.arange(3)),  # no longer the one of ``again``
+        lambda: vars(env.held).update(amounts=vars(env.held).pop("counts")),  # another name
         lambda: env.reset(seed=5),  # another state of the generator
         lambda: env.np_random.random(),
     ):

@@ -143,5 +143,5 @@ def test_solving_curves_are_drawn(tmp_path) -> None:
     plot_training({"from scratch": [curve, curve]}, panels, tmp_path / "a.png", title="two seeds")
     picture = iio.imread(tmp_path / "a.png")
     assert picture.shape[:2] == (506, 1210)
-    blue = (np.abs(picture[..., :3].astype(int) - (29, 78, 216)) < 12).all(-1)
-    assert blue.sum() > 500  # the curve is there
+    violet = (np.abs(picture[..., :3].astype(int) - (127, 16, 253)) < 12).all(-1)
+    assert violet.sum() > 500  # the curve is there

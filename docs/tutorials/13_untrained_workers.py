@@ -75,7 +75,7 @@ for row in json.loads(file.read_text())["rows"]:
 # ------------------
 #
 # - **It works for every seed.** With one seed the untrained skills reach everything, with another
-#   two of them are the same and half of the mazes stay unsolved.
+#   two of them are nearly the same and half of the mazes stay unsolved.
 # - **Less search.** A plan over trained skills costs a half to a tenth of the simulated steps.
 # - **It matters more where actions are far from motion.** In Waterworld an action is a thrust, and
 #   to repeat one is as good as a trained skill. In DeepMind Lab's maze, where a key turns the

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import io
-import marshal
 import pickle
 import struct
 import types
-from itertools import compress
-from operator import is_
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.generators import (
-    generator_memory,
-    generator_state,
-    set_generator_state,
-)
+from torchrl_hmcts.envs.gym.generators import generator_state, set_generator_state
+from torchrl_hmcts.envs.gym.marks import ATOMS, Seen, look_through
 from torchrl_hmcts.envs.gym.snapshots import (
     DEFAULT_CAP,
     KNOWN_WRAPPERS,
@@ -38,21 +32,9 @@ _FIXED_TYPES = (
     types.ModuleType,
     type,
 )
-_ATOMS: frozenset[type] = frozenset({int, float, str, bool, bytes, type(None)})
-_NO_OBJECTS = frozenset({*_ATOMS, list, dict, tuple, np.ndarray, np.dtype})
+_NO_OBJECTS = frozenset({*ATOMS, list, dict, tuple, np.ndarray, np.dtype})
 _FIXED, _PLAIN, _OTHER = range(3)
-
-
-class _Seen(NamedTuple):
-    """The attributes of a layer at the last look."""
-
-    names: tuple[str, ...]
-    read: list[bool]
-    values: list[Any]  # of those that are read
-    atoms: bytes  # names and values of those that nobody can change in place
-    arrays: list[np.ndarray]  # of numbers
-    others: list[Any]
-    memory: tuple[memoryview, ...] | None  # of the generator
+_REMEMBERED = 8  # states of attributes whose objects are kept
 
 
 class AttributeSnapshot(Snapshot):
@@ -86,7 +68,7 @@ class AttributeSnapshot(Snapshot):
         {"spec", "metadata", "_previous_data", "render_mode"}
         | {"_saved_kwargs", "_ezpickle_args", "_ezpickle_kwargs"}  # how the env was made
     )
-    plain_types: ClassVar[frozenset[type]] = _ATOMS
+    plain_types: ClassVar[frozenset[type]] = ATOMS
     head: ClassVar[int] = 1  # numbers before the clocks
     drawing_modules: ClassVar[tuple[str, ...]] = ("pygame", "matplotlib", "PIL", "cv2", "moviepy")
 
@@ -109,7 +91,8 @@ class AttributeSnapshot(Snapshot):
         self._kinds: list[dict[tuple[str, type], int]] = [{} for _ in self._layers]
         self._unchanged: bytes | None = None  # attributes of the env, if it took no step since
         self._known: tuple[Any, bytes] = None, b""  # a mark, and what it stands for
-        self._seen = [_Seen((), [], [], b"", [], [], ())] * len(self._layers)
+        self._seen: Seen | None = None
+        self._recent: dict[bytes, tuple[Seen, Any, list[Any], list[Any], list[Any]]] = {}
         content = self._pickled(learning=True)
         self._unpickled(content)  # a class that is not read is named now, not in a search
         self.width = _room_for(len(content), cap, env)
@@ -166,8 +149,26 @@ class AttributeSnapshot(Snapshot):
         if content != self._unchanged:
             mark, known = self._known
             if content != known or mark is None or self._mark() != mark:
-                self._load_attributes(content)
+                if not self._recalls(content):
+                    self._load_attributes(content)
             self._unchanged = content
+
+    def _recalls(self, content: bytes) -> bool:
+        """Sets the attributes to the objects that were read, if these have not changed since."""
+        if content not in self._recent:
+            return False
+        seen, mark, states, inner, lists = self._recent[content]
+        for layer, state in zip(self._layers, states, strict=True):
+            vars(layer).update(state)
+        for held, copied in zip(seen.dicts[len(states) :], inner, strict=True):
+            held.clear()
+            held.update(copied)
+        for items, copies in zip(seen.lists, lists, strict=True):
+            items[:] = copies
+        if not seen.still() or seen.contents() != mark:
+            return False
+        self._seen, self._known = seen, (mark, content)
+        return True
 
     def _load_attributes(self, content: bytes) -> None:
         """Sets the attributes of all layers."""
@@ -177,7 +178,7 @@ class AttributeSnapshot(Snapshot):
             now = vars(layer)
             if len(now) > len(plain) + len(other):
                 for name in [n for n in now if n not in plain and n not in other]:
-                    if self._kind(number, name, now[name]) != _FIXED:
+                    if self._is_state(number, name, now[name]):
                         del now[name]
             now.update(plain)
             now.update((name, value) for name, value in other.items() if value is not _KEPT)
@@ -195,12 +196,18 @@ class AttributeSnapshot(Snapshot):
 
     def _kind(self, layer: int, name: str, value: Any) -> int:
         """Whether an attribute is no state, a plain value, or anything else."""
-        if name == "_np_random" or name in self.skipped_attributes or self.is_fixed(value):
+        if name == "_np_random" or self.is_fixed(value):
+            kind = _FIXED
+        elif not self.is_read(self._layers[layer], name):
             kind = _FIXED
         else:
             kind = _PLAIN if type(value) in self.plain_types else _OTHER
         self._kinds[layer][name, type(value)] = kind
         return kind
+
+    def _is_state(self, layer: int, name: str, value: Any) -> bool:
+        kind = self._kinds[layer].get((name, type(value)))
+        return (self._kind(layer, name, value) if kind is None else kind) != _FIXED
 
     def _pickled(self, learning: bool = False) -> bytes:
         """The attributes of all layers; while learning, objects that are no state get numbers.
@@ -234,6 +241,13 @@ class AttributeSnapshot(Snapshot):
             except Exception as error:
                 raise SnapshotError(self._refusal(others, error)) from error
         self._known = mark, stream.getvalue()
+        if mark is not None and self._seen is not None:
+            if len(self._recent) == _REMEMBERED:
+                del self._recent[next(iter(self._recent))]
+            states = [a | b for a, b in zip(values, others, strict=True)]
+            inner = [*map(dict, self._seen.dicts[len(states) :])]
+            lists = [*map(list, self._seen.lists)]
+            self._recent[self._known[1]] = self._seen, mark, states, inner, lists
         return self._known[1]
 
     def _mark(self) -> Any:
@@ -241,75 +255,21 @@ class AttributeSnapshot(Snapshot):
 
         None where some are objects of which nothing is known.
         """
-        marks: list[Any] = []
-        shared: dict[int, int] = {}
-        try:
-            for number, layer in enumerate(self._layers):
-                own, seen = vars(layer), self._seen[number]
-                values = compress(own.values(), seen.read)
-                if tuple(own) != seen.names or not all(map(is_, values, seen.values)):
-                    seen = self._seen[number] = self._look(number, own)
-                marks.append(seen.atoms)
-                if seen.memory is None:
-                    marks.append(marshal.dumps(generator_state(own.get("_np_random")), 2))
-                else:
-                    marks += map(bytes, seen.memory)
-                for array in seen.arrays:
-                    marks += shared.setdefault(id(array), len(shared)), array.tobytes()
-                    marks += array.shape, array.dtype.char
-                if seen.others:  # the newest version that does not depend on references
-                    digests = [self._digest(value, shared) for value in seen.others]
-                    marks.append(marshal.dumps(digests, 2))
-        except (TypeError, ValueError):
-            return None
-        return marks
+        if self._seen is None or not self._seen.still():
+            names = [[self.is_read(layer, name) for name in vars(layer)] for layer in self._layers]
+            self._seen = look_through(
+                self._layers, names, self._is_state, self._index, self._packages
+            )
+        return None if self._seen is None else self._seen.contents()
 
-    def _look(self, number: int, own: dict[str, Any]) -> _Seen:
-        kinds = self._kinds[number]
-        atoms: list[Any] = []
-        arrays: list[Any] = []
-        others: list[Any] = []
-        names: list[Any] = []
-        for name, value in own.items():
-            kind = kinds.get((name, type(value)))
-            if kind is None:
-                kind = self._kind(number, name, value)
-            if kind == _FIXED:
-                continue
-            if type(value) in _ATOMS:
-                atoms.append((name, value))
-                continue
-            plain = type(value) is np.ndarray and value.dtype.kind not in "OV"
-            (arrays if plain else others).append(value)
-            names.append((name, plain))
-        mark = marshal.dumps([atoms, names], 2)
-        read = [name not in self.skipped_attributes for name in own]
-        values = [*compress(own.values(), read)]
-        generator = own.get("_np_random")
-        memory = () if generator is None else generator_memory(generator)
-        return _Seen(tuple(own), read, values, mark, arrays, others, memory)
+    def is_read(self, layer: Any, name: str) -> bool:
+        """Return whether an attribute may be state.
 
-    def _digest(self, value: Any, shared: dict[int, int]) -> Any:
-        """Stands for a value that may be changed in place; two names of one are not two."""
-        kind = type(value)
-        if kind in _ATOMS:
-            return value
-        number = self._index.get(id(value))
-        if number is not None:
-            return "fixed", number
-        number = shared.setdefault(id(value), len(shared))
-        if number < len(shared) - 1:
-            return "shared", number
-        if kind is np.ndarray or isinstance(value, np.generic):
-            if value.dtype.kind not in "OV":
-                return kind is np.ndarray, value.dtype.str, value.shape, value.tobytes()
-        elif kind is dict:
-            return ["dict", *[self._digest(x, shared) for item in value.items() for x in item]]
-        elif kind in (list, tuple):
-            return [kind.__name__, *[self._digest(x, shared) for x in value]]
-        elif kind.__module__.partition(".")[0] in self._packages and _is_open(kind):
-            return [kind.__qualname__, self._digest(vars(value), shared)]
-        raise TypeError
+        Args:
+            layer: whose it is.
+            name: of the attribute.
+        """
+        return name not in self.skipped_attributes
 
     def _refusal(self, values: list[dict[str, Any]], error: Exception) -> str:
         """Names the attribute that cannot be pickled."""
@@ -331,16 +291,6 @@ _NUMPY = frozenset(
     "__randomstate_ctor PCG64 MT19937 Philox SFC64 PCG64DXSM SeedSequence "
     "__pyx_unpickle_SeedSequence".split()
 )
-
-
-def _is_open(kind: Any) -> bool:
-    """Whether objects of a class have nothing but attributes by name."""
-    sizes = (kind.__basicsize__, kind.__dictoffset__)
-    return sizes == (_Open.__basicsize__, _Open.__dictoffset__)  # type: ignore[attr-defined]
-
-
-class _Open:
-    pass
 
 
 class _Kept:

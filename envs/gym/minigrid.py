@@ -175,7 +175,9 @@ class MiniGridSnapshot(AttributeSnapshot):
     def _forget(self) -> None:
         """Drops the reference of the last episode."""
         self._reference, self._cells, self._movable = b"", [], []
-        self._changes = _Changes([], [], b"")
+        self._changes, self._seen = _Changes([], [], b""), None
+        self._known = None, b""
+        self._recent.clear()
         for item in self._fixed[self._own_fixed :]:
             self._index.pop(id(item), None)
         del self._fixed[self._own_fixed :]
@@ -199,6 +201,7 @@ class MiniGridSnapshot(AttributeSnapshot):
         for item in things:
             self._index[id(item)] = len(self._fixed)
             self._fixed.append(item)
+        self._seen = None  # which knew them by what they hold
 
     def _number(self, item: Any) -> int | None:
         if item is None:

@@ -17,7 +17,12 @@ _DERIVED = (
     "actuator_length", "actuator_velocity",
 )  # fmt: skip
 _PROBE_STEPS = 12
-_NO_STATE = frozenset({"MujocoRenderer", "MujocoModelNames", "Maze"})  # names and maps of a model
+# What OGBench's arms write at the beginning of each step, before they read it.
+_REWRITTEN = frozenset(
+    {"_prev_qpos", "_prev_qvel", "_prev_ob_info", "_prev_button_states", "_target_effector_pose"}
+)
+# Names and maps of a model, and what OGBench's arm solves its equations in, from nothing each time.
+_NO_STATE = frozenset({"MujocoRenderer", "MujocoModelNames", "Maze", "DiffIKController"})
 
 
 class MujocoSnapshot(AttributeSnapshot):
@@ -75,41 +80,49 @@ class MujocoSnapshot(AttributeSnapshot):
             or super().is_fixed(value)
         )
 
+    def is_read(self, layer: Any, name: str) -> bool:
+        ours = type(layer).__module__.startswith("ogbench.manipspace")
+        return super().is_read(layer, name) and not (ours and name in _REWRITTEN)
+
     def read(self) -> np.ndarray:
         row = np.zeros(self.width, np.uint8)
-        native = row[: self._native].view(np.float64)
-        self._mj.mj_getState(self.model, self.data, native[: self._numbers], self._spec)
-        at = self._numbers
-        for view in self._views:
-            native[at : at + view.size] = view.ravel()
-            at += view.size
+        state = row[: 8 * self._numbers].view(np.float64)
+        self._mj.mj_getState(self.model, self.data, state, self._spec)
+        raw = row.data
+        for memory, begin, end in self._model_parts + self._parts:
+            raw[begin:end] = memory
         self._write(row[self._native :])
         return row
 
     def restore(self, row: np.ndarray) -> None:
-        native = row[: self._native].view(np.float64)
-        at = self._numbers
-        state = native[:at]
-        for view in self._views[: len(self._model_fields)]:
-            view[...] = native[at : at + view.size].reshape(view.shape)
-            at += view.size
+        state = row[: 8 * self._numbers].view(np.float64)
+        raw = row.data
+        for memory, begin, end in self._model_parts:
+            memory[:] = raw[begin:end]
         self._mj.mj_setState(self.model, self.data, state, self._spec)
         if self.forward:
             self._mj.mj_forward(self.model, self.data)
             self._mj.mj_setState(self.model, self.data, state, self._spec)
-        for view in self._views[len(self._model_fields) :]:
-            view[...] = native[at : at + view.size].reshape(view.shape)
-            at += view.size
+        for memory, begin, end in self._parts:
+            memory[:] = raw[begin:end]
         self._load(row[self._native :])
 
     # ------------------------------------------------------------------ what an env needs
 
     def _set_views(self) -> None:
-        fields = [getattr(self.model, name) for name in self._model_fields]
-        fields += [getattr(self.data, name) for name in self.derived]
-        self._views = [field for field in fields if field.size]
-        self._native = 8 * (self._numbers + sum(view.size for view in self._views))
+        self._native = 8 * self._numbers
+        self._model_parts = self._parts_of(self.model, self._model_fields)
+        self._parts = self._parts_of(self.data, self.derived)
         self.width = self._native + self._attributes
+
+    def _parts_of(self, owner: Any, names: tuple[str, ...]) -> list[tuple[memoryview, int, int]]:
+        """The memory of fields, and where in a row they are."""
+        parts = []
+        for field in [getattr(owner, name) for name in names]:
+            if field.size:
+                begin, self._native = self._native, self._native + field.nbytes
+                parts.append((memoryview(field).cast("B"), begin, self._native))
+        return parts
 
     def _choose(self, env: gymnasium.Env) -> None:
         """Takes the cheapest way of restoring after which the env repeats its steps to the bit."""

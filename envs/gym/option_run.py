@@ -135,16 +135,16 @@ class OptionRun(ABC):
             for step in range(1, self.max_steps + 1):
                 action = act(observation, option, generator)
                 observation, gained, terminated, truncated, _ = take(action)
-                work[0] += 1
-                reward += discount * gained
+                work[0] += 1  # a step of Atari adds to it as well
+                reward += discount * float(gained)
                 discount *= gamma
-                if step >= left:
-                    truncated = True
-                over = terminated or truncated
-                if over or (ends is not None and ends(observation, option, step)):
+                if terminated or truncated or step >= left:
+                    break
+                if ends is not None and ends(observation, option, step):
                     break
         if clock is not None:
             clock._elapsed_steps += step
+            truncated = truncated or step >= left
         slots["reward"][index] = reward
         slots["duration"][index] = step
         slots["terminated"][index], slots["truncated"][index] = terminated, truncated
@@ -259,6 +259,7 @@ class GymRun(OptionRun):
         observation = self.first_observation()
         self._paths = _paths(observation)
         self._single = self._paths == [()]
+        self._flat = [path[0] for path in self._paths] if all(map(_is_flat, self._paths)) else None
         leaves = [_leaf(observation, path) for path in self._paths]
         # A number, e.g. of a Discrete space, reaches the worker as a number.
         self._kinds = [None if isinstance(leaf, np.ndarray) else type(leaf) for leaf in leaves]
@@ -318,7 +319,11 @@ class GymRun(OptionRun):
         ]
         if not self._notes_actions:  # one note is enough
             self.snapshot.note_step(None)
-        return (values[0] if self._single else _nested(self._paths, values)), self._draws
+        if self._single:
+            return values[0], self._draws
+        if self._flat is not None:
+            return dict(zip(self._flat, values, strict=True)), self._draws
+        return _nested(self._paths, values), self._draws
 
     def _noted_step(self, action: Any) -> tuple[Any, Any, Any, Any, Any]:
         self.snapshot.note_step(action)
@@ -351,6 +356,10 @@ def _paths(observation: Any) -> list[tuple[str, ...]]:
     if not isinstance(observation, dict):
         return [()]
     return [(name, *path) for name, part in observation.items() for path in _paths(part)]
+
+
+def _is_flat(path: tuple[str, ...]) -> bool:
+    return len(path) == 1
 
 
 def _key(path: tuple[str, ...]) -> Any:

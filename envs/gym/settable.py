@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import pickle
 import random
 from collections.abc import Callable
 from typing import Any, Literal
@@ -51,7 +50,7 @@ class PrivateRandom(gymnasium.Wrapper):
     def seed_globals(self, seed: int) -> None:
         """Seed its own states of the global generators."""
         state = np.random.RandomState(seed % 2**32).get_state()
-        self._states: tuple[Any, Any] = state, random.Random(seed).getstate()
+        self._states: tuple[Any, Any] = _as_bytes(state), random.Random(seed).getstate()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -78,7 +77,9 @@ class PrivateRandom(gymnasium.Wrapper):
 
     def __exit__(self, *error: Any) -> Literal[False]:
         assert self._outside is not None
-        self._states = _global_states()
+        states = _global_states()
+        if states != self._states:  # the same object says at once that nothing was drawn
+            self._states = states
         _set_global_states(self._outside)
         self._outside = None
         return False
@@ -166,16 +167,22 @@ def _draws_globally(env: gymnasium.Env) -> bool:
             env.reset(seed=0)
     after = _global_states()
     _set_global_states(before)
-    return pickle.dumps(before) != pickle.dumps(after)
+    return before != after
 
 
 def _global_states() -> tuple[Any, Any]:
-    """The states of NumPy's and Python's global generators."""
-    return np.random.get_state(), random.getstate()
+    """The states of NumPy's and Python's global generators, of which nothing can be changed."""
+    return _as_bytes(np.random.get_state()), random.getstate()
+
+
+def _as_bytes(state: Any) -> tuple[Any, ...]:
+    kind, key, *rest = state
+    return kind, key.tobytes(), *rest
 
 
 def _set_global_states(states: tuple[Any, Any]) -> None:
-    np.random.set_state(states[0])
+    kind, key, *rest = states[0]
+    np.random.set_state((kind, np.frombuffer(key, np.uint32), *rest))
     random.setstate(states[1])
 
 

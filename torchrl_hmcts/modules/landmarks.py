@@ -180,7 +180,7 @@ class LandmarkModel(nn.Module):
 
     @property
     def has_chance(self) -> bool:
-        """Whether an option has more outcomes than one."""
+        """True if an option has more outcomes than one."""
         return bool((self.probabilities > 0.0).sum(-1).max() > 1)
 
     def values(self, goal: Tensor, gamma: float) -> Tensor:

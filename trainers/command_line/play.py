@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
-from torchrl_hmcts.trainers.command_line.words import split_words
+from torchrl_hmcts.trainers.command_line.words import no_bare_words, split_words
 from torchrl_hmcts.trainers.runs.config import home, read_value, unknown_key
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ def play(words: Sequence[str]) -> int:
     """Show an agent acting: in a window, on a page of its own, or in a film."""
     with told("play", *WRONG_WORDS):
         own, rest = split_words(words, _KEYS)
+        no_bare_words(rest, "run")
         if rest:
             raise ValueError(unknown_key(rest[0].partition("=")[0], [*_KEYS, "log_level"]))
         if "run" not in own:
@@ -31,21 +32,24 @@ def play(words: Sequence[str]) -> int:
         if out and Path(out).suffix not in (".gif", ".mp4"):
             raise ValueError(f"out is a film: FILE.mp4 or FILE.gif; got {out!r}.")
     with told("play", ValueError, FileNotFoundError), printing(own.get("log_level", "info")):
+        print(f"hmcts play shows the agent of {own['run']}", flush=True)
         from torchrl_hmcts.trainers.agent import HMCTS
+        from torchrl_hmcts.trainers.runs.console import alive
 
-        agent = HMCTS.load(home(own["run"]))
-        print(agent)
-        if out:
-            print(agent.play(seed, out=out))
-            print(f"Film: {out}")
-        elif _has_display() and hasattr(agent.config, "id"):
-            print(agent.play(seed))
-        else:
-            folder = Path(home(own["run"])) / "play"
-            folder.mkdir(exist_ok=True)
-            solution = agent.play(seed, out=folder / "play.gif")
-            print(solution)
-            print(f"Page: {_write_page(agent, solution, folder, seed)}")
+        with alive():
+            agent = HMCTS.load(home(own["run"]))
+            print(agent)
+            if out:
+                print(agent.play(seed, out=out))
+                print(f"Film: {out}")
+            elif _has_display() and hasattr(agent.config, "id"):
+                print(agent.play(seed))
+            else:
+                folder = Path(home(own["run"])) / "play"
+                folder.mkdir(exist_ok=True)
+                solution = agent.play(seed, out=folder / "play.gif")
+                print(solution)
+                print(f"Page: {_write_page(agent, solution, folder, seed)}")
     return 0
 
 

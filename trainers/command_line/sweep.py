@@ -57,6 +57,8 @@ def sweep(words: Sequence[str]) -> int:
         study = plan.study()  # before any trial: says what is wrong with storage or folder
     level = own.get("log_level", "info")
     line = ["hmcts", "sweep", *words]
+    from torchrl_hmcts.trainers.runs.console import alive
+
     # Optuna reports each trial; what the trials say is for those who ask for it.
     quiet = contextlib.redirect_stdout(io.StringIO())
     try:
@@ -64,6 +66,7 @@ def sweep(words: Sequence[str]) -> int:
             told("sweep", ValueError),
             signals_handled(),
             printing(level),
+            alive(),
             contextlib.nullcontext() if level == "debug" else quiet,
         ):
             study = plan.start(trials)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import numbers
 import os
 import shutil
 import sys
@@ -206,10 +207,12 @@ def _rows(figures: Mapping[str, Any], before: str) -> Iterator[tuple[str, str]]:
             yield from _rows(value, f"{before}{words}: ")
         elif isinstance(value, str):
             yield f"{before}{words}", value
-        elif isinstance(value, (int, float)) and math.isfinite(value):
-            shown = f"{value:,.4g}" if isinstance(value, float) and abs(value) < 1e4 else ""
+        elif isinstance(value, numbers.Real) and math.isfinite(value):
+            number = float(value)
+            exact = isinstance(value, numbers.Integral) or abs(number) >= 1e4
+            shown = f"{number:,.0f}" if exact else f"{number:,.4g}"
             if words in ("mean", "median", "95 %"):  # of a spread
                 words = f"{before.removesuffix(': ')}, {words}"
             else:
                 words = before + words
-            yield words, shown or f"{value:,.0f}"
+            yield words, shown

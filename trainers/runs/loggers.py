@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ class ScalarLoggers(Logger):
         for name, caption in captions.items():
             path = folder / name
             if path.is_file():
-                self._each(lambda logger, path=path, words=caption: _picture(logger, path, words))
+                self._each(partial(_picture, path=path, caption=caption))
 
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
         """Log the configuration."""

@@ -130,7 +130,7 @@ class GymKit(Kit):
         self.config = dataclasses.replace(
             config,
             option_steps=steps,
-            skill_steps=config.skill_steps or 2 * steps,
+            skill_steps=config.skill_steps or steps,
             novelty_radius=config.novelty_radius or look.novelty_radius,
         )
         self._fixed: Any = None  # worker of a pool whose options are given
@@ -321,10 +321,17 @@ class GymKit(Kit):
                 "until_plan": False,
             },
         }
-        if self.look.kind == "return":
+        uct = {"_component_": f"{planners}.UCT"}
+        if self.look.kind == "return" and self.look.step_reward > 0.0:
+            # To live on is what pays: the deepest path would be the best, a dead end too. The mean
+            # over random ways says how many of them survive.
+            part["rollout"]["max_options"] = 30
+            most_visited = {"_component_": f"{planners}.MostVisited"}
+            part |= {"tree_policy": uct | {"c": 1.0}, "final_choice": most_visited}
+        elif self.look.kind == "return":
             part["rollout"]["max_options"] = 10
             part |= {
-                "tree_policy": {"_component_": f"{planners}.UCT", "c": 0.3},
+                "tree_policy": uct | {"c": 0.3},
                 "backup": "max",
                 "final_choice": {"_component_": f"{planners}.HighestValue"},
             }

@@ -81,6 +81,7 @@ def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel:
         places,
         data["done"][:, 0],
         radius=config.radius,
+        min_count=config.min_count,
         jump_factor=config.jump_factor,
         seed=config.seed,
     )

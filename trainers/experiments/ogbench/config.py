@@ -31,6 +31,8 @@ class OGBenchConfig(RunConfig):
     """Numbers of an observation, its first ones, that say where the agent is."""
     radius: float = 1.5
     """Least distance of two landmarks, in units of the maze, whose corridors are 4 wide."""
+    min_count: int = 1
+    """Recorded passages from a landmark to another that make an option."""
     jump_factor: float = 10.0
     """Median steps from which on a recorded step is a jump, whose outcomes are left to chance."""
     goal_steps: int = 30
@@ -53,7 +55,17 @@ class OGBenchConfig(RunConfig):
 
     EXPERIMENT = "ogbench"
     TOY = {"updates": 200, "episodes": 1}
-    KEPT = ("seed", "toy", "id", "data", "radius", "jump_factor", "goal_steps", "updates")
+    KEPT = (
+        "seed",
+        "toy",
+        "id",
+        "data",
+        "radius",
+        "min_count",
+        "jump_factor",
+        "goal_steps",
+        "updates",
+    )
     PATHS = ("out", "data")
     ABOVE_ZERO = ("radius", "learning_rate", "jump_factor")
     LEAST = {"progress_coeff": 0}
