@@ -23,16 +23,17 @@ from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import MCTSPlanner, Plan
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import skills
+from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
 from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, make_kit
 from torchrl_hmcts.trainers.experiments.kits.gym import GymKit
-from torchrl_hmcts.trainers.experiments.registry import load_config
-from torchrl_hmcts.trainers.experiments.settings import GymConfig, SkillsConfig
+from torchrl_hmcts.trainers.experiments.registry import KITS, find_experiment, load_config
+from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer
 from torchrl_hmcts.trainers.manager import ManagerPolicy, make_manager, scale_by
 from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
 from torchrl_hmcts.trainers.saving.run_folder import read_run
-from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
+from torchrl_hmcts.trainers.saving.worker_file import save_worker
 
 _MANAGER = "manager.torchrl"
 _OTHER_DRAWS = 1_000_003  # added to the seed of the env to act in, whose draws no planner knows
@@ -76,10 +77,12 @@ class HMCTS:
 
     Args:
         env (str or callable): a Gymnasium id, or a function that makes such an env.
-        num_skills (int): skills to learn. Default 8.
+        num_skills (int, optional): skills to learn. Default: 8, and what the kit names.
+        kit (str): of the env: ``"gym"`` or, with what is known of an ant, ``"ant"``.
         seed (int): of all random numbers. Default 0.
-        **keys: of :class:`~torchrl_hmcts.trainers.experiments.settings.GymConfig`, e.g.
+        **keys: of :class:`~torchrl_hmcts.trainers.experiments.gym_settings.GymConfig`, e.g.
             ``option_steps=10``, ``task="return"``, ``make={"max_episode_steps": 500}``,
+            ``worker=DIR`` for the skills of another agent or run,
             ``planner={"leaves_per_wave": 8}``. What is not given is found by a short look at the
             env.
 
@@ -103,22 +106,31 @@ class HMCTS:
         self,
         env: str | Callable[[], Any] | SkillsConfig,
         *,
-        num_skills: int = 8,
+        num_skills: int | None = None,
+        kit: str = "gym",
         seed: int = 0,
         **keys: Any,
     ) -> None:
         config = env
         if not isinstance(config, SkillsConfig):
-            keys = {"options": "directions", "num_skills": num_skills, "seed": seed, **keys}
-            config = GymConfig(id=env if isinstance(env, str) else "", **keys)
+            options = "learned" if keys.get("worker") else "directions"
+            keys = {"options": options, "seed": seed, **keys}
+            if num_skills is not None:
+                keys["num_skills"] = num_skills
+            made = find_experiment(kit, KITS).config_class
+            if not issubclass(made, GymConfig):
+                raise ValueError(f"kit={kit!r} is none of Gymnasium envs: use 'gym' or 'ant'.")
+            config = made(id=env if isinstance(env, str) else "", **keys)
         self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
         self.kit = self._make_kit(config)
         self.learned: LearnedSkills | None = None
         self.manager: TensorDictModule | None = None
         self._worker = self.kit.given_worker()
+        if config.worker:
+            self._take(skills.load_skills(self.kit, config.worker))
 
     def _make_kit(self, config: Any) -> Kit:
-        return GymKit(config, self._env) if isinstance(config, GymConfig) else make_kit(config)
+        return make_kit(config, *([self._env] if isinstance(config, GymConfig) else []))
 
     # ------------------------------------------------------------ parts
 
@@ -164,12 +176,12 @@ class HMCTS:
     # ------------------------------------------------------------ what it does
 
     def learn(
-        self, base_steps: int = 50_000, *, progress: bool = True, save_dir: Any = None
+        self, base_steps: int | None = None, *, progress: bool = True, save_dir: Any = None
     ) -> HMCTS:
         """Learn skills without reward; return the agent.
 
         Args:
-            base_steps: of training.
+            base_steps: of training. Default: 50,000, or what the kit names.
             progress: show a bar; False prints nothing.
             save_dir: folder of checkpoints. Default: none.
 
@@ -181,7 +193,9 @@ class HMCTS:
                 f"{self} is of the kit {self.config.KIT}: train it with hmcts train "
                 f"kit={self.config.KIT}, and load the folder."
             )
-        changes: dict[str, Any] = {"options": "learned", "train_base_steps": base_steps}
+        changes: dict[str, Any] = {"options": "learned", "worker": ""}
+        if base_steps is not None:
+            changes["train_base_steps"] = base_steps
         self.kit = self._make_kit(dataclasses.replace(self._asked, **changes))
         with _torchrl_quiet():
             self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
@@ -360,7 +374,7 @@ class HMCTS:
             raise ValueError(f"{folder} holds a run of {config.EXPERIMENT}, which has no skills.")
         agent = cls(config)
         if config.options == "learned":
-            agent._take(_load_skills(agent.kit, folder))
+            agent._take(skills.load_skills(agent.kit, folder))
         if (Path(folder) / _MANAGER).is_file():
             bounded = not agent.kit.replans
             network = make_manager(agent.planner, agent.kit.manager_keys, bounded=bounded)
@@ -396,14 +410,6 @@ def _torchrl_quiet() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-
-
-def _load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
-    loss = skills.make_loss(kit)
-    path = load_networks(loss, folder)
-    worker = SkillPolicy(loss.actor_network, deterministic=True)
-    step = int("".join(filter(str.isdigit, path.stem)) or 0)
-    return LearnedSkills(worker, loss, {}, skills.RoundRecords(), step, step, 0, 0.0)
 
 
 def load_worker(folder: str | Path) -> SkillPolicy:

@@ -40,8 +40,9 @@ _FEATURES = f"after {FEATURES_KEY}"
 class OptionWorker(Protocol):
     """The part of an agent that acts inside options: any object that can be pickled.
 
-    It may have ``ends(observation, option, steps) -> bool`` too: whether the option ends after so
-    many steps.
+    It may have ``begin(observation, option)`` too, which is called before the first step of an
+    option, and ``ends(observation, option, steps) -> bool``: whether the option ends after so many
+    steps.
 
     Example:
         >>> class LeftOrRight:
@@ -92,6 +93,7 @@ class OptionRun(ABC):
     def __init__(self, worker: OptionWorker, max_steps: int, gamma: float) -> None:
         self.worker, self.max_steps, self.gamma = worker, max_steps, gamma
         self.ends: Callable[..., bool] | None = getattr(worker, "ends", None)
+        self._begun: Callable[..., None] | None = getattr(worker, "begin", None)
         self.work: Any = np.zeros(1, np.int64).data
         self.arguments: tuple[Any, ...] = ()
 
@@ -124,6 +126,8 @@ class OptionRun(ABC):
         """
         option = int(slots["option"][index])
         observation, generator = self.begin(slots, index)
+        if self._begun is not None:
+            self._begun(observation, option)
         act, ends, take, gamma = self.worker.act, self.ends, self.step, self.gamma
         reward, discount, work, clock = 0.0, 1.0, self.work, self.clock
         left = clock._max_episode_steps - clock._elapsed_steps if clock is not None else np.inf
@@ -188,6 +192,8 @@ class OptionRun(ABC):
             )
         observation = self.first_observation()
         for option in range(count):
+            if self._begun is not None:
+                self._begun(observation, option)
             action = worker.act(observation, option, np.random.default_rng(0))
             if wanted := self.check_action(action):
                 raise ValueError(

@@ -179,6 +179,12 @@ class OccasionalAction:
             return self.action
         return self.worker.act(observation, option, generator)
 
+    def begin(self, observation: Any, option: int) -> None:
+        """Tell the worker that an option begins."""
+        begin: Any = getattr(self.worker, "begin", None)
+        if begin is not None:
+            begin(observation, option)
+
     def ends(self, observation: Any, option: int, steps: int) -> bool:
         """Return whether the worker ends the option; never, if it cannot."""
         ends: Any = getattr(self.worker, "ends", None)
@@ -215,6 +221,13 @@ class JoinedWorkers:
         """Return the action of the worker whose option it is."""
         worker, own = self._whose[option]
         return worker.act(observation, own, generator)
+
+    def begin(self, observation: Any, option: int) -> None:
+        """Tell the worker whose option it is that it begins."""
+        worker, own = self._whose[option]
+        begin: Any = getattr(worker, "begin", None)
+        if begin is not None:
+            begin(observation, own)
 
     def ends(self, observation: Any, option: int, steps: int) -> bool:
         """Return whether the worker whose option it is ends it; never, if it cannot."""

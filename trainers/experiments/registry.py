@@ -174,10 +174,18 @@ EXPERIMENTS = {
 GYM = Experiment(
     "gym",
     "any Gymnasium env: tree search over skills that are learned there, or over its actions",
-    ".settings:GymConfig",
+    ".gym_settings:GymConfig",
     *_SKILLS,
     objective="test.solved",
     kit="gym",
+)
+ANT = Experiment(
+    "ant",
+    "ant mazes: the kit gym, and what is known by hand of MuJoCo's ant",
+    ".gym_settings:AntConfig",
+    *_SKILLS,
+    objective="test.solved",
+    kit="ant",
 )
 OGBENCH = Experiment(
     "ogbench",
@@ -196,7 +204,13 @@ DEMO = Experiment(
     objective="solved",
     kit="waterworld",
 )
-ALL_EXPERIMENTS = {"demo": DEMO, **EXPERIMENTS, "gym": GYM, "ogbench": OGBENCH}
+ALL_EXPERIMENTS = {
+    "demo": DEMO,
+    **EXPERIMENTS,
+    "gym": GYM,
+    "ant": ANT,
+    "ogbench": OGBENCH,
+}
 """The experiments of ``hmcts train``, the demo and the gym kit: all that leave a run's folder."""
 KITS = {e.kit: e for e in ALL_EXPERIMENTS.values() if e.kit}
 """The experiments that ``hmcts train kit=NAME`` runs, by kit."""

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
+from torchrl_hmcts.trainers.runs.config import RunConfig, need_package
 
 NUM_TEST_MAZES = 342  # of Waterworld's test split
 BATCH_STEPS = 64  # base steps of a batch of DIAYN's training
@@ -32,6 +32,8 @@ class SkillsConfig(RunConfig):
     options: str = "learned"
     """"learned": the manager plans over skills; "actions": over primitive actions, each repeated,
     without any training."""
+    worker: str = ""
+    """Folder of a run or an agent whose skills are taken; none are learned then."""
     algorithm: str = "diayn"
     """How the worker learns: "diayn" (mini-episodes, before the manager plans) or "hmcts"
     (Algorithm 3 from scratch: rounds of search in training mazes)."""
@@ -80,8 +82,8 @@ class SkillsConfig(RunConfig):
 
     KIT: ClassVar[str] = ""  # name of the kit
     KEPT: ClassVar[tuple[str, ...]] = (
-        *("seed", "toy", "options", "algorithm", "objective", "loss", "trainer", "planner"),
-        "num_skills",
+        *("seed", "toy", "options", "worker", "algorithm", "objective", "loss", "trainer"),
+        *("planner", "num_skills"),
     )
     LEAST = {"curve_points": 0}
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("novelty_radius", "updates_per_step")
@@ -387,85 +389,3 @@ class WaterworldGoalsConfig(WaterworldA3CConfig):
                 f"0 < goal_met_threshold < goal_divergence_threshold; got "
                 f"{self.goal_met_threshold} and {self.goal_divergence_threshold}."
             )
-
-
-@dataclass
-class GymConfig(SkillsConfig):
-    """Keys of ``hmcts train kit=gym env.id=NAME``: the agent over the kit ``gym``.
-
-    Example:
-        >>> GymConfig(id="PointMaze_Large-v3").num_skills
-        8
-    """
-
-    out: str = "runs/gym"
-    """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
-    id: str = ""
-    """Id of the Gymnasium env, e.g. env.id=PointMaze_Large-v3."""
-    make: dict[str, Any] = field(default_factory=dict)
-    """Keywords of gymnasium.make: make.KEY=VALUE, e.g. make.maze_map=[[1,1],[1,1]]."""
-    options: str = "learned"
-    """"learned": the manager plans over skills; "actions": over primitive actions, each repeated;
-    "directions": the same, where actions lie within bounds; "goals": over values that features are
-    brought to, of the features that actions control."""
-    task: str = "auto"
-    """"goal": plan until it is reached; "return": collect rewards, with a search before every
-    option; "auto": found by a short look at the env."""
-    mazes: int = 20
-    """Starts to act from."""
-    num_skills: int = 8
-    """Skills of the worker, the options of the manager."""
-    option_steps: int = 0  # type: ignore[misc]
-    """Base steps of an option; 0: found by a short look at the env."""
-    skill_steps: int = 0  # type: ignore[misc]
-    """Base steps of a mini-episode in training; 0: those of an option, so that skills part soon."""
-    novelty_radius: float = 0.0
-    """Distance between features within which a state counts as visited; 0: half of how far an
-    action that is repeated moves them, three quarters of how far a skill does."""
-    train_base_steps: int = 50_000
-    """Base steps of worker training."""
-    expansions: int = 20_000
-    """Nodes that a search may expand before it gives up, where there is a goal."""
-    improve_expansions: int = 2_000
-    """Nodes that it expands after the first plan to find a shorter one, where every step costs."""
-    search_steps: int = 2_000
-    """Base steps that each search may simulate, where rewards are collected."""
-    processes: int = 0
-    """Processes that simulate; 0: the calling one."""
-    keep: str = "last"
-    """Which worker of the training to keep: "last"."""
-    toy: bool = False
-    """A little training and 2 starts, to see in seconds that everything works."""
-
-    EXPERIMENT, KIT = "gym", "gym"
-    TOY = {"train_base_steps": 1_280, "mazes": 2, "expansions": 200, "search_steps": 200}
-    KEPT = (*SkillsConfig.KEPT, "id", "make", "option_steps", "skill_steps")
-    LEAST = {"curve_points": 0, "option_steps": 0, "skill_steps": 0, "processes": 0}
-    ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("updates_per_step",)
-    CHOICES = SkillsConfig.CHOICES | {
-        "options": ("learned", "actions", "directions", "goals"),
-        "task": ("auto", "goal", "return"),
-        "keep": ("last",),
-    }
-
-    @property
-    def train_steps(self) -> int:  # type: ignore[override]
-        """Base steps of training."""
-        return max(BATCH_STEPS, self.train_base_steps // BATCH_STEPS * BATCH_STEPS)
-
-    def check_inputs(self) -> None:
-        """Check that there is such an env.
-
-        Raises:
-            ExperimentError: if there is no id, or none like it.
-            ImportError: if the env needs a package that is not installed.
-        """
-        super().check_inputs()
-        if not self.id:
-            raise ExperimentError("say which env: env.id=NAME, e.g. env.id=PointMaze_Large-v3.")
-        from torchrl_hmcts.envs.gym.settable import make_gym  # here: it loads torch
-
-        try:
-            make_gym(self.id, **self.make).close()
-        except ValueError as error:
-            raise ExperimentError(str(error)) from None

@@ -163,6 +163,8 @@ def learn(
     """
     config = kit.config
     begin = time.process_time()
+    if config.worker:
+        return load_skills(kit, config.worker)
     given = kit.given_worker()
     if given is not None:
         return LearnedSkills(given, None, {}, RoundRecords(), 0, 0, 0, 0.0)
@@ -202,6 +204,24 @@ def learn(
     )
 
 
+def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
+    """Read the skills of a run or an agent.
+
+    Args:
+        kit: of networks like those in the folder.
+        folder: of the run or the agent.
+
+    Raises:
+        FileNotFoundError: if it has no networks yet.
+        ValueError: if they are other ones.
+    """
+    loss = make_loss(kit)
+    path = load_networks(loss, folder)
+    worker = SkillPolicy(loss.actor_network, deterministic=True)
+    step = int("".join(filter(str.isdigit, path.stem)) or 0)
+    return LearnedSkills(worker, loss, {}, RoundRecords(), step, step, 0, 0.0)
+
+
 def make_loss(kit: Kit) -> Any:
     """Build actor, critics and objective of the worker.
 
@@ -211,6 +231,8 @@ def make_loss(kit: Kit) -> Any:
     Args:
         kit: gives the env, the keys, and the configuration with its seed.
     """
+    if (made := kit.make_loss()) is not None:
+        return made
     config, env = kit.config, kit.make_training_env(1)
     node = merged(OBJECTIVE, config.objective)
     keywords = dict(config.loss)
@@ -275,6 +297,7 @@ def _make_diayn(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> DIAYNTr
     scale = _REWARD_SCALES.get(type(loss.objective).__name__)
     if scale is not None:
         own["reward"] = SkillReward(loss.objective, intrinsic_coeff=scale)
+    own |= kit.trainer_part(loss)
     path = kit.parts()["trainer"]["_component_"]
     return build(path, env=kit.make_training_env(), loss_module=loss, **{**own, **keywords})
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +28,21 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import PUCT, MCTSPlanner, PolicyValueEvaluator
 from torchrl_hmcts.trainers.diayn import worker_losses
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
+from torchrl_hmcts.trainers.experiments.kits.trial import LearnedSkills, Trial
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.parts import build, merged
 from torchrl_hmcts.trainers.runs.config import ExperimentError
-from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import OptionTransform
 
 __all__: list[str] = []
 
-KITS = {"waterworld": "waterworld.WaterworldKit", "labmaze": "lab.LabMazeKit", "gym": "gym.GymKit"}
+KITS = {
+    "waterworld": "waterworld.WaterworldKit",
+    "labmaze": "lab.LabMazeKit",
+    "gym": "gym.GymKit",
+    "ant": "ant.AntKit",
+}
 """Class of each kit by its name on the command line, in this package."""
 
 
@@ -45,52 +50,6 @@ OBJECTIVE = {"_component_": "torchrl_hmcts.objectives.SkillDiscriminatorLoss"}
 """DIAYN's objective, the default of every kit."""
 
 Curve = tuple[Any, Sequence[float]]  # steps and values
-
-
-@dataclass
-class LearnedSkills:
-    """A worker and how it became what it is.
-
-    Attributes:
-        worker (TensorDictModule): with its most probable actions.
-        loss (LossModule, optional): with its networks; None where nothing was learned.
-        history (mapping): all logged curves.
-        tests (RoundRecords): what it achieved while it learned.
-        steps (int): base steps of training, simulated ones included.
-        worker_step (int): those that the networks have seen that are kept.
-        rounds (int): of Algorithm 3.
-        seconds (float): of the processor, tests included.
-    """
-
-    worker: TensorDictModuleBase
-    loss: LossModule | None
-    history: Mapping[str, list[float]]
-    tests: RoundRecords
-    steps: int
-    worker_step: int
-    rounds: int
-    seconds: float
-
-
-@dataclass
-class Trial:
-    """One episode from each start: a plan, executed in another instance of the env.
-
-    Attributes:
-        starts (TensorDict): states ``[M]``.
-        planner (MCTSPlanner): with which the plans were made.
-        results (Results): what they led to.
-        second_searches (int): starts that were searched twice.
-        compile_seconds (float): until the first plan of all was made.
-        cpu_seconds (float): of all searches and episodes.
-    """
-
-    starts: TensorDictBase
-    planner: MCTSPlanner
-    results: Results
-    second_searches: int
-    compile_seconds: float
-    cpu_seconds: float
 
 
 class Kit:
@@ -155,6 +114,18 @@ class Kit:
             num_envs: copies.
         """
         raise NotImplementedError
+
+    def make_loss(self) -> LossModule | None:
+        """Return the worker's loss, of networks that keys cannot describe; None: the keys' loss."""
+        return None
+
+    def trainer_part(self, loss: LossModule) -> dict[str, Any]:
+        """Return keywords of the trainer at the kit's defaults.
+
+        Args:
+            loss: that is trained.
+        """
+        return {}
 
     def make_env(self, split: str) -> EnvBase:
         """Return a base env to act in.
@@ -424,6 +395,8 @@ class Kit:
                 rooms = drawing.rooms(10 * config.num_skills, maze)
                 steps = 100 // config.frames_per_step
                 plot_skill_fan(sampling, rooms, path, num_skills=config.num_skills, steps=steps)
+        if not learned.history:
+            return
         with pictures.one("losses.png", captions["losses.png"]) as path:
             from torchrl_hmcts.trainers.figures.curves import plot_losses
 
@@ -488,11 +461,12 @@ class Kit:
         return f"{test['solved']} of {test['starts']} starts solved at the first trial."
 
 
-def make_kit(config: SkillsConfig) -> Kit:
+def make_kit(config: SkillsConfig, *env: Any) -> Kit:
     """Return the kit of a configuration.
 
     Args:
         config: its ``KIT`` names the kit.
+        *env: of a kit of Gymnasium envs, a function that makes the env instead of its id.
 
     Example:
         >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
@@ -501,5 +475,5 @@ def make_kit(config: SkillsConfig) -> Kit:
     """
     path = f"{__name__}.{KITS[config.KIT]}"
     module, _, name = path.rpartition(".")
-    kit: Kit = getattr(importlib.import_module(module), name)(config)
+    kit: Kit = getattr(importlib.import_module(module), name)(config, *env)
     return kit

@@ -64,8 +64,8 @@ class _FilmedWorker:
     def __init__(self, worker: Any, film: Film) -> None:
         self._worker, self._film = worker, film
         self.num_options = worker.num_options
-        if hasattr(worker, "ends"):
-            self.ends = worker.ends
+        for name in {"begin", "ends"} & set(dir(worker)):
+            setattr(self, name, getattr(worker, name))
 
     def act(self, observation: Any, option: int, generator: np.random.Generator) -> Any:
         self._film.options.append(option)

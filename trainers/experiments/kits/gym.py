@@ -19,6 +19,7 @@ from torchrl_hmcts.envs import (
     GridMoves,
     GridView,
     OptionPool,
+    OptionWorker,
     RepeatActions,
     SettableGymEnv,
     SkillWorker,
@@ -31,11 +32,11 @@ from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, SearchBudget, extract_plans
 from torchrl_hmcts.trainers.evaluation import Results, spread
+from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
 from torchrl_hmcts.trainers.experiments.kits import Kit, Trial
 from torchrl_hmcts.trainers.experiments.kits.feature_goals import find_goals
 from torchrl_hmcts.trainers.experiments.kits.film import Film
 from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
-from torchrl_hmcts.trainers.experiments.settings import GymConfig
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 _PLAYED = 1_000_003  # added to the seed of envs to act in
@@ -95,7 +96,7 @@ class GymKit(Kit):
         env: makes the env instead of the id of ``config``.
 
     Example:
-        >>> from torchrl_hmcts.trainers.experiments.settings import GymConfig
+        >>> from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
         >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
         >>> kit.look.kind, kit.config.option_steps
         ('goal', 14)
@@ -119,8 +120,7 @@ class GymKit(Kit):
         super().__init__(config)
         if env is None:
             config.check_inputs()
-        given = config.options != "learned"
-        self._env = partial(make_seen, config.id if env is None else env, given)
+        self._env = self.maker(config.id if env is None else env)
         look = look_at(self._env, gamma=config.gamma, **config.make)
         if config.task != "auto":
             look = dataclasses.replace(look, kind=config.task)  # type: ignore[arg-type]
@@ -135,6 +135,14 @@ class GymKit(Kit):
         )
         self._fixed: Any = None  # worker of a pool whose options are given
         self._radius = config.novelty_radius  # 0: found
+
+    def maker(self, name: Any) -> Any:
+        """Return what makes the env as options see it, from keywords of ``gymnasium.make``.
+
+        Args:
+            name: id, or a function that makes the env.
+        """
+        return partial(make_seen, name, self.config.options != "learned")
 
     @cached_property
     def gym_env(self) -> gymnasium.Env:
@@ -215,7 +223,7 @@ class GymKit(Kit):
         make: Any = partial(make_task, self._env, self.look, real, keywords)
         acts: Any = self._fixed
         if isinstance(worker, SkillPolicy):
-            acts = SkillWorker(worker.actor, deterministic=worker.deterministic)
+            acts = self.pool_worker(worker)
         if film is not None:
             make, acts = film.of(make, acts)
         return OptionPool(
@@ -229,6 +237,14 @@ class GymKit(Kit):
             still=0.0 if self.look.discrete or self.replans else _STILL * config.novelty_radius,
             seed=config.seed + (_PLAYED if real else 0),
         )
+
+    def pool_worker(self, worker: SkillPolicy) -> OptionWorker:
+        """Return learned skills as the worker of a pool.
+
+        Args:
+            worker: the skills.
+        """
+        return SkillWorker(worker.actor, deterministic=worker.deterministic)
 
     def describe(self) -> str:
         return f"{self.config.id}: {self.look}."
