@@ -98,6 +98,7 @@ class LandmarkModel(nn.Module):
         radius: float,
         hops: int = 3,
         min_count: int = 3,
+        max_steps: float = float("inf"),
         jump_factor: float = 10.0,
         seed: int = 0,
     ) -> LandmarkModel:
@@ -109,6 +110,8 @@ class LandmarkModel(nn.Module):
             radius (float): least distance of two landmarks.
             hops (int): landmarks that an option may pass at most. Default 3.
             min_count (int): passages that make an option. Default 3.
+            max_steps (float): longest option, base steps; as far as the goals lie ahead by which
+                the worker was trained. Default: as long as it takes.
             jump_factor (float): median steps from which on a step is a jump; infinite: none is.
                 Default 10.
             seed (int): of the states among which landmarks are chosen. Default 0.
@@ -143,8 +146,9 @@ class LandmarkModel(nn.Module):
             exits.setdefault(i, {})[j] = exits.get(i, {}).get(j, 0) + 1
         options: list[list[tuple[int, int]]] = [[] for _ in range(sum(map(len, found)))]
         for (i, j), times in passages.items():
-            if len(times) >= min_count and i < len(plain):
-                options[i].append((j, max(1, round(float(np.quantile(times, _SHARE))))))
+            steps = max(1, round(float(np.quantile(times, _SHARE))))
+            if len(times) >= min_count and steps <= max_steps and i < len(plain):
+                options[i].append((j, steps))
         if not any(options):
             raise ValueError(
                 f"{owner} found no two of {len(options)} landmarks between which {min_count} "

@@ -82,6 +82,7 @@ def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel:
         data["done"][:, 0],
         radius=config.radius,
         min_count=config.min_count,
+        max_steps=config.goal_steps,
         jump_factor=config.jump_factor,
         seed=config.seed,
     )

@@ -36,7 +36,7 @@ class OGBenchConfig(RunConfig):
     jump_factor: float = 10.0
     """Median steps from which on a recorded step is a jump, whose outcomes are left to chance."""
     goal_steps: int = 30
-    """Base steps by which a goal of the worker lies ahead, at most."""
+    """Base steps by which a goal of the worker lies ahead, at most, and of an option."""
     progress_coeff: float = 2.0
     """How much more the worker clones an action that led to the goal fast; 0: not at all."""
     updates: int = 4_000
