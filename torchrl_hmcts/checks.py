@@ -71,8 +71,8 @@ def real_number(
 def no_class(owner: str, name: str, value: Any) -> None:
     """Raise a TypeError if a value is a class, where an object of it is due."""
     if isinstance(value, type):
-        given = inspect.signature(value.__init__).parameters.values()
-        needed = [p.name for p in [*given][1:] if p.default is p.empty and p.kind == 1]
+        given = inspect.signature(value).parameters.values()
+        needed = [p.name for p in given if p.default is p.empty and p.kind == 1]
         raise TypeError(
             f"{owner} needs an object for {name}; got the class {value.__name__}. Write "
             f"{name}={value.__name__}({', '.join(needed)})."

@@ -383,7 +383,7 @@ class HMCTS:
         return agent
 
     def _repr_html_(self) -> str:
-        planner = self.__dict__.get("planner")
+        planner: Any = self.__dict__.get("planner")
         searched = planner is not None and planner.has_searched
         return notebook.shown(repr(self)) + (planner.last_search._repr_html_() if searched else "")
 

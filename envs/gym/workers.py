@@ -125,7 +125,7 @@ class FollowGoals:
     """
 
     def __init__(self, goals: Sequence[Goal]) -> None:
-        self.goals = tuple(goals)
+        self.goals: tuple[Any, ...] = tuple(goals)
         if not self.goals:
             raise ValueError("FollowGoals needs a goal for each option; got none.")
         self.num_options = len(self.goals)

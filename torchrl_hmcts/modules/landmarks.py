@@ -210,16 +210,21 @@ class LandmarkModel(nn.Module):
             values = better
         return values
 
-    def nearest(self, places: Tensor) -> Tensor:
+    def nearest(self, places: Tensor, *, goal: bool = False) -> Tensor:
         """Return the landmark nearest to each place, of those with options and without jumps.
 
         Args:
             places: ``[m, F]``.
+            goal: of those to which options lead instead.
 
         Returns:
             int64 ``[m]``.
         """
-        useful = torch.nonzero((self.targets >= 0).any(1) & ~self.is_jump).flatten()
+        useful = (self.targets >= 0).any(1)
+        if goal:
+            useful = torch.zeros_like(useful)
+            useful[self.targets[self.targets >= 0]] = True
+        useful = torch.nonzero(useful & ~self.is_jump).flatten()
         return useful[_nearest(places.float(), self.places[useful])]
 
 

@@ -117,10 +117,10 @@ def load_worker(part: dict[str, Any]) -> OptionWorker:
     if kind == "repeat":
         return RepeatActions(part["actions"])
     if kind == "goals":
-        worker = FollowGoals([ByteGoal(**goal) for goal in part["goals"]])
+        goals = FollowGoals([ByteGoal(**goal) for goal in part["goals"]])
         if part.get("fire") is None:
-            return worker
-        return OccasionalAction(worker, part["fire"], part["fire_probability"])  # of 0.9 and before
+            return goals
+        return OccasionalAction(goals, part["fire"], part["fire_probability"])  # an older folder's
     if kind == "network":
         worker = SharedMLP(part["num_options"], part["num_actions"], hidden=part["hidden"])
         worker.weights.copy_(part["weights"])

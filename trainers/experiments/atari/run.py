@@ -53,8 +53,8 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
             "versions": versions(),
         }
         with left_out("curves.csv"):
-            rows = ((name, step, value) for step, name, value in run.curves())
-            write_csv(folder.path / "curves.csv", ("name", "base_steps", "value"), rows)
+            values = ((name, step, value) for step, name, value in run.curves())
+            write_csv(folder.path / "curves.csv", ("name", "base_steps", "value"), values)
         title = f"{config.game} by planning over options, {config.protocol}"
         with folder.finish(metrics, title=title) as pictures:
             draw(run, pictures)

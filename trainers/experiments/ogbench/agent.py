@@ -210,11 +210,14 @@ class LandmarkAgent:
         """
         self.model.load_state_dict(self._given.state_dict())
         self._goal = torch.from_numpy(goal[: self.config.num_places]).float()
-        self._goal_landmark = self.model.nearest(self._goal[None])
+        self._goal_landmark = self.model.nearest(self._goal[None], goal=True)
         self._values.table = self.model.values(self._goal_landmark, self.config.gamma)
         self._target: Tensor | None = None
         self._last: Tensor | None = None
-        self.num_options, self.path = 0, []
+        self._steps, self._limit, self._chosen = 0, 0, (0, -1)
+        self._arrived: int | None = None  # at the landmark of the last option
+        self.num_options = 0
+        self.path: list[int] = []
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return an action.
@@ -246,11 +249,16 @@ class LandmarkAgent:
                 self._values.table = table
             return True
         near = self.config.radius / 2
-        return self._chosen[1] >= 0 and float((here - self._target).norm()) < near
+        if self._chosen[1] < 0 or float((here - self._target).norm()) >= near:
+            return False
+        self._arrived = self.path[-1]
+        return True
 
     def _choose(self, here: Tensor) -> None:
         landmark = self.model.nearest(here[None])
-        self._steps = 0
+        if self._arrived is not None and bool((self.model.targets[self._arrived] >= 0).any()):
+            landmark = torch.tensor([self._arrived])  # another one may be nearer by a little
+        self._arrived, self._steps = None, 0
         if bool(landmark == self._goal_landmark):
             self._target, self._chosen, self._limit = self._goal, (int(landmark), -1), _LEAST_STEPS
             return

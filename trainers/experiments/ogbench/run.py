@@ -52,7 +52,8 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
         data = recorded(config)
         begin = time.process_time()
         if run.resumes:
-            loss, curves = _loss(data, config), {}
+            loss = _loss(data, config)
+            curves: dict[str, list[float]] = {}
             load_networks(loss, run.path)
         else:
             loss, curves = learn(data, config, progress=counted("learn", "updates"))
