@@ -32,7 +32,13 @@ from torchrl_hmcts.envs import (
     StatelessSimulator,
     WaterworldMazeEnv,
 )
-from torchrl_hmcts.modules import OptionModel, OptionModelEnv, SkillActor, SkillPolicy
+from torchrl_hmcts.modules import (
+    LandmarkEnv,
+    OptionModel,
+    OptionModelEnv,
+    SkillActor,
+    SkillPolicy,
+)
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.testing import (
     ChainEnv,
@@ -231,5 +237,12 @@ def test_no_env_that_is_exported_is_left_out() -> None:
     envs = {c for c in exported if isinstance(c, type) and issubclass(c, EnvBase)}
     made = [*MACRO_ENVS.values(), *ATARI_ENVS.values(), LAB]
     covered = {make.func if isinstance(make, functools.partial) else make for make in made}
-    own_tests = {OptionModelEnv, OptionPool, StatelessSimulator, SettableGymEnv, MujocoBatch}
+    own_tests = {
+        LandmarkEnv,
+        OptionModelEnv,
+        OptionPool,
+        StatelessSimulator,
+        SettableGymEnv,
+        MujocoBatch,
+    }
     assert envs == covered | own_tests

@@ -291,13 +291,14 @@ EXCLUDED = {  # why public names are not fuzzed here
     "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
     "Evaluation GoalEpisodes GoalTrack Options Controllability Solution MujocoTask",
     "a protocol": "NoveltyTest PlansGoals OptionWorker",
-    "a base class": "SkillObjective SkillPrior ResumableTrainer",
+    "a base class": "Kit SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
     "SkillWorker GridView MujocoBatch HMCTS "
     "LandmarkEnv LandmarkModel GoalCloningLoss AttributeSnapshot ReplaySnapshot SettableGymEnv "
     "Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",
+    "is the base of configs that are fuzzed": "SkillsConfig",
     "hands its arguments to SkillReward": "SkillRewardHook",
     "searches from any object": "ReferenceSearch",
     "is built by the kit gym": "FeatureGoal",

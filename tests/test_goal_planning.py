@@ -410,6 +410,6 @@ def test_every_python_block_of_the_page_runs(
     for block in blocks:
         exec(compile(block, str(page), "exec"), namespace)  # noqa: S102
     written = {path.name for path in tmp_path.iterdir()}
-    assert written == {"episode.png", "episode.gif", "episode.mp4"}
+    assert written == {"episode.png"}
     for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", text):
         assert (page.parent / target).exists(), f"links to {target}, which is missing"

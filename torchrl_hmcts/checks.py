@@ -81,8 +81,8 @@ def no_class(owner: str, name: str, value: Any) -> None:
 
 def instance(owner: str, name: str, value: Any, *kinds: Any) -> None:
     """Raise a TypeError if a value is of none of the classes."""
-    no_class(owner, name, value)
     if not isinstance(value, kinds):
+        no_class(owner, name, value)
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise TypeError(
             f"{owner} needs a {wanted} for {name}; got {value!r}, a {type(value).__name__}."

@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import instance, no_class, real_number, whole_number
-from torchrl_hmcts.nesting import option_gamma
+from torchrl_hmcts.nesting import innermost, option_gamma
 from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
 from torchrl_hmcts.planners.evaluation import Evaluator, NodeEvaluator
 from torchrl_hmcts.planners.novelty import NoveltyTest
@@ -314,7 +314,8 @@ class MCTSPlanner(TensorDictModuleBase):
         search = Search(num_roots, self.num_options, self.settings, capacity=capacity)
         search.seed(self._draw_seed() if seed is None else seed)
         self._plant(search, root, None)
-        search.tree.draw_map = getattr(self.simulator.given_env, "draw_map", None)
+        env = innermost(self.simulator.given_env)
+        search.tree.draw_map = env.draw_map if hasattr(type(env), "draw_map") else None
         self.last_search = search
         return search
 

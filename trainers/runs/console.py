@@ -106,10 +106,12 @@ def counted(desc: str, unit: str) -> Callable[[Sequence[Any]], Iterator[Any]]:
 
     def through(steps: Sequence[Any]) -> Iterator[Any]:
         bar = Bar(len(steps), desc=desc, unit=unit)
-        for step in steps:
-            yield step
-            bar.update()
-        bar.close()
+        try:
+            for step in steps:
+                yield step
+                bar.update()
+        finally:
+            bar.close()
 
     return through
 
