@@ -35,6 +35,7 @@ from torchrl_hmcts.trainers.evaluation import spread
 from torchrl_hmcts.trainers.experiments.kits.ant import open_arena
 from torchrl_hmcts.trainers.experiments.kits.film import Film
 from torchrl_hmcts.trainers.experiments.skills import make_loss
+from torchrl_hmcts.trainers.figures.intervals import wilson
 from torchrl_hmcts.trainers.figures.pictures import save_figure
 from torchrl_hmcts.trainers.saving.worker_file import save_worker
 
@@ -112,27 +113,23 @@ def add_row(row: dict[str, Any], out: Path) -> None:
         writer.writerow(row)
 
 
-def wilson(solved: int, starts: int) -> list[float]:
-    """Return the 95 % interval of Wilson for a share, in percent."""
-    z, share = 1.96, solved / starts
-    middle = share + z * z / (2 * starts)
-    half = z * np.sqrt(share * (1 - share) / starts + z * z / (4 * starts * starts))
-    scale = 100 / (1 + z * z / starts)
-    return [round(float(scale * (middle + sign * half)), 1) for sign in (-1, 1)]
-
-
 def summary(rows: list[dict[str, str]]) -> dict[str, Any]:
     """Return counts, and what a start cost."""
     solved = sum(int(row["solved"]) for row in rows)
-    out: dict[str, Any] = {"starts": len(rows), "solved": solved}
-    out |= {"percent": round(100 * solved / len(rows), 1), "wilson": wilson(solved, len(rows))}
+    seeds = sorted({int(row["seed"]) for row in rows})
+    out: dict[str, Any] = {"seeds": seeds, "starts": len(rows), "solved": solved}
+    out |= {
+        "percent": round(100 * solved / len(rows), 1),
+        "wilson": [round(100 * x, 1) for x in wilson(solved, len(rows))],
+    }
     tasks = sorted({row["task"] for row in rows} - {""})
     if tasks:
         counts = [[int(row["solved"]) for row in rows if row["task"] == task] for task in tasks]
         out["solved_by_task"] = [f"{sum(count)}/{len(count)}" for count in counts]
     for key in ("cpu", "simulated"):
         out[key] = spread([float(row[key]) for row in rows])
-    out["steps_of_solved"] = spread([float(row["steps"]) for row in rows if row["solved"] == "1"])
+    steps = [float(row["steps"]) for row in rows if row["solved"] == "1"]
+    out["steps_of_solved"] = spread(steps) | {"most": max(steps, default=None)}
     return out
 
 

@@ -131,6 +131,7 @@ TABLES = [
     ("docs/results/README.md", "## gymcts and ours", "settable/gymcts.json"),
     ("docs/results/README.md", "## MiniGrid", "settable/minigrid.json"),
     ("docs/results/README.md", "## AntMaze", "antmaze/results.json"),
+    ("docs/results/README.md", "## OGBench's point mazes", "ogbench/mazes.json"),
     ("docs/results/README.md", "## Point mazes", "settable/point_mazes.json"),
 ]
 

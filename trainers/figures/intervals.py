@@ -69,4 +69,4 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     middle = share + z**2 / (2 * trials)
     half = z * np.sqrt(share * (1 - share) / trials + (z / (2 * trials)) ** 2)
     low, high = ((middle + sign * half) / (1 + z**2 / trials) for sign in (-1, 1))
-    return round(float(low), 4), round(float(high), 4)
+    return max(0.0, round(float(low), 4)), min(1.0, round(float(high), 4))

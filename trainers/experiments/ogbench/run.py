@@ -66,7 +66,7 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
         run.write_curves({k: (steps, v) for k, v in curves.items()}, "updates")
         agent = LandmarkAgent(fit_model(data, config), loss.actor_network, config)
         episodes = play_tasks(agent, config, progress=counted("act", "episodes"))
-        metrics = {
+        metrics: dict[str, Any] = {
             "seed": config.seed,
             "recorded_steps": len(data),
             "landmarks": agent.model.num_landmarks,
@@ -81,6 +81,8 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
                 plot_landmarks(
                     agent.model, [e["places"] for e in episodes[:: config.episodes]], path
                 )
+    solved = 100 * metrics["test"]["solved"]
+    print(f"{solved:.1f} % of {len(episodes)} episodes of five tasks solved.")
     return metrics
 
 
