@@ -26,6 +26,14 @@ from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.stopping import Stopped
 
 
+@pytest.fixture(autouse=True)
+def _fresh_handlers() -> None:
+    """After any test before in this process: nothing has asked to stop, handlers are default."""
+    stopping._put_back()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 def send(signum: int = signal.SIGINT) -> None:
     os.kill(os.getpid(), signum)
     time.sleep(0.01)  # Python handles it here
