@@ -35,12 +35,13 @@ def run(name: str, arm: str, seed: int, episodes: int) -> dict[str, Any]:
     """Learn and act; return a row."""
     config = OGBenchConfig(id=name, seed=seed, episodes=episodes, **ARMS[arm])
     data, begin = recorded(config), time.process_time()
-    model, (loss, _) = fit_model(data, config), learn(data, config)
+    model, learned = fit_model(data, config), learn(data, config)
     seconds = time.process_time() - begin
-    agent = LandmarkAgent(model, loss.actor_network, config)
+    agent = LandmarkAgent(model, learned.loss.actor_network, config)
     figures = summary(play_tasks(agent, config))
-    learned = {"landmarks": model.num_landmarks, "train_cpu_seconds": round(seconds, 1)}
-    return {"dataset": name, "arm": arm, "seed": seed, **learned, **figures}
+    figures["percent"] = round(100 * figures["solved"], 1)
+    told = {"landmarks": model.num_landmarks, "train_cpu_seconds": round(seconds, 1)}
+    return {"dataset": name, "arm": arm, "seed": seed, **told, **figures}
 
 
 def main() -> None:

@@ -165,6 +165,7 @@ def test_shares_have_wilsons_interval() -> None:
     [
         ({"radius": 0.0}, "radius.*got 0.0"),
         ({"radius": 1.0, "min_count": 100}, "no two of .* landmarks"),
+        ({"radius": 1.0, "jump_factor": 0.0}, "jump_factor.*got 0.0"),
         ({"radius": 1.0, "hops": -1}, "hops.*got -1"),
     ],
 )
@@ -194,6 +195,7 @@ def test_episodes_are_recorded_as_the_seed_says_and_read_by_torchrl(
     from torchrl_hmcts.trainers.experiments.ogbench.data import load, record
 
     data = load(folder)
+    assert [path.name for path in folder.parent.iterdir()] == ["medium"]  # and nothing half-written
     assert data.batch_size == torch.Size([40 * 1001])
     assert torch.nonzero(data["done"][:, 0]).flatten().diff().unique().tolist() == [1001]
     again = record(NAME, episodes=2)
@@ -202,7 +204,9 @@ def test_episodes_are_recorded_as_the_seed_says_and_read_by_torchrl(
     free = (steps.abs() > 0.0).all(1)
     moved, asked = steps[free], 0.2 * data["action"][:-1][~data["done"][:-1, 0]][free]
     assert float((moved - asked).abs().median()) < 1e-5  # but for walls, a step is 0.2 an action
-    buffer = TensorDictReplayBuffer(storage=LazyMemmapStorage(100), batch_size=8)
+    # With its clean-up TorchRL takes over Ctrl-C for the whole process.
+    storage = LazyMemmapStorage(100, auto_cleanup=False)
+    buffer = TensorDictReplayBuffer(storage=storage, batch_size=8)
     buffer.extend(data[:100])
     assert buffer.sample()["observation"].shape == (8, 2)
     arrays = {"observations": data["observation"], "actions": data["action"]}
@@ -223,6 +227,12 @@ def test_the_agent_learns_offline_and_acts_from_the_command_line(
     assert metrics["test"]["episodes"] == 5
     assert metrics["test"]["solved"] >= 0.8
     assert (out / "search.png").is_file()
+    curves = (out / "curves.csv").read_text()
+    assert main(["train", f"resume={out}"]) == 0  # what was learned stays, with what it cost
+    again = json.loads((out / "metrics.json").read_text())
+    assert again["train_cpu_seconds"] == metrics["train_cpu_seconds"] > 0
+    assert again["test"]["solved"] == metrics["test"]["solved"]
+    assert (out / "curves.csv").read_text() == curves
     assert main(["evaluate", f"run={out}", "seed=1"]) == 0
     assert "1" in capsys.readouterr().out
 
@@ -246,7 +256,7 @@ def test_the_agent_reads_nothing_of_the_simulator(folder: Path) -> None:
 
     config = OGBenchConfig(id=NAME, updates=800)
     data = load(folder)
-    agent = LandmarkAgent(fit_model(data, config), learn(data, config)[0].actor_network, config)
+    agent = LandmarkAgent(fit_model(data, config), learn(data, config).loss.actor_network, config)
     episode = act_once(Blind(), agent, 1, [0, 1])  # type: ignore[arg-type]
     assert episode["solved"]
     assert episode["options"] > 5
@@ -258,6 +268,7 @@ def test_the_agent_reads_nothing_of_the_simulator(folder: Path) -> None:
         (["data", "id=pointmaze-gaint-navigate-v0"], "Did you mean: pointmaze-giant-navigate-v0"),
         (["data"], "say which dataset"),
         (["data", f"id={NAME}", "sede=1"], "sede"),
+        (["data", f"id={NAME}", "episodes=-1"], "needs episodes >= 0; got -1"),
         (["train", "kit=ogbench", "env.id=antmaze"], "Unknown dataset"),
         (["train", "kit=ogbench", "data=/no/such"], "does not exist"),
     ],

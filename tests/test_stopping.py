@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import torch
 from small_trainers import make_a3c, make_diayn
+from torchrl.data import LazyMemmapStorage
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.saving import resume, stopping
@@ -24,14 +25,6 @@ from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.stopping import Stopped
-
-
-@pytest.fixture(autouse=True)
-def _fresh_handlers() -> None:
-    """After any test before in this process: nothing has asked to stop, handlers are default."""
-    stopping._put_back()
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def send(signum: int = signal.SIGINT) -> None:
@@ -172,6 +165,20 @@ def test_handlers_of_the_program_stay_and_an_ignored_signal_stays_ignored() -> N
         signal.signal(signal.SIGTERM, before)
         signal.signal(signal.SIGINT, ignored)
     assert seen == [signal.SIGTERM]
+
+
+def test_a_memory_mapped_buffer_of_torchrl_does_not_keep_a_run_from_being_saved() -> None:
+    before = [signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        storage = LazyMemmapStorage(1)
+        theirs = signal.getsignal(signal.SIGINT)
+        with pytest.raises(Stopped), stopping.patient():
+            send()
+        assert signal.getsignal(signal.SIGINT) is theirs
+        storage.cleanup()
+    finally:
+        for signum, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+            signal.signal(signum, handler)
 
 
 @pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

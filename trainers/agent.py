@@ -15,7 +15,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
-from tqdm import tqdm
 
 from torchrl_hmcts import notebook
 from torchrl_hmcts.modules import SkillPolicy
@@ -30,6 +29,7 @@ from torchrl_hmcts.trainers.experiments.registry import KITS, find_experiment, l
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer
 from torchrl_hmcts.trainers.manager import ManagerPolicy, make_manager, scale_by
+from torchrl_hmcts.trainers.runs.console import Bar
 from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
 from torchrl_hmcts.trainers.saving.run_folder import read_run
@@ -397,7 +397,7 @@ class HMCTS:
 
 
 def _bar(name: str, shown: bool) -> Callable[..., Any] | None:
-    return partial(tqdm, desc=name) if shown else None
+    return partial(Bar, desc=name) if shown else None
 
 
 @contextlib.contextmanager

@@ -48,11 +48,12 @@ class LandmarkModel(nn.Module):
     Attributes:
         places: float32 ``[N, F]``.
         is_jump: bool ``[N]``, places before jumps.
-        jump: distance of two places from which on a step is a jump.
+        jump: float32 ``[]``, distance from which on a step is a jump, in units of the places.
         targets: int64 ``[N, A]``, to which landmark an option goes; -1: there is no such option,
             and it stays.
         durations: float32 ``[N, A]``, base steps.
-        outcomes: int64 ``[N, A, K]``, landmarks; probabilities: float32 ``[N, A, K]``, of each.
+        outcomes: int64 ``[N, A, K]``, landmarks.
+        probabilities: float32 ``[N, A, K]``, of the outcomes.
 
     Reference:
         Places as nodes: Savinov, Dosovitskiy and Koltun, "Semi-parametric topological memory for
@@ -123,14 +124,17 @@ class LandmarkModel(nn.Module):
         radius = real_number(owner, "radius", radius, above=0.0)
         hops = whole_number(owner, "hops", hops, least=0)
         min_count = whole_number(owner, "min_count", min_count, least=1)
+        real_number(owner, "max_steps", max_steps, least=1.0, finite=False)
+        real_number(owner, "jump_factor", jump_factor, above=0.0, finite=False)
         if places.dim() != 2 or ends.shape != places.shape[:1] or len(places) < 2:
             raise ValueError(
                 f"{owner} needs places [T, F] and ends [T], T >= 2; got {list(places.shape)} and "
                 f"{list(ends.shape)}."
             )
-        x, last = places.float(), ends.bool().clone()
+        x, last = places.float().cpu(), ends.bool().cpu().clone()
         last[-1] = True
-        jumps = find_jumps(x, last, jump_factor)
+        shortest = _shortest_jump(x, last, jump_factor)
+        jumps = _far_steps(x, last, shortest)
         generator = torch.Generator().manual_seed(seed)
         plain = _spread(x[~jumps], radius, generator)
         found = [plain]
@@ -161,7 +165,7 @@ class LandmarkModel(nn.Module):
         model = cls(len(options), x.shape[1], width, most)
         model.places.copy_(torch.cat(found))
         model.is_jump[len(plain) :] = True
-        model.jump.fill_(_shortest_jump(x, last, jump_factor))
+        model.jump.fill_(shortest)
         for i, known in enumerate(options):
             for a, (j, steps) in enumerate(sorted(known)):
                 after = exits[i] if i == j else {j: 1}
@@ -247,15 +251,18 @@ def find_jumps(places: Tensor, ends: Tensor, jump_factor: float = 10.0) -> Tenso
         >>> find_jumps(places, torch.zeros(4, dtype=torch.bool))
         tensor([False, False,  True, False])
     """
-    jumps = torch.zeros_like(ends)
-    steps = (places[1:] - places[:-1]).norm(dim=1)
-    jumps[:-1] = ~ends[:-1] & (steps > _shortest_jump(places, ends, jump_factor))
-    return jumps
+    return _far_steps(places, ends, _shortest_jump(places, ends, jump_factor))
 
 
 def _shortest_jump(places: Tensor, ends: Tensor, jump_factor: float) -> float:
     steps = (places[1:] - places[:-1]).norm(dim=1)[~ends[:-1]]
     return jump_factor * float(steps.median()) if len(steps) else float("inf")
+
+
+def _far_steps(places: Tensor, ends: Tensor, shortest: float) -> Tensor:
+    far = torch.zeros_like(ends)
+    far[:-1] = ~ends[:-1] & ((places[1:] - places[:-1]).norm(dim=1) > shortest)
+    return far
 
 
 def _spread(places: Tensor, radius: float, generator: torch.Generator) -> Tensor:

@@ -27,7 +27,7 @@ class Outcomes(NamedTuple):
 
 
 class RootStates(NamedTuple):
-    """Knowledge of roots before they are searched."""
+    """Values, priors and masks of roots before they are searched."""
 
     values: np.ndarray  # [m] float32
     done: np.ndarray  # [m] bool

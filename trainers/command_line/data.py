@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, Failure, printing, told
-from torchrl_hmcts.trainers.command_line.words import no_bare_words, split_words
+from torchrl_hmcts.trainers.command_line.words import only_words
 from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
-from torchrl_hmcts.trainers.runs.config import home, need_package, read_value, unknown_key
+from torchrl_hmcts.trainers.runs.config import home, need_package, read_value
 
 _KEYS = ("id", "out", "seed", "episodes")
 
@@ -16,10 +16,7 @@ _KEYS = ("id", "out", "seed", "episodes")
 def data(words: Sequence[str]) -> int:
     """Record a dataset and write it as memory-mapped tensors; return the exit status."""
     with told("data", *WRONG_WORDS):
-        own, rest = split_words(words, _KEYS)
-        no_bare_words(rest, "id")
-        if rest:
-            raise ValueError(unknown_key(rest[0].partition("=")[0], [*_KEYS, "log_level"]))
+        own = only_words(words, _KEYS)
         if "id" not in own:
             raise ValueError("say which dataset: id=NAME, e.g. id=pointmaze-giant-stitch-v0.")
         split_name(own["id"])

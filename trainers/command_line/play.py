@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
-from torchrl_hmcts.trainers.command_line.words import no_bare_words, split_words
-from torchrl_hmcts.trainers.runs.config import home, read_value, unknown_key
+from torchrl_hmcts.trainers.command_line.words import only_words
+from torchrl_hmcts.trainers.runs.config import home, read_value
 
 if TYPE_CHECKING:
     from torchrl_hmcts.trainers.agent import HMCTS, Solution
@@ -21,10 +21,7 @@ _KEYS = ("run", "seed", "out")
 def play(words: Sequence[str]) -> int:
     """Show an agent acting: in a window, on a page of its own, or in a film."""
     with told("play", *WRONG_WORDS):
-        own, rest = split_words(words, _KEYS)
-        no_bare_words(rest, "run")
-        if rest:
-            raise ValueError(unknown_key(rest[0].partition("=")[0], [*_KEYS, "log_level"]))
+        own = only_words(words, _KEYS)
         if "run" not in own:
             raise ValueError("say which agent: run=DIR, the folder of a run or of HMCTS.save().")
         seed = read_value("seed", own.get("seed", "0"), "int")

@@ -138,6 +138,32 @@ def split_words(words: Sequence[str], own: Sequence[str]) -> tuple[dict[str, str
     return found, rest
 
 
+def only_words(words: Sequence[str], own: Sequence[str]) -> dict[str, str]:
+    """Read the words of a command that has no keys but its own.
+
+    Args:
+        words: of the command line, without the verb.
+        own: keys of the command, the one that must be given first; ``log_level`` always is one.
+
+    Returns:
+        The values of the keys.
+
+    Raises:
+        ValueError: if there is another word, or one of the keys is given twice, or has no value.
+
+    Example:
+        >>> only_words(["run=runs/gym", "sede=1"], ["run", "seed"])
+        Traceback (most recent call last):
+        ...
+        ValueError: Unknown key 'sede'. Did you mean: seed?
+    """
+    found, rest = split_words(words, own)
+    no_bare_words(rest, own[0])
+    if rest:
+        raise ValueError(unknown_key(rest[0].partition("=")[0], [*own, "log_level"]))
+    return found
+
+
 def no_bare_words(words: Sequence[str], folder: str = "") -> None:
     """Refuse a word that lacks its key, and say with which key to write it.
 

@@ -87,7 +87,7 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
     if learned.loss is not None:
         save_worker(run.path, learned.loss, learned.worker_step)
     train_seconds = time.perf_counter() - begin
-    trial = solve(kit, learned.worker, say=console.say)
+    trial = solve(kit, learned.worker, progress=True)
     metrics: dict[str, Any] = {
         "seed": config.seed,
         "train_seconds": round(train_seconds, 2),
@@ -127,7 +127,7 @@ def evaluate_skills(config: SkillsConfig) -> dict[str, Any]:
         worker = SkillPolicy(loss.actor_network, deterministic=True)
     return {
         "checkpoint": checkpoint,
-        "test": kit.figures(solve(kit, worker, say=console.say)),
+        "test": kit.figures(solve(kit, worker, progress=True)),
         **kit.extras(worker),
     }
 
@@ -409,15 +409,13 @@ class CurveTests:
 # ---------------------------------------------------------------- planning and acting
 
 
-def solve(
-    kit: Kit, worker: TensorDictModuleBase, *, say: Callable[..., Any] = lambda *_, **__: None
-) -> Trial:
+def solve(kit: Kit, worker: TensorDictModuleBase, *, progress: bool = False) -> Trial:
     """Plan in the simulator and execute the plan in another instance: one trial per test start.
 
     Args:
         kit: of the experiment.
         worker: executes the options.
-        say: told what is done, e.g. ``print``. Default: nobody is.
+        progress: say what is done, and show a bar. Default False.
 
     Example:
         >>> from torchrl_hmcts.trainers import DemoConfig, make_kit
@@ -425,6 +423,7 @@ def solve(
         >>> solve(kit, kit.given_worker()).results.solved.tolist()
         [True, True]
     """
+    say: Callable[[str], Any] = console.say if progress else lambda words: None
     kit.prepare(worker)
     config = kit.config
     starts = kit.starts("test", config.mazes)
@@ -435,15 +434,14 @@ def solve(
     compile_seconds = time.perf_counter() - begin
     say(f"Solving {config.mazes} {kit.start_name} ...")
     cpu = time.process_time()
-    shown = say is console.say
-    results = _solve(kit, worker, planner, starts, shown)
+    results = _solve(kit, worker, planner, starts, progress)
     again, other = np.flatnonzero(~results.found), kit.second_try()
     if other is None:
         again = again[:0]
     elif len(again):  # nothing has been executed there yet
         second_planner = other.make_planner(other.make_simulator(worker))
         some = starts[torch.from_numpy(again)]
-        second = _solve(other, worker, second_planner, some, shown)
+        second = _solve(other, worker, second_planner, some, progress)
         results = with_second_search(results, again, second)
     seconds = time.process_time() - cpu
     return Trial(starts, planner, results, len(again), compile_seconds, seconds)
@@ -454,13 +452,13 @@ def _solve(
     worker: TensorDictModuleBase,
     planner: MCTSPlanner,
     starts: TensorDictBase,
-    shown: bool,
+    progress: bool,
 ) -> Results:
     """Plan and act from a group of starts after the other."""
     real = kit.make_options(kit.make_env("test"), worker)
     parts: list[Results] = []
     name = kit.start_name.split()[-1] if len(kit.start_name.split()) == 1 else "starts"
-    bar = console.Bar(len(starts), desc="solve", unit=name) if shown else None
+    bar = console.Bar(len(starts), desc="solve", unit=name) if progress else None
     for some in starts.split(kit.group):
         parts.append(kit.act(planner, real, some))
         if bar is not None:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from torchrl_hmcts.modules import LandmarkModel
 from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
-_JUMP = "#bf0d00"
+_GREY, _PALE = "#71717a", "#d4d8e0"
 
 
 def plot_landmarks(model: LandmarkModel, ways: Sequence[np.ndarray], path: Path) -> None:
@@ -28,10 +28,10 @@ def plot_landmarks(model: LandmarkModel, ways: Sequence[np.ndarray], path: Path)
     lines = places[np.stack([starts, model.targets.numpy()[starts, options]], 1)]
     figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.add_subplot()
-    axes.add_collection(LineCollection(list(lines), colors="#d4d8e0", linewidths=0.5, zorder=0))
+    axes.add_collection(LineCollection(list(lines), colors=_PALE, linewidths=0.5, zorder=0))
     jumps = model.is_jump.numpy()
-    axes.scatter(places[~jumps, 0], places[~jumps, 1], s=6, color="#71717a", zorder=1)
-    axes.scatter(places[jumps, 0], places[jumps, 1], s=60, color=_JUMP, marker="*", zorder=3)
+    axes.scatter(places[~jumps, 0], places[~jumps, 1], s=6, color=_GREY, zorder=1)
+    axes.scatter(places[jumps, 0], places[jumps, 1], s=90, color="black", marker="*", zorder=3)
     for task, (way, color) in enumerate(zip(ways, COLORS, strict=False), 1):
         broken = np.linalg.norm(np.diff(way, axis=0), axis=1) > float(model.jump)
         shown = np.insert(way, np.flatnonzero(broken) + 1, np.nan, axis=0)

@@ -90,14 +90,17 @@ def _say(words: str) -> None:
 def signals_handled() -> Iterator[None]:
     """Make Ctrl-C and SIGTERM raise :class:`Stopped` while in the context; may be nested.
 
-    Handlers that the program set itself stay, and so does a signal that is ignored. Without effect
-    in other threads than the main one, where Python calls no handlers.
+    Handlers that the program set itself stay, and so does a signal that is ignored. That of
+    TorchRL waits, which a ``LazyMemmapStorage`` sets to remove its files: it does so at exit, too.
+    Without effect in other threads than the main one, where Python calls no handlers.
     """
     if _state.before or threading.current_thread() is not threading.main_thread():
         yield
         return
     for signum in _SIGNALS:
-        if signal.getsignal(signum) in (signal.SIG_DFL, signal.default_int_handler):
+        handler: Any = signal.getsignal(signum)
+        default = handler in (signal.SIG_DFL, signal.default_int_handler)
+        if default or getattr(handler, "__module__", "").startswith("torchrl."):
             _state.before[signum] = signal.signal(signum, _handle)
     try:
         yield

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -11,11 +12,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import FeatureGoal, FollowGoals, OptionPool, RepeatActions
 from torchrl_hmcts.envs.gym.features import Features, whole_observation
 from torchrl_hmcts.envs.gym.task import fixed_actions
-from torchrl_hmcts.trainers.skills.controllability import (
-    Controllability,
-    probe_controllability,
-    random_states,
-)
+from torchrl_hmcts.trainers.skills.controllability import probe_controllability, random_states
 
 _STATES = 60  # in which every action is tried
 _EFFECT = 0.02  # of a feature's span, that an action must raise and another must lower
@@ -66,16 +63,16 @@ def find_goals(
         seed=seed,
     )
     states = random_states(pool, _STATES, seed)
-    found = probe_controllability(pool, states, "features")
+    found = probe_controllability(
+        pool, states, "features", min_dependence=0.1, min_values=3, min_effect=_EFFECT
+    )
     points = states["features"].double().numpy()
     for key in ("features", "desired_goal"):
         if key in starts.keys() and starts[key].shape[-1] == points.shape[-1]:
             points = np.concatenate([points, starts[key].double().numpy()])
     low, span = points.min(0), np.ptp(points, 0)
     effects = (found.effects - found.effects.mean(0)) / np.maximum(span, 1e-9)
-    found = Controllability(
-        effects, found.dependence, found.num_values, found.motion, 0.1, 3, _EFFECT
-    )
+    found = replace(found, effects=effects)
     goals = [
         FeatureGoal(
             features,

@@ -252,32 +252,30 @@ class GymKit(Kit):
     def given_worker(self) -> TensorDictModuleBase | None:
         if self.config.options == "learned":
             return None
-        if self._moves and self.config.options != "goals":
-            space: Any = self.gym_env.action_space
-            self._fixed = GridMoves(int(space.n))
-            self.config = dataclasses.replace(self.config, num_skills=self._fixed.num_options)
+        self._fixed = self._given_options()
+        self.config = dataclasses.replace(self.config, num_skills=self._fixed.num_options)
+        if not isinstance(self._fixed, RepeatActions):
             return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        if self.config.options == "goals":
-            if self.look.discrete:
-                raise ValueError(
-                    f"options=goals brings a feature to a value between others; those of "
-                    f"{self.config.id} are kinds without an order. Use options=actions."
-                )
-            make = partial(make_task, self._env, self.look, False, self.config.make)
-            self._fixed = find_goals(
-                make,
-                self.look.features,
-                self.starts("train", 10),
-                option_steps=self.config.option_steps,
-                seed=self.config.seed,
-            )
-            self.config = dataclasses.replace(self.config, num_skills=self._fixed.num_options)
-            return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        actions = fixed_actions(self.gym_env.action_space)
-        self._fixed = RepeatActions(actions)
-        self.config = dataclasses.replace(self.config, num_skills=len(actions))
-        table = torch.from_numpy(np.array(actions))
+        table = torch.from_numpy(np.array(self._fixed.actions))
         return TensorDictModule(lambda skill: table[skill], ["skill"], ["action"])
+
+    def _given_options(self) -> Any:
+        config, space = self.config, self.gym_env.action_space
+        if config.options != "goals":
+            moves: Any = space
+            return GridMoves(int(moves.n)) if self._moves else RepeatActions(fixed_actions(space))
+        if self.look.discrete:
+            raise ValueError(
+                f"options=goals brings a feature to a value between others; those of {config.id} "
+                "are kinds without an order. Use options=actions."
+            )
+        return find_goals(
+            partial(make_task, self._env, self.look, False, config.make),
+            self.look.features,
+            self.starts("train", 10),
+            option_steps=config.option_steps,
+            seed=config.seed,
+        )
 
     def prepare(self, worker: TensorDictModuleBase) -> None:
         """Set the novelty radius to three quarters of how far learned options move the features."""

@@ -6,7 +6,9 @@ Letters: T recorded steps, F numbers of a place, B transitions of an update.
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from torchrl_hmcts.planners import (
     MCTSPlanner,
     ProgressiveWidening,
     SearchBudget,
+    ValueEvaluator,
 )
 from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
 
@@ -55,20 +58,6 @@ class _ToGoal(nn.Module):
         return self.layers(torch.cat([seen, ahead], -1)).tanh()
 
 
-def make_worker(data: TensorDictBase, config: OGBenchConfig) -> TensorDictModule:
-    """Return a worker that reads ``"observation"`` and ``"goal"`` and writes ``"action"``.
-
-    Args:
-        data: recorded episodes, for the sizes and the spread of the observation.
-        config: of the run.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        actions, seen = data["action"].shape[-1], data["observation"].float()
-        network = _ToGoal(seen, config.num_places, actions, config.radius)
-    return TensorDictModule(network, ["observation", "goal"], ["action"])
-
-
 def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel:
     """Return the option model of recorded episodes.
 
@@ -88,12 +77,51 @@ def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel:
     )
 
 
+@dataclass
+class Learned:
+    """A worker and its training, which a checkpoint keeps beside the networks.
+
+    Attributes:
+        loss: with the worker in ``actor_network``.
+        curves: of the loss's outputs, by name, and the ``"updates"`` at which they were taken.
+        cpu_seconds: of the training.
+    """
+
+    loss: GoalCloningLoss
+    curves: dict[str, list[float]] = field(default_factory=dict)
+    cpu_seconds: float = 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the training without the networks."""
+        return {"curves": self.curves, "cpu_seconds": self.cpu_seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over a training.
+
+        Args:
+            state_dict: of :meth:`state_dict`.
+        """
+        self.curves, self.cpu_seconds = state_dict["curves"], state_dict["cpu_seconds"]
+
+
+def make_loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
+    """Return the loss of a worker that reads ``"observation"`` and ``"goal"``, writes ``"action"``.
+
+    Args:
+        data: recorded episodes, for the sizes and the spread of the observation.
+        config: of the run.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        actions, seen = data["action"].shape[-1], data["observation"].float()
+        network = _ToGoal(seen, config.num_places, actions, config.radius)
+    worker = TensorDictModule(network, ["observation", "goal"], ["action"])
+    return GoalCloningLoss(worker, progress_coeff=config.progress_coeff)
+
+
 def learn(
-    data: TensorDictBase,
-    config: OGBenchConfig,
-    *,
-    progress: Callable[[Any], Any] = iter,
-) -> tuple[GoalCloningLoss, dict[str, list[float]]]:
+    data: TensorDictBase, config: OGBenchConfig, *, progress: Callable[[Any], Any] = iter
+) -> Learned:
     """Train the worker to reach places that lie ahead in recorded episodes, but behind no jump.
 
     Args:
@@ -102,9 +130,9 @@ def learn(
         progress: wraps the range of the updates.
 
     Returns:
-        The loss, with the worker in ``actor_network``, and the curves of its outputs.
+        The worker and its training.
     """
-    loss = GoalCloningLoss(make_worker(data, config), progress_coeff=config.progress_coeff)
+    begin, loss = time.process_time(), make_loss(data, config)
     optimizer = torch.optim.Adam(loss.parameters(), config.learning_rate)
     decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.updates)
     draw = _Hindsight(data, config)
@@ -120,11 +148,14 @@ def learn(
             curves["updates"].append(update + 1)
             for name in ("loss_actor", "action_error"):
                 curves[name].append(out[name].item())
-    return loss.eval(), curves
+    return Learned(loss, curves, time.process_time() - begin)
 
 
 class _Hindsight:
-    """Draws transitions, each with a place to which the same episode led within some steps."""
+    """Draws transitions, each with a place to which the same episode led within some steps.
+
+    TorchRL's ``HERReplayBuffer`` draws goals from all the rest of an episode.
+    """
 
     def __init__(self, data: TensorDictBase, config: OGBenchConfig) -> None:
         self.seen = data["observation"].float().contiguous()
@@ -155,18 +186,6 @@ class _Hindsight:
         )
 
 
-class _Values:
-    """Values of landmarks for one goal, for the planner's leaves."""
-
-    in_keys = ("landmark",)
-
-    def __init__(self) -> None:
-        self.table = torch.zeros(0)
-
-    def __call__(self, td: TensorDictBase) -> Tensor:
-        return self.table[td["landmark"]]
-
-
 class LandmarkAgent:
     """Acts towards a goal: a search before every option, and a worker that takes it.
 
@@ -191,11 +210,12 @@ class LandmarkAgent:
         self._given, self.worker, self.config = model, worker, config
         self.model = copy.deepcopy(model)
         self._env = LandmarkEnv(self.model, gamma=config.gamma, seed=config.seed)
-        self._values = _Values()
+        self._table = torch.zeros(0)  # values of landmarks on the way to the goal
+        values = TensorDictModule(lambda at: self._table[at], ["landmark"], ["state_value"])
         self.planner = MCTSPlanner(
             self._env,
             tree_policy=UCT(c=0.05),
-            leaf_evaluator=self._values,
+            leaf_evaluator=ValueEvaluator(values),
             chance=ProgressiveWidening() if model.has_chance else None,
             backup="max",
             final_choice=HighestValue(),
@@ -211,7 +231,7 @@ class LandmarkAgent:
         self.model.load_state_dict(self._given.state_dict())
         self._goal = torch.from_numpy(goal[: self.config.num_places]).float()
         self._goal_landmark = self.model.nearest(self._goal[None], goal=True)
-        self._values.table = self.model.values(self._goal_landmark, self.config.gamma)
+        self._table = self.model.values(self._goal_landmark, self.config.gamma)
         self._target: Tensor | None = None
         self._last: Tensor | None = None
         self._steps, self._limit, self._chosen = 0, 0, (0, -1)
@@ -245,8 +265,7 @@ class LandmarkAgent:
             landmark, option = self._chosen
             if option >= 0:  # it did not lead where it should
                 self.model.durations[landmark, option] += self._limit
-                table = self.model.values(self._goal_landmark, self.config.gamma)
-                self._values.table = table
+                self._table = self.model.values(self._goal_landmark, self.config.gamma)
             return True
         near = self.config.radius / 2
         if self._chosen[1] < 0 or float((here - self._target).norm()) >= near:

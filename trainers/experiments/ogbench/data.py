@@ -15,19 +15,17 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.trainers.experiments.ogbench.names import Recipe, split_name
+from torchrl_hmcts.trainers.saving.files import replacing
 
 Cell = tuple[int, int]
 _SIDES = ((-1, 0), (0, -1), (1, 0), (0, 1))
 
 
-def _identity(steps: Any) -> Any:
-    return steps
-
-
 def record(
-    name: str, *, seed: int = 0, episodes: int = 0, progress: Callable[[Any], Any] = _identity
+    name: str, *, seed: int = 0, episodes: int = 0, progress: Callable[[Any], Any] = iter
 ) -> TensorDict:
     """Record a dataset as OGBench's script does; its draws are other ones.
 
@@ -39,7 +37,7 @@ def record(
     Args:
         name: of the dataset.
         seed: of all draws.
-        episodes: how many. Default: as many as OGBench records for training.
+        episodes: number of them. Default 0: as many as OGBench records for training.
         progress: wraps the range of the episodes, e.g. ``tqdm``.
 
     Returns:
@@ -47,8 +45,10 @@ def record(
         episode's last step.
 
     Raises:
-        ValueError: if the name is unknown.
+        ValueError: if the name is unknown, or a number is negative.
     """
+    whole_number("record", "seed", seed, least=0)
+    whole_number("record", "episodes", episodes, least=0)
     recipe = split_name(name)
     env = make_gym(recipe.env, terminate_at_goal=False, max_episode_steps=recipe.steps)
     env.action_space.seed(seed)
@@ -161,10 +161,12 @@ def load(path: str | Path) -> TensorDictBase:
 
 
 def save(data: TensorDictBase, folder: str | Path) -> None:
-    """Write recorded episodes as memory-mapped tensors, which TorchRL's storages read.
+    """Write recorded episodes, whole or not at all, as memory-mapped tensors.
 
     Args:
         data: of :func:`record`.
         folder: made if absent.
     """
-    data.memmap(folder)
+    Path(folder).parent.mkdir(parents=True, exist_ok=True)
+    with replacing(folder) as temporary:
+        data.memmap(temporary)

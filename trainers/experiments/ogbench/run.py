@@ -13,13 +13,13 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs.gym.settable import make_gym
-from torchrl_hmcts.objectives import GoalCloningLoss
 from torchrl_hmcts.trainers.evaluation import spread
 from torchrl_hmcts.trainers.experiments.ogbench.agent import (
     LandmarkAgent,
+    Learned,
     fit_model,
     learn,
-    make_worker,
+    make_loss,
 )
 from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
 from torchrl_hmcts.trainers.experiments.ogbench.data import load, record, save
@@ -27,7 +27,7 @@ from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.figures.intervals import wilson
 from torchrl_hmcts.trainers.runs.console import counted
 from torchrl_hmcts.trainers.runs.run import open_run
-from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
+from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, plain_checkpoint
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 
 _FOLDER = Path("data") / "ogbench"
@@ -50,31 +50,30 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
         config = run.config.sized()
         torch.set_num_threads(1)
         data = recorded(config)
-        begin = time.process_time()
+        learned = Learned(make_loss(data, config))
         if run.resumes:
-            loss = _loss(data, config)
-            curves: dict[str, list[float]] = {}
-            load_networks(loss, run.path)
+            path = newest_checkpoint(run.checkpoints)
+            plain_checkpoint(loss_module=learned.loss, training=learned).load(path)
         else:
-            loss, curves = learn(data, config, progress=counted("learn", "updates"))
+            learned = learn(data, config, progress=counted("learn", "updates"))
             run.checkpoints.mkdir(exist_ok=True)
-            name = f"checkpoint-{config.updates:012d}.torchrl"
-            plain_checkpoint(loss_module=loss).save(run.checkpoints / name)
-        seconds = time.process_time() - begin
-        save_worker(run.path, loss, config.updates)
-        steps = curves.pop("updates", [])
-        run.write_curves({k: (steps, v) for k, v in curves.items()}, "updates")
-        agent = LandmarkAgent(fit_model(data, config), loss.actor_network, config)
+            path = run.checkpoints / f"checkpoint-{config.updates:012d}.torchrl"
+            plain_checkpoint(loss_module=learned.loss, training=learned).save(path)
+        save_worker(run.path, learned.loss, config.updates)
+        steps = learned.curves["updates"]
+        curves = {k: (steps, values) for k, values in learned.curves.items() if k != "updates"}
+        run.write_curves(curves, "updates")
+        agent = LandmarkAgent(fit_model(data, config), learned.loss.actor_network, config)
         episodes = play_tasks(agent, config, progress=counted("act", "episodes"))
         metrics: dict[str, Any] = {
             "seed": config.seed,
             "recorded_steps": len(data),
             "landmarks": agent.model.num_landmarks,
-            "train_cpu_seconds": round(seconds, 1),
+            "train_cpu_seconds": round(learned.cpu_seconds, 1),
             "test": summary(episodes),
         }
         with run.finish(metrics, config, title=f"Offline: {config.id}") as pictures:
-            words = "Landmarks and options (grey), places of jumps (red), an episode of each task."
+            words = "Landmarks and options (grey), places before jumps (stars), an episode a task."
             with pictures.one("search.png", words) as path:
                 from torchrl_hmcts.trainers.figures.landmarks import plot_landmarks
 
@@ -95,15 +94,11 @@ def evaluate_ogbench(config: OGBenchConfig) -> dict[str, Any]:
     config = config.sized()
     torch.set_num_threads(1)
     data = recorded(config)
-    loss = _loss(data, config)
+    loss = make_loss(data, config)
     checkpoint = load_networks(loss, config.out)
     agent = LandmarkAgent(fit_model(data, config), loss.actor_network, config)
-    return {"checkpoint": checkpoint.name, "test": summary(play_tasks(agent, config))}
-
-
-def _loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
-    worker = make_worker(data, config)
-    return GoalCloningLoss(worker, progress_coeff=config.progress_coeff)
+    episodes = play_tasks(agent, config, progress=counted("act", "episodes"))
+    return {"checkpoint": checkpoint.name, "test": summary(episodes)}
 
 
 def recorded(config: OGBenchConfig) -> TensorDictBase:
