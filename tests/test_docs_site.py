@@ -30,6 +30,7 @@ RUN_ELSEWHERE = {
 }
 VERBS = {"demo", "train", "evaluate", "play", "report", "sweep", "data", "list", "completion"}
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
+SHOWN = re.compile(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)  # and its output
 
 
 def pages() -> dict[str, str]:
@@ -149,11 +150,13 @@ def test_every_page_with_code_is_run_by_a_test() -> None:
 @pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")
 @pytest.mark.filterwarnings("ignore:The 'post_loss' hook stage:FutureWarning")
 @pytest.mark.parametrize("page", RUN_HERE)
-def test_every_python_block_of_a_page_runs(page: str, tmp_path, monkeypatch) -> None:
+def test_every_python_block_of_a_page_runs(page: str, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     namespace: dict = {}
-    for block in BLOCK.findall(PAGES[page]):
+    for block, output in SHOWN.findall(PAGES[page]):
         exec(compile(block, page, "exec"), namespace)  # noqa: S102
+        said = capsys.readouterr().out
+        assert not output or said.strip() == output.strip()
 
 
 def commands() -> list[tuple[str, str]]:
