@@ -31,6 +31,7 @@ from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
 from torchrl_hmcts.envs.lab.mazes import lab_maze
 from torchrl_hmcts.envs.lab.recordings import replay_recording
 from torchrl_hmcts.envs.mazes.gridworld import GridworldMazeEnv
+from torchrl_hmcts.envs.mazes.items import MazeItems
 from torchrl_hmcts.envs.mazes.layouts import (
     free_tiles,
     generate_mazes,
@@ -58,6 +59,7 @@ __all__ = [
     "GridworldMazeEnv",
     "JoinedWorkers",
     "LAB_ACTIONS",
+    "MazeItems",
     "LabMazeEnv",
     "MujocoBatch",
     "MujocoTask",

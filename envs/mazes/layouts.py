@@ -23,6 +23,9 @@ from torchrl_hmcts.envs.mazes.wall_growing import draw_mazes
 
 POOL_SIZE = 2342
 POOL_TRAIN_SIZE = 2000
+LARGE_WALLS = {15: 96, 31: 440}
+"""Walls of the larger mazes by their side: the most frequent numbers that the algorithm grows."""
+_LARGE_TRAIN, _LARGE_TEST = 256, 342
 # Changing any of these changes the pool: every published figure rests on it.
 _POOL_SEED = 0
 _POOL_SHA256 = "cba98569ef76344ee619bbfc73b69ce3f545cf2dfba06fde46cb7d988c19d63c"
@@ -140,7 +143,7 @@ def generate_mazes(
     )
 
 
-def maze_pool(split: Literal["train", "test", "all"] = "all") -> Tensor:
+def maze_pool(split: Literal["train", "test", "all"] = "all", size: int = 9) -> Tensor:
     """Return the fixed pool of 2,342 distinct connected 9x9 mazes with 31 walls, or a split of it.
 
     The pool is generated once, in a few seconds, and kept in a user cache folder:
@@ -151,12 +154,14 @@ def maze_pool(split: Literal["train", "test", "all"] = "all") -> Tensor:
     Args:
         split (str): ``"train"`` (the first 2,000), ``"test"`` (the other 342) or ``"all"``. Default
             ``"all"``.
+        size (int): side of the mazes, 9, 15 or 31. Default 9. Of the larger ones there are 598
+            (256 to train in, 342 to test in), with 96 and 440 walls, made when they are asked for.
 
     Returns:
         bool Tensor ``[2000 | 342 | 2342, 9, 9]``, True = wall; a copy that may be changed freely.
 
     Raises:
-        ValueError: if ``split`` is another word.
+        ValueError: if ``split`` is another word, or there are no mazes of that size.
 
     Reference:
         Dissertation, section 3.1.1 (the pool); the split is this project's.
@@ -167,12 +172,20 @@ def maze_pool(split: Literal["train", "test", "all"] = "all") -> Tensor:
     """
     if split not in ("train", "test", "all"):
         raise ValueError(f'split must be "train", "test" or "all", got {split!r}.')
-    pool = _pool()
-    if split == "train":
-        pool = pool[:POOL_TRAIN_SIZE]
-    elif split == "test":
-        pool = pool[POOL_TRAIN_SIZE:]
-    return pool.clone()
+    if size != 9 and size not in LARGE_WALLS:
+        raise ValueError(
+            f"There are mazes of 9, {' and '.join(map(str, LARGE_WALLS))} tiles a side; got "
+            f"{size!r}. Make others with generate_mazes(height=..., width=..., num_walls=...)."
+        )
+    pool, train = (_pool(), POOL_TRAIN_SIZE) if size == 9 else (_large(size), _LARGE_TRAIN)
+    parts = {"train": slice(train), "test": slice(train, None), "all": slice(None)}
+    return pool[parts[split]].clone()
+
+
+@lru_cache(maxsize=len(LARGE_WALLS))
+def _large(size: int) -> Tensor:
+    count, walls = _LARGE_TRAIN + _LARGE_TEST, LARGE_WALLS[size]
+    return generate_mazes(count, height=size, width=size, num_walls=walls, seed=_POOL_SEED)
 
 
 @lru_cache(maxsize=1)

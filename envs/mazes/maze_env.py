@@ -177,6 +177,8 @@ def _limits(spec: TensorSpec) -> tuple[torch.dtype, list[int], Tensor, Tensor]:
     """Dtype, shape and bounds of an entry."""
     if isinstance(spec, Bounded):
         low, high = spec.space.low.cpu(), spec.space.high.cpu()
+    elif isinstance(spec, Binary):
+        low, high = torch.tensor(0), torch.tensor(1)
     else:
         low, high = torch.tensor(0), torch.tensor(int(spec.space.n) - 1)
     return spec.dtype, list(spec.shape), low, high

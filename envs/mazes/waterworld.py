@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical
+from torchrl.data import Binary, Bounded, Categorical
 
+from torchrl_hmcts.checks import instance, real_number
 from torchrl_hmcts.envs.mazes.chipmunk import ChipmunkMazes
+from torchrl_hmcts.envs.mazes.items import MazeItems, PlacedItems
 from torchrl_hmcts.envs.mazes.maze_env import TileMazeEnv
 from torchrl_hmcts.envs.mazes.rendering import draw_maze
 
 _DIRECTIONS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))  # (x, y) of up, down, left, right
+_HEADINGS = 32  # of a boat, which turns from one to the next in a base step
+_TURNS = (0, -1, 1)  # of ahead, left, right
 _OVERLAP_TOLERANCE = 1e-3  # tiles; a disc in contact is up to 2e-5 inside the wall
 
 
@@ -50,6 +54,15 @@ class WaterworldMazeEnv(TileMazeEnv):
             five times what a good player needs.
         observation (bool): write ``"observation"``; simulators whose worker does not read it save
             time. Default True.
+        steering ("directions" or "heading"): with ``"heading"`` the disc is a boat. Its actions are
+            0 ahead (thrust where it heads), 1 and 2 turn left and right by 11.25 degrees (no
+            thrust); ``"heading"`` (float32 ``[*B, 2]``, a unit vector) joins the state. Default:
+            thrust in four directions.
+        drag (float): per second; without thrust the velocity falls to ``exp(-drag)`` of it in one.
+            Default 2; at least 4/3, so that thrust keeps within :attr:`MAX_SPEED`.
+        goal_reward (float): for the target. Default 1.
+        items (MazeItems, optional): apples and a key. ``"items"`` (bool ``[*B, K]``, True where one
+            lies) joins the state. Default: none.
         batch_size (sequence of int): copies that ``reset()`` without a tensordict makes, and the
             batch size of the specs. Any other batch shape can be stepped too. Default none.
         seed (int, optional): of the env's own generator; drawn from torch's global one by default.
@@ -81,7 +94,7 @@ class WaterworldMazeEnv(TileMazeEnv):
     THRUST = 4.0
     """Acceleration of the disc by its thrust, tiles per second squared."""
     DAMPING = math.exp(-2.0)
-    """Share of its velocity that the disc keeps in one second without thrust."""
+    """Share of its velocity that the disc keeps in one second without thrust, by default."""
     PLAYER_RADIUS = 0.25
     """Radius of the disc, tiles."""
     TARGET_RADIUS = 0.25
@@ -99,17 +112,34 @@ class WaterworldMazeEnv(TileMazeEnv):
         *,
         max_steps: int = 1000,
         observation: bool = True,
+        steering: Literal["directions", "heading"] = "directions",
+        drag: float = 2.0,
+        goal_reward: float = 1.0,
+        items: MazeItems | None = None,
         batch_size: Sequence[int] = (),
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(mazes, max_steps, observation, batch_size, device)
+        name = "WaterworldMazeEnv"
+        self.drag = real_number(name, "drag", drag, least=4 / 3)
+        self.goal_reward = real_number(name, "goal_reward", goal_reward)
+        if steering not in ("directions", "heading"):
+            raise ValueError(
+                f'{name} is steered by "directions" or by "heading"; got {steering!r}.'
+            )
+        self.steering = steering
+        instance(name, "items", items, MazeItems, type(None))
+        self.items = items
         self._acceleration = np.array(_DIRECTIONS, np.float32) * np.float32(self.THRUST)  # [A, 2]
+        angles = np.arange(_HEADINGS) * (2.0 * math.pi / _HEADINGS)
+        self._compass = np.stack((np.cos(angles), np.sin(angles)), -1).astype(np.float32)
         self._touch = self.PLAYER_RADIUS + self.TARGET_RADIUS
+        self._placed = items and PlacedItems(items, self.mazes, self._touch)
         self._physics = ChipmunkMazes(
             self.mazes.cpu().numpy(),
             radius=self.PLAYER_RADIUS,
-            damping=self.DAMPING,
+            damping=math.exp(-self.drag),
             time_step=self.TIME_STEP,
         )
         device = self.device
@@ -122,6 +152,10 @@ class WaterworldMazeEnv(TileMazeEnv):
             "target": Bounded(zero, size, device=device),
             **self._counted(),
         }
+        if steering == "heading":
+            state["heading"] = Bounded(-torch.ones_like(size), torch.ones_like(size), device=device)
+        if items is not None:
+            state["items"] = Binary(items.count, dtype=torch.bool, device=device)
         read_outs: dict[str, Any] = {}
         if self._writes_observation:
             read_outs["observation"] = Bounded(
@@ -129,29 +163,42 @@ class WaterworldMazeEnv(TileMazeEnv):
                 torch.cat((size, size, (size - 0.5).repeat(self.num_walls))),
                 device=device,
             )
-        action = Categorical(len(_DIRECTIONS), shape=(), device=device)
+        num_actions = len(_DIRECTIONS if steering == "directions" else _TURNS)
+        action = Categorical(num_actions, shape=(), device=device)
         self._set_up(state, read_outs, action, seed, free=("position", "target"))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         # Small arrays: numpy does in one microsecond what torch does in three.
         target, maze = tensordict.get("target"), tensordict.get("maze_index")
         shape, device = target.shape, target.device
+        index = maze.numpy(force=True).reshape(-1)
+        thrust, state = self._thrust(tensordict)
         new_position, new_velocity = self._physics.step(
-            maze.numpy(force=True).reshape(-1),
+            index,
             tensordict.get("position").numpy(force=True).reshape(-1, 2),
             tensordict.get("velocity").numpy(force=True).reshape(-1, 2),
-            self._acceleration[tensordict.get("action").numpy(force=True).reshape(-1)],
+            thrust,
         )
         offset = new_position - target.numpy(force=True).reshape(-1, 2)
         offset *= offset
-        terminated = (offset[:, 0] + offset[:, 1] < self._touch**2).reshape(*shape[:-1], 1)
+        met = offset[:, 0] + offset[:, 1] < self._touch**2
+        reward = met.astype(np.float32)
+        if self._placed is not None:
+            left = tensordict.get("items").numpy(force=True).reshape(len(index), -1)
+            state["items"], earned, is_open = self._placed.take(index, new_position, left)
+            met &= is_open
+            reward = met * np.float32(self.goal_reward) + earned
+        elif self.goal_reward != 1.0:
+            reward *= np.float32(self.goal_reward)
+        terminated = met.reshape(*shape[:-1], 1)
         step_count = tensordict.get("step_count").numpy(force=True) + 1
         truncated = step_count >= self.max_steps
         arrays = {
-            "reward": terminated.astype(np.float32),
+            "reward": reward.reshape(terminated.shape),
             "terminated": terminated,
             "truncated": truncated,
             "done": terminated | truncated,
+            **{key: value.reshape(*shape[:-1], -1) for key, value in state.items()},
         }
         position, velocity, steps, *rest = (
             torch.from_numpy(array).to(device)
@@ -166,6 +213,17 @@ class WaterworldMazeEnv(TileMazeEnv):
         return self._write_state(
             position, velocity, target, maze, steps, tensordict.batch_size, **entries
         )
+
+    def _thrust(self, tensordict: TensorDictBase) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """The acceleration of each disc, float32 ``[n, 2]``, and where a boat heads afterwards."""
+        action = tensordict.get("action").numpy(force=True).reshape(-1)
+        if self.steering == "directions":
+            return self._acceleration[action], {}
+        heading = tensordict.get("heading").numpy(force=True).reshape(-1, 2)
+        angle = np.arctan2(heading[:, 1], heading[:, 0]) * (_HEADINGS / (2.0 * math.pi))
+        index = (np.rint(angle).astype(np.int64) + np.take(_TURNS, action)) % _HEADINGS
+        after = self._compass[index]
+        return after * ((action == 0) * np.float32(self.THRUST))[:, None], {"heading": after}
 
     def _write_state(
         self,
@@ -190,17 +248,32 @@ class WaterworldMazeEnv(TileMazeEnv):
         maze, player, target, steps = self._draw_tiles(shape)
         position = self._tile_center(player)
         at_rest = torch.zeros_like(position)
-        return self._write_state(position, at_rest, self._tile_center(target), maze, steps, shape)
+        entries = {}
+        if self.steering == "heading":
+            drawn = torch.randint(_HEADINGS, shape, generator=self._generator)
+            entries["heading"] = torch.from_numpy(self._compass)[drawn].to(position.device)
+        if self.items is not None:
+            entries["items"] = self._all_items(shape)
+        return self._write_state(
+            position, at_rest, self._tile_center(target), maze, steps, shape, **entries
+        )
+
+    def _all_items(self, shape: torch.Size) -> Tensor:
+        assert self.items is not None
+        return torch.ones((*shape, self.items.count), dtype=torch.bool, device=self.device)
 
     def _tile_center(self, tile: Tensor) -> Tensor:
         column_row = torch.stack((tile % self.width, tile // self.width), -1)
         return column_row + 0.5
 
     def _reset_to_state(self, tensordict: TensorDictBase | None) -> TensorDict:
-        position, velocity, target, maze, steps = self._state_of(tensordict)
+        position, velocity, target, maze, steps, *others = self._state_of(tensordict)
         assert tensordict is not None
         self._check_places(position, target, maze)
-        return self._write_state(position, velocity, target, maze, steps, tensordict.batch_size)
+        entries = dict(zip(list(self._limits)[5:], others, strict=True))
+        return self._write_state(
+            position, velocity, target, maze, steps, tensordict.batch_size, **entries
+        )
 
     def _check_places(self, position: Tensor, target: Tensor, maze: Tensor) -> None:
         size = torch.tensor([self.width, self.height], device=position.device)
@@ -247,6 +320,8 @@ class WaterworldMazeEnv(TileMazeEnv):
         *,
         velocity: Any = (0.0, 0.0),
         step_count: Any = 0,
+        heading: Any = (1.0, 0.0),
+        items: Any = None,
     ) -> TensorDict:
         """Build a state, to step from or to pass to ``reset(td, set_state=True)``.
 
@@ -256,6 +331,10 @@ class WaterworldMazeEnv(TileMazeEnv):
             target (sequence or Tensor): float ``[*B, 2]``, (x, y) of the target, tiles.
             velocity (sequence or Tensor): float ``[*B, 2]``, tiles per second. Default at rest.
             step_count (int or Tensor): base steps already taken, ``[*B]``. Default 0.
+            heading (sequence or Tensor): of a boat, float ``[*B, 2]``, a unit vector; rounded to
+                one of 32. Default to the right.
+            items (sequence or Tensor, optional): bool ``[*B, K]``, True where an item lies, in a
+                maze with items. Default: all.
 
         Returns:
             TensorDict ``[*B]`` as ``env.reset()`` gives it; the arguments are broadcast to ``*B``.
@@ -273,19 +352,27 @@ class WaterworldMazeEnv(TileMazeEnv):
         maze, steps = (torch.as_tensor(x, device=device) for x in (maze_index, step_count))
         points = [
             torch.as_tensor(x, dtype=torch.float32, device=device)
-            for x in (position, velocity, target)
+            for x in (position, velocity, target, heading)
         ]
-        for name, point in zip(("position", "velocity", "target"), points, strict=True):
+        names = ("position", "velocity", "target", "heading")
+        for name, point in zip(names, points, strict=True):
             if not point.ndim or point.shape[-1] != 2:
                 raise ValueError(f"{name} must be (x, y) pairs [*B, 2]; got {list(point.shape)}.")
         shape = torch.broadcast_shapes(maze.shape, steps.shape, *(p.shape[:-1] for p in points))
         maze, steps = (x.to(torch.int64).expand(shape).clone() for x in (maze, steps))
-        at, moving, goal = (point.expand(*shape, 2).clone() for point in points)
+        at, moving, goal, ahead = (point.expand(*shape, 2).clone() for point in points)
         steps = steps.unsqueeze(-1)
-        values = (at, moving, goal, maze, steps)
-        self._check_form(dict(zip(self._limits, values, strict=True)), shape)
+        values = {"position": at, "velocity": moving, "target": goal}
+        values |= {"maze_index": maze, "step_count": steps}
+        entries = {}
+        if self.steering == "heading":
+            entries["heading"] = ahead
+        if self.items is not None:
+            lying = self._all_items(shape) if items is None else torch.as_tensor(items)
+            entries["items"] = lying.to(device).expand(*shape, self.items.count).clone()
+        self._check_form(values | entries, shape)
         self._check_places(at, goal, maze)
-        state = self._write_state(at, moving, goal, maze, steps, shape)
+        state = self._write_state(at, moving, goal, maze, steps, shape, **entries)
         return state.update({k: torch.zeros_like(steps, dtype=torch.bool) for k in self.done_keys})
 
     def _draw(self, tensordict: TensorDictBase, options: dict[str, Any]) -> np.ndarray:

@@ -12,7 +12,8 @@ from typing import Protocol
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
 
 from torchrl_hmcts.checks import instance, nested_keys, real_number, whole_number
 
@@ -126,6 +127,9 @@ class RadiusNovelty(_Counted):
         shorter_paths: accept states near others that are reached in fewer base steps. Default
             False: a place is searched from the first path to it. Meant for a budget that continues
             after the first plan (``improve_expansions``).
+        encoder (TensorDictModule, optional): writes ``key`` from entries of the state or
+            observation, e.g. a :class:`~torchrl_hmcts.modules.SkillEncoder`: novelty is then of
+            learned features. Default: none, ``key`` is an entry itself.
 
     Raises:
         ValueError: if no key is given, the radius is not positive, the scales do not match the
@@ -155,15 +159,25 @@ class RadiusNovelty(_Counted):
         relaxation: float = 0.75,
         max_relaxations: int = 14,
         shorter_paths: bool = False,
+        encoder: TensorDictModuleBase | None = None,
     ) -> None:
-        self.in_keys = nested_keys("RadiusNovelty", "key", key)
+        self.keys = nested_keys("RadiusNovelty", "key", key)
+        self.encoder, self.in_keys = encoder, self.keys
+        if encoder is not None:
+            instance("RadiusNovelty", "encoder", encoder, TensorDictModuleBase)
+            if unknown := set(self.keys) - {unravel_key(k) for k in encoder.out_keys}:
+                raise ValueError(
+                    f"RadiusNovelty compares {sorted(map(str, unknown))}; its encoder writes "
+                    f"{encoder.out_keys}."
+                )
+            self.in_keys = [unravel_key(k) for k in encoder.in_keys]
         self.radius = real_number("RadiusNovelty", "radius", radius, above=0.0)
         if scale is not None:
             instance("RadiusNovelty", "scale", scale, Sequence, np.ndarray)
-        self.scale = [1.0] * len(self.in_keys) if scale is None else list(scale)
-        if len(self.scale) != len(self.in_keys):
+        self.scale = [1.0] * len(self.keys) if scale is None else list(scale)
+        if len(self.scale) != len(self.keys):
             raise ValueError(
-                f"RadiusNovelty needs one scale per key; got {self.scale} for {self.in_keys}."
+                f"RadiusNovelty needs one scale per key; got {self.scale} for {self.keys}."
             )
         for factor in self.scale:
             real_number("RadiusNovelty", "scale", factor)
@@ -214,7 +228,10 @@ class RadiusNovelty(_Counted):
 
     def features(self, tensordict: TensorDictBase) -> np.ndarray:
         """Return the features of states, ``[m, F]``."""
-        parts = [tensordict.get(key).to(torch.float32) for key in self.in_keys]
+        if self.encoder is not None:
+            with torch.no_grad():
+                tensordict = self.encoder(tensordict.select(*self.in_keys))
+        parts = [tensordict.get(key).to(torch.float32) for key in self.keys]
         scaled = zip(parts, self.scale, strict=True)
         return _side_by_side([part if scale == 1.0 else part * scale for part, scale in scaled])
 
@@ -262,7 +279,7 @@ class RadiusNovelty(_Counted):
 
     def __repr__(self) -> str:
         shorter = ", shorter_paths=True" if self.shorter_paths else ""
-        return f"RadiusNovelty({self.in_keys}, radius={self.radius}{shorter})"
+        return f"RadiusNovelty({self.keys}, radius={self.radius}{shorter})"
 
 
 class WidthNovelty(_Counted):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -40,6 +41,9 @@ class SkillsConfig(RunConfig):
     objective: dict[str, Any] = field(default_factory=dict)
     """What sets skills apart: objective=metra, lsd, dads or diayn, the default;
     objective.KEY=VALUE."""
+    objective_key: str = ""
+    """Entry of the state that the objective reads. Default: the displacement since the skill began
+    (DIAYN) or the place; "observation": all that the env shows, and no feature made by hand."""
     loss: dict[str, Any] = field(default_factory=dict)
     """The worker's loss: loss=diayn, the default, or discrete_skill_sac; for actions within bounds
     skill_sac. Its keywords: loss.KEY=VALUE, e.g. loss.alpha_init=0.1."""
@@ -65,6 +69,9 @@ class SkillsConfig(RunConfig):
     """Leaves of the tree whose options are simulated together; more are faster, less selective."""
     novelty_radius: float = 1.0
     """Tiles within which a place counts as visited; about what an option covers."""
+    features: str = "place"
+    """What the novelty test compares: "place"; "learned": the output of the objective's network,
+    within a radius found from how far options move it; or "none": all states are searched."""
     gamma: float = 0.99
     """Discount per base step."""
     curve_mazes: int = 20
@@ -83,13 +90,14 @@ class SkillsConfig(RunConfig):
     KIT: ClassVar[str] = ""  # name of the kit
     KEPT: ClassVar[tuple[str, ...]] = (
         *("seed", "toy", "options", "worker", "algorithm", "objective", "loss", "trainer"),
-        *("planner", "num_skills"),
+        *("objective_key", "planner", "num_skills"),
     )
     LEAST = {"curve_points": 0}
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("novelty_radius", "updates_per_step")
     CHOICES = {
         "options": ("learned", "actions"),
         "algorithm": ("diayn", "hmcts"),
+        "features": ("place", "learned", "none"),
         "keep": ("best", "last"),
         "collector": ("local", "ray"),
     }
@@ -141,20 +149,44 @@ class DemoConfig(SkillsConfig):
     runs/demo (runs/demo_toy with toy=true), or the next of runs/demo_2, ... that holds no run."""
     mazes: int = 100
     """Test mazes to solve, at most the 342 of the test split."""
-    option_steps: int = 25  # type: ignore[misc]
-    """Base steps of an option (the dissertation's N_worker_samples)."""
-    skill_steps: int = 50  # type: ignore[misc]
-    """Base steps of a mini-episode in training: long enough for the skills to part."""
-    train_base_steps: int = 40_000
-    """Base steps of worker training in the training mazes."""
+    task: str = "maze"
+    """What there is to do: "maze" (reach the target), "boat" (the same with a body that must turn to
+    where it goes), "apples" (collect what is worth most before the fuel is spent) or "key" (the
+    target is shut to who has not taken the key)."""
+    size: int = 9
+    """Tiles along a side of the test mazes: 9, 15 or 31. Skills are learned in mazes of 9."""
+    search_steps: int = 0
+    """Base steps that a search may simulate; 0: no limit (in "apples" 4,000)."""
+    option_steps: int = 0  # type: ignore[misc]
+    """Base steps of an option (the dissertation's N_worker_samples); 0: 25, for a boat 40."""
+    skill_steps: int = 0  # type: ignore[misc]
+    """Base steps of a mini-episode in training: long enough for the skills to part; 0: 50, for a
+    boat 40."""
+    train_base_steps: int = 0
+    """Base steps of worker training in the training mazes; 0: 40,000, for a boat 80,000."""
+    updates_per_step: float = 0.0
+    """Updates of the networks per base step; 0: 3/64, for a boat 0.1."""
     toy: bool = False
     """1,920 base steps of training and 3 mazes, to see in seconds that everything works."""
 
     EXPERIMENT, KIT = "demo", "waterworld"
-    KEPT = (*SkillsConfig.KEPT, "skill_steps")
+    KEPT = (*SkillsConfig.KEPT, "skill_steps", "task")
+    LEAST = {**SkillsConfig.LEAST, "search_steps": 0}
+    CHOICES = {**SkillsConfig.CHOICES, "task": ("maze", "boat", "apples", "key")}
+    OWN: ClassVar[Mapping[str, tuple[float, float]]] = {  # of most tasks, of a boat
+        "option_steps": (25, 40),
+        "skill_steps": (50, 40),
+        "train_base_steps": (40_000, 80_000),
+        "updates_per_step": (3 / 64, 0.1),
+    }
 
     def __post_init__(self) -> None:
+        for name, own in self.OWN.items():
+            if getattr(self, name) == 0:
+                setattr(self, name, own[self.task == "boat"])
         super().__post_init__()
+        if self.size not in (9, 15, 31):
+            raise ValueError(f"size is 9, 15 or 31 tiles; got {self.size}.")
         if self.train_base_steps % BATCH_STEPS:
             raise ValueError(
                 f"train_base_steps={self.train_base_steps} is no whole number of batches of "
@@ -189,8 +221,13 @@ class LabMazeConfig(SkillsConfig):
 
     out: str = "runs/labmaze"
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
+    task: str = "maze"
+    """What there is to do: "maze" (find the goal), "turn" (the same without steps sideways or back)
+    or "apples" (collect apples, 1 each, before max_frames are over; the goal pays 1 and ends it)."""
     size: int = 9
     """Cells along a side of the test mazes, border included, odd; the stock level has 15."""
+    search_frames: int = 0
+    """Frames that a search may simulate; 0: no limit."""
     mazes: int = 200
     """Test mazes to solve, all from seeds that were never trained on."""
     option_frames: int = 100
@@ -200,8 +237,9 @@ class LabMazeConfig(SkillsConfig):
     early, as in the dissertation. A search that finds no plan so is made again without."""
     frames_per_step: int = 4  # type: ignore[misc]
     """Frames that an action of the worker lasts."""
-    train_frames: int = 40_000
-    """Frames of worker training at most, simulated ones included, in 256 mazes of 9 x 9."""
+    train_frames: int = 0
+    """Frames of worker training at most, simulated ones included, in 256 mazes of 9 x 9; 0: 40,000,
+    with task=turn 160,000."""
     updates_per_step: float = 0.1875
     """Updates of the networks per base step."""
     skill_frames: int = 200
@@ -238,12 +276,22 @@ class LabMazeConfig(SkillsConfig):
     }
     KEPT = (
         *SkillsConfig.KEPT,
-        *("option_frames", "frames_per_step", "updates_per_step", "skill_frames", "init_options"),
+        *(
+            "task",
+            "option_frames",
+            "frames_per_step",
+            "updates_per_step",
+            "skill_frames",
+            "init_options",
+        ),
         *("retrain_interval", "round_expansions", "novelty_radius", "gamma"),
     )
-    LEAST = {"curve_points": 0, "improve_expansions": 0, "stall_steps": 0}
+    LEAST = {"curve_points": 0, "improve_expansions": 0, "stall_steps": 0, "search_frames": 0}
+    CHOICES = {**SkillsConfig.CHOICES, "task": ("maze", "turn", "apples")}
 
     def __post_init__(self) -> None:
+        if self.train_frames == 0:
+            self.train_frames = 160_000 if self.task == "turn" else 40_000
         super().__post_init__()
         if self.size < 5 or self.size % 2 == 0:
             raise ValueError(f"size must be odd and at least 5 cells; got {self.size}.")

@@ -231,8 +231,14 @@ def make_loss(kit: Kit) -> Any:
     Args:
         kit: gives the env, the keys, and the configuration with its seed.
     """
-    if (made := kit.make_loss()) is not None:
-        return made
+    loss = kit.make_loss()
+    if loss is None:
+        loss = _make_loss(kit)
+    kit.note(loss)
+    return loss
+
+
+def _make_loss(kit: Kit) -> Any:
     config, env = kit.config, kit.make_training_env(1)
     node = merged(OBJECTIVE, config.objective)
     keywords = dict(config.loss)
@@ -243,7 +249,8 @@ def make_loss(kit: Kit) -> Any:
     if node != OBJECTIVE:
         keywords["objective"] = make_objective(kit, env, node)
     if node["_component_"] == OBJECTIVE["_component_"]:
-        critic_keys.append("displacement")
+        critic_keys.append(config.objective_key or "displacement")
+        keywords["discriminator_keys"] = critic_keys[-1:]
     return DIAYNTrainer.make_loss(
         env,
         config.num_skills,
@@ -265,17 +272,18 @@ def make_objective(kit: Kit, env: EnvBase, node: Mapping[str, Any]) -> SkillObje
     """
     name, number = node["_component_"].rpartition(".")[2], kit.config.num_skills
     spec = env.full_observation_spec_unbatched
-    place = int(spec[kit.place_key].shape[-1])
+    key = kit.config.objective_key or kit.place_key
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(kit.config.seed)
         if name == "SkillDiscriminatorLoss":
-            network: Any = SkillDiscriminator(int(spec["displacement"].shape[-1]), number)
+            key = kit.config.objective_key or "displacement"
+            network: Any = SkillDiscriminator(int(spec[key].shape[-1]), number, in_keys=[key])
         elif name == "SkillDynamicsLoss":
-            keys = {"in_keys": [kit.place_key], "target_key": kit.place_key}
-            network = SkillDynamics(place, place, number, **keys)
+            keys = {"in_keys": [key], "target_key": key}
+            network = SkillDynamics(*2 * [int(spec[key].shape[-1])], number, **keys)
         else:
             linear = SpectralLinear if name == "LSDEncoderLoss" else torch.nn.Linear
-            network = SkillEncoder(place, number, in_keys=[kit.place_key], linear=linear)
+            network = SkillEncoder(spec[key].shape[-1], number, in_keys=[key], linear=linear)
     first = {"SkillDiscriminatorLoss": "discriminator", "SkillDynamicsLoss": "dynamics"}
     objective: SkillObjective = build(**node, **{first.get(name, "encoder"): network})
     return objective
@@ -455,7 +463,7 @@ def _solve(
     progress: bool,
 ) -> Results:
     """Plan and act from a group of starts after the other."""
-    real = kit.make_options(kit.make_env("test"), worker)
+    real = kit.make_options(kit.make_env("test"), worker, gamma=1.0)
     parts: list[Results] = []
     name = kit.start_name.split()[-1] if len(kit.start_name.split()) == 1 else "starts"
     bar = console.Bar(len(starts), desc="solve", unit=name) if progress else None

@@ -46,6 +46,8 @@ KITS = {
 """Class of each kit by its name on the command line, in this package."""
 
 
+RADIUS_SHARE = 0.75
+"""Novelty radius, as a share of how far learned options move the features."""
 OBJECTIVE = {"_component_": "torchrl_hmcts.objectives.SkillDiscriminatorLoss"}
 """DIAYN's objective, the default of every kit."""
 
@@ -73,6 +75,7 @@ class Kit:
         group (int): starts that are planned side by side.
         replans (bool): whether it plans before every option, rather than execute one plan.
         can_be_solved (bool): whether it is known what counts as solved.
+        shorter_paths (bool): whether a search accepts a shorter way to a place it knows.
 
     Example:
         >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
@@ -101,6 +104,7 @@ class Kit:
     group = 38
     replans = False
     can_be_solved = True
+    shorter_paths = False
 
     def __init__(self, config: Any) -> None:
         self.config: SkillsConfig = config
@@ -145,7 +149,12 @@ class Kit:
         raise NotImplementedError
 
     def make_options(
-        self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
+        self,
+        env: EnvBase,
+        worker: TensorDictModuleBase,
+        trajectory_keys: Any = None,
+        *,
+        gamma: float | None = None,
     ) -> EnvBase:
         """Return the macro env over a base env, whose actions are the options.
 
@@ -153,13 +162,14 @@ class Kit:
             env: the base env.
             worker: executes the options.
             trajectory_keys: base transitions to hand out, see ``OptionTransform``.
+            gamma: discount per base step of its rewards. Default: the configuration's.
         """
         config = self.config
         options = OptionTransform(
             worker,
             config.num_skills,
             config.option_steps,
-            config.gamma,
+            config.gamma if gamma is None else gamma,
             trajectory_keys=trajectory_keys,
         )
         return TransformedEnv(env, options)
@@ -183,7 +193,53 @@ class Kit:
         return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
 
     def prepare(self, worker: TensorDictModuleBase) -> None:
-        """Take note of a worker before it is planned with, e.g. of how far its options reach."""
+        """Take note of a worker before it is planned with, e.g. of how far its options reach.
+
+        With ``features="learned"`` the novelty radius becomes three quarters of that.
+        """
+        if self.config.features == "learned":
+            self.config = replace(self.config, novelty_radius=1e-9)
+            reach = self.reach(self.make_simulator(worker, "train"), self.starts("train", 8))
+            self.config = replace(self.config, novelty_radius=RADIUS_SHARE * reach)
+
+    def reach(self, simulator: EnvBase, starts: TensorDictBase) -> float:
+        """Return how far options move what the novelty test compares; a quarter move it farther.
+
+        Args:
+            simulator: the macro env, whose options are all taken.
+            starts: states ``[M]``.
+        """
+        options = torch.arange(self.config.num_skills).repeat_interleave(len(starts))
+        before = starts.repeat(self.config.num_skills)
+        after = simulator.step(before.clone().set("option", options))["next"]
+        compare: Any = self.make_planner(simulator).novelty
+        moved = compare.features(after) - compare.features(before)
+        return float(np.quantile(np.linalg.norm(moved, axis=-1), 0.75))
+
+    def note(self, loss: LossModule) -> None:
+        """Take note of the networks that are learned: what ``features="learned"`` compares."""
+        objective: Any = getattr(loss, "objective", None)
+        network = getattr(objective, "encoder", getattr(objective, "discriminator", None))
+        self._encoder: TensorDictModuleBase | None = network
+
+    def novelty_part(self) -> dict[str, Any] | None:
+        """Return the entries of the planner's novelty test at the kit's defaults, by keyword."""
+        config = self.config
+        if config.features == "none":
+            return None
+        part: dict[str, Any] = {"_component_": "torchrl_hmcts.planners.RadiusNovelty"}
+        part |= {"key": self.place_key, "radius": config.novelty_radius}
+        if self.shorter_paths:
+            part["shorter_paths"] = True
+        if config.features == "learned":
+            encoder = getattr(self, "_encoder", None)
+            if encoder is None or "displacement" in encoder.in_keys:
+                raise ExperimentError(
+                    "features=learned compares what the objective's network says of a state, and "
+                    "that of this run reads none. Add objective=metra, or objective_key=observation."
+                )
+            part |= {"key": encoder.out_keys[0], "encoder": encoder}
+        return part
 
     def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
         """Return the macro env to plan in.
@@ -201,11 +257,7 @@ class Kit:
         config = self.config
         return {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
-            "novelty": {
-                "_component_": "torchrl_hmcts.planners.RadiusNovelty",
-                "key": self.place_key,
-                "radius": config.novelty_radius,
-            },
+            "novelty": self.novelty_part(),
             "budget": {
                 "_component_": "torchrl_hmcts.planners.SearchBudget",
                 "expansions": config.expansions,
@@ -254,9 +306,11 @@ class Kit:
         """
         bare = {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
-            "novelty": self.planner_part()["novelty"] | {"shorter_paths": False},
+            "novelty": self.planner_part()["novelty"],
             "budget": {"_component_": "torchrl_hmcts.planners.SearchBudget"},
         }
+        if bare["novelty"] is not None:
+            bare["novelty"] |= {"shorter_paths": False}
         part = merged(bare, self.config.planner)
         part["budget"] = {**part["budget"], "expansions": self.config.round_expansions}
         planner: MCTSPlanner = build(**{**own, **part, "seed": own["seed"]}, env=simulator)

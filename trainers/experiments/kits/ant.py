@@ -218,6 +218,7 @@ class AntKit(GymKit):
 
     worker_keys = ("body",)  # type: ignore[assignment]
     config: AntConfig
+    shorter_paths = True  # type: ignore[assignment]  # an episode is short for the longest ways
 
     def __init__(self, config: AntConfig, env: Any = None) -> None:
         self._name = config.id if env is None else env
@@ -312,11 +313,6 @@ class AntKit(GymKit):
     @property
     def manager_keys(self) -> Sequence[Any]:
         return [key for key in self.state_entries if key != "action_mask"]
-
-    def planner_part(self) -> dict[str, Any]:
-        part = super().planner_part()
-        part["novelty"]["shorter_paths"] = True  # an episode is short for the longest ways
-        return part
 
     def map(self, env: EnvBase) -> Any:
         from torchrl_hmcts.trainers.figures.maps import FeatureMap

@@ -33,14 +33,13 @@ from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, SearchBudget, extract_plans
 from torchrl_hmcts.trainers.evaluation import Results, spread
 from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
-from torchrl_hmcts.trainers.experiments.kits import Kit, Trial
+from torchrl_hmcts.trainers.experiments.kits import RADIUS_SHARE, Kit, Trial
 from torchrl_hmcts.trainers.experiments.kits.feature_goals import find_goals
 from torchrl_hmcts.trainers.experiments.kits.film import Film
 from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 _PLAYED = 1_000_003  # added to the seed of envs to act in
-_RADIUS = 0.75  # novelty radius, as a share of how far learned options move the features
 _STILL = 0.05  # of the radius, within a fifth of an option: it no longer moves
 _GOALS = ("achieved_goal", "desired_goal")
 
@@ -194,7 +193,12 @@ class GymKit(Kit):
         return torch.stack(found).exclude("done", "terminated", "truncated")  # type: ignore[attr-defined]
 
     def make_options(
-        self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
+        self,
+        env: EnvBase,
+        worker: TensorDictModuleBase,
+        trajectory_keys: Any = None,
+        *,
+        gamma: float | None = None,
     ) -> EnvBase:
         return self.make_pool(worker, real=True)
 
@@ -282,12 +286,7 @@ class GymKit(Kit):
         if self._radius or self.config.options != "learned":
             return
         starts = self.starts("train", 8)
-        pool = self.make_pool(worker)
-        options = torch.arange(pool.num_options).repeat_interleave(len(starts))
-        before = starts.repeat(pool.num_options)
-        after = pool.step(before.set("option", options))["next"]
-        moved = (after["features"] - before["features"]).float().norm(dim=-1)
-        radius = _RADIUS * float(moved.quantile(0.75))
+        radius = RADIUS_SHARE * self.reach(self.make_pool(worker), starts)
         if radius > 0.0:
             self.config = dataclasses.replace(self.config, novelty_radius=radius)
 
@@ -298,7 +297,6 @@ class GymKit(Kit):
         if self.look.discrete:
             part["leaves_per_wave"] = 32
         if self.look.step_reward < 0.0:  # shorter plans pay more
-            part["novelty"]["shorter_paths"] = True
             part["budget"]["improve_expansions"] = config.improve_expansions
         elif self.look.discrete:
             stages = getattr(self.look.features, "stages", ())
@@ -360,6 +358,11 @@ class GymKit(Kit):
     @property
     def manager_keys(self) -> Sequence[Any]:
         return [] if self._moves else self.state_entries  # the view of the grid has too little
+
+    @property
+    def shorter_paths(self) -> bool:  # type: ignore[override]
+        """True where every step costs."""
+        return self.look.step_reward < 0.0
 
     @property
     def replans(self) -> bool:  # type: ignore[override]

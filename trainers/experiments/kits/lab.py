@@ -20,7 +20,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
+from torchrl_hmcts.envs import LAB_ACTIONS, LabMazeEnv, draw_first_person, lab_maze
+from torchrl_hmcts.envs.lab.read_outs import READ_OUTS
 from torchrl_hmcts.modules import StallTermination
 from torchrl_hmcts.planners import HierarchicalPolicy
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
@@ -45,6 +46,8 @@ TEST_SEED, CURVE_SEED = 1_000_000, 2_000_000
 _STALL_SPEED = 0.3  # share of the top speed below which a player is at a standstill
 _LOSSES = ("loss_actor", "qvalue_loss_0", "qvalue_loss_1", "loss_discriminator")
 _FRAME = 3  # column of the state's "level"
+TURN_ACTIONS = ("forward", "look left", "look right")
+"""Actions of the task "turn": without a step sideways or back, a player must face where it goes."""
 
 
 def make_lab_env(maze_seeds: Sequence[int] = range(TRAINING_MAZES), **kwargs: Any) -> LabMazeEnv:
@@ -148,18 +151,37 @@ class LabMazeKit(Kit):
     curve_steps = "training_frames"
     title = "DeepMind Lab's random maze, by planning over learned skills"
     group = 40
+    shorter_paths = True
+
+    def __init__(self, config: LabMazeConfig) -> None:
+        if config.task == "turn":  # who turns stands still
+            config = dataclasses.replace(config, stall_steps=0)
+        super().__init__(config)
+        read_outs = (self.place_key, *self.worker_keys)
+        if config.objective_key in READ_OUTS[3:]:
+            read_outs = (*read_outs, config.objective_key)
+        self.env_kwargs: dict[str, Any] = {"read_outs": read_outs}
+        self.env_kwargs |= {
+            "maze": {},
+            "turn": {"actions": {name: LAB_ACTIONS[name] for name in TURN_ACTIONS}},
+            "apples": {"apple_reward": 1.0, "read_outs": (*read_outs, "apples")},
+        }[config.task]
+        """Keywords of the task's env, besides its mazes."""
 
     # ------------------------------------------------------- envs
 
     def make_training_env(self, num_envs: int = 32) -> TransformedEnv:
         config = self.config
         skills = SkillTransform(config.num_skills, max_skill_steps=config.skill_steps)
-        base = make_lab_env(batch_size=[num_envs], num_steps=config.frames_per_step)
+        base = make_lab_env(
+            batch_size=[num_envs], num_steps=config.frames_per_step, **self.env_kwargs
+        )
         return TransformedEnv(base, Compose(skills, DisplacementTransform(self.place_key)))
 
     def make_env(self, split: str, num_mazes: int | None = None, **kwargs: Any) -> LabMazeEnv:
         config = self.config
-        kwargs = {"num_steps": config.frames_per_step, "max_frames": config.max_frames, **kwargs}
+        limits = {"num_steps": config.frames_per_step, "max_frames": config.max_frames}
+        kwargs = {**limits, **self.env_kwargs, **kwargs}
         if split == "train":
             return make_lab_env(**kwargs)
         if split == "curve":
@@ -169,7 +191,12 @@ class LabMazeKit(Kit):
         return make_lab_env(seeds, rows=size, columns=size, **kwargs)
 
     def make_options(
-        self, env: EnvBase, worker: TensorDictModuleBase, trajectory_keys: Any = None
+        self,
+        env: EnvBase,
+        worker: TensorDictModuleBase,
+        trajectory_keys: Any = None,
+        *,
+        gamma: float | None = None,
     ) -> TransformedEnv:
         config = self.config
         stalled = StallTermination(config.stall_steps) if config.stall_steps else None
@@ -177,7 +204,7 @@ class LabMazeKit(Kit):
             worker,
             config.num_skills,
             config.option_steps,
-            config.gamma,
+            config.gamma if gamma is None else gamma,
             stalled,
             trajectory_keys=trajectory_keys,
         )
@@ -194,9 +221,17 @@ class LabMazeKit(Kit):
 
     def planner_part(self) -> dict[str, Any]:
         part = super().planner_part()
-        part["novelty"]["shorter_paths"] = True
-        part["budget"]["improve_expansions"] = self.config.improve_expansions
-        return {**part, "seed": self.config.seed}
+        config, budget = self.config, part["budget"]
+        if config.search_frames:
+            budget["base_steps"] = config.search_frames // config.frames_per_step
+        if config.task == "apples":
+            if config.features == "place":
+                part["novelty"] |= {"key": [self.place_key, "apples"], "scale": [1.0, 10.0]}
+            part["tree_policy"] = {"_component_": "torchrl_hmcts.planners.UCT", "c": 0.3}
+            budget["until_plan"] = False
+        else:
+            budget["improve_expansions"] = config.improve_expansions
+        return {**part, "seed": config.seed}
 
     def second_try(self) -> LabMazeKit | None:
         if not self.config.stall_steps:

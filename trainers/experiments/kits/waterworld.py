@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from operator import index
@@ -13,8 +14,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from torchrl_hmcts.envs import WaterworldMazeEnv, free_tiles, maze_pool, shortest_path_lengths
+from torchrl_hmcts.envs import (
+    MazeItems,
+    WaterworldMazeEnv,
+    free_tiles,
+    maze_pool,
+    shortest_path_lengths,
+)
 from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, Trial
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.transforms import DisplacementTransform, OptionTransform, SkillTransform
 
 
@@ -25,6 +33,7 @@ def make_training_env(
     skill_steps: int = 50,
     copies: int = 32,
     max_steps: int = 400,
+    **env_kwargs: Any,
 ) -> TransformedEnv:
     """Build the env in which skills are learned in mini-episodes, with their displacement.
 
@@ -34,6 +43,7 @@ def make_training_env(
         skill_steps: base steps of a mini-episode.
         copies: mazes played at once.
         max_steps: base steps after which a copy gets a new maze.
+        **env_kwargs: of :class:`~torchrl_hmcts.envs.WaterworldMazeEnv`.
 
     Returns:
         The env, of batch size ``[copies]``.
@@ -42,7 +52,8 @@ def make_training_env(
         >>> make_training_env(copies=2).rollout(3)["next", "displacement"].shape
         torch.Size([2, 3, 2])
     """
-    base = WaterworldMazeEnv(mazes, observation=False, batch_size=[copies], max_steps=max_steps)
+    env_kwargs = {"observation": False, "max_steps": max_steps, **env_kwargs}
+    base = WaterworldMazeEnv(mazes, batch_size=[copies], **env_kwargs)
     return TransformedEnv(
         base,
         Compose(SkillTransform(num_skills, max_skill_steps=skill_steps), DisplacementTransform()),
@@ -108,7 +119,9 @@ def make_starts(env: WaterworldMazeEnv, num_mazes: int, seed: int) -> TensorDict
     )
     chosen = tiles.gather(1, picks)  # [num_mazes, 2]
     centers = torch.stack((chosen % env.width, chosen // env.width), -1) + 0.5
-    return env.make_state(torch.arange(num_mazes), centers[:, 0], centers[:, 1])
+    angle = torch.rand(num_mazes, generator=generator) * (2.0 * math.pi)  # of boats
+    heading = torch.stack((angle.cos(), angle.sin()), -1)
+    return env.make_state(torch.arange(num_mazes), *centers.unbind(1), heading=heading)
 
 
 class WaterworldKit(Kit):
@@ -122,26 +135,62 @@ class WaterworldKit(Kit):
         342
     """
 
-    worker_keys = ("velocity",)
-    state_keys = ("maze_index", "position", "velocity", "target")
+    config: DemoConfig
     title = "Solving random mazes by planning over learned skills"
     group = 1  # each search is timed on its own
+
+    def __init__(self, config: DemoConfig) -> None:
+        super().__init__(config)
+        size = config.size
+        self.env_kwargs: dict[str, Any] = {
+            "maze": {},
+            "boat": {"steering": "heading"},
+            "apples": {"items": MazeItems(apples=size**2 // 9), "max_steps": 40 * size},
+            "key": {"items": MazeItems(key=True)},
+        }[config.task]
+        """Keywords of the task's env, besides its mazes."""
+        extra = ("heading",) if config.task == "boat" else ()
+        self.worker_keys = ("velocity", *extra)
+        self.sees = config.objective_key == "observation"
+        self.shorter_paths = config.task in ("apples", "boat")
+        self.has_items = "items" in self.env_kwargs
+        items = ("items",) if self.has_items else ()
+        self.state_keys = ("maze_index", "position", "velocity", "target", *extra, *items)
 
     def make_training_env(self, num_envs: int = 32) -> EnvBase:
         config = self.config
         return make_training_env(
-            num_skills=config.num_skills, skill_steps=config.skill_steps, copies=num_envs
+            num_skills=config.num_skills,
+            skill_steps=config.skill_steps,
+            copies=num_envs,
+            observation=self.sees,
+            steering=self.env_kwargs.get("steering", "directions"),
         )
 
     def make_env(self, split: str) -> WaterworldMazeEnv:
-        mazes = maze_pool("test" if split == "test" else "train")
-        return WaterworldMazeEnv(mazes, observation=False)
+        size = self.config.size if split == "test" else 9
+        mazes = maze_pool("test" if split == "test" else "train", size)
+        limit = {"max_steps": 1000 * size**2 // 81}
+        return WaterworldMazeEnv(mazes, observation=self.sees, **{**limit, **self.env_kwargs})
+
+    def planner_part(self) -> dict[str, Any]:
+        config, part = self.config, super().planner_part()
+        if (
+            self.has_items and config.features == "place"
+        ):  # a place is another one with other items around
+            part["novelty"] |= {"key": ["position", "items"], "scale": [1.0, 10.0]}
+        if config.task == "apples":
+            part["tree_policy"] = {"_component_": "torchrl_hmcts.planners.UCT", "c": 0.3}
+            part["budget"] |= {"until_plan": False, "base_steps": 4_000}
+        if config.search_steps:
+            part["budget"]["base_steps"] = config.search_steps
+        return part
 
     def starts(self, split: str, num_starts: int) -> TensorDictBase:
         return make_starts(self.make_env(split), num_starts, self.config.seed)
 
     def path_lengths(self, starts: TensorDictBase) -> np.ndarray:
-        mazes = maze_pool("test")
+        mazes = self.make_env("test").mazes
         lengths = []
         for start in starts.unbind(0):
             player, target = (start[key].long().flip(-1).tolist() for key in ("position", "target"))

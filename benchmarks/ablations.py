@@ -1,0 +1,307 @@
+"""What each part of the agent is worth: search, novelty test, simulation step, learned skills.
+
+    python benchmarks/ablations.py --seeds 0 1 2 --out docs/results/ablations.json
+    python benchmarks/ablations.py --tables search --tasks apples --seeds 0
+
+An arm is a line of words as `hmcts train` takes them, and what cannot be said in words: a worker
+that was never trained, a search with a queue, a random tree policy. Rows that the file already has
+are not run again.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from queue_search import ORDERS, plan_by_queue
+from table import add_row, markdown, read_arguments
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import RolloutEvaluator
+from torchrl_hmcts.trainers.command_line.words import parse_config
+from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
+from torchrl_hmcts.trainers.experiments.kits import Kit, make_kit
+from torchrl_hmcts.trainers.experiments.registry import DEMO, EXPERIMENTS
+from torchrl_hmcts.trainers.experiments.skills import learn, make_loss
+from torchrl_hmcts.trainers.figures.intervals import bootstrap, wilson
+
+COMMAND = "python benchmarks/ablations.py --seeds 0 1 2 --out docs/results/ablations.json"
+TASKS: dict[str, tuple[str, ...]] = {  # kit, then words
+    "maze": ("waterworld", "mazes=100"),
+    "maze 15": ("waterworld", "mazes=50", "size=15", "search_steps=30000"),
+    "boat": ("waterworld", "mazes=50", "task=boat", "search_steps=15000"),
+    "key 15": ("waterworld", "mazes=50", "task=key", "size=15", "search_steps=60000"),
+    "apples 15": ("waterworld", "mazes=50", "task=apples", "size=15"),
+    "lab": ("labmaze", "mazes=100", "curve_points=0"),
+    "lab turn": ("labmaze", "mazes=50", "task=turn", "curve_points=0", "search_frames=80000"),
+    "lab apples 15": (
+        *("labmaze", "mazes=50", "task=apples", "size=15", "curve_points=0"),
+        *("max_frames=1200", "search_frames=16000"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A row of a table: a task with other words, worker, search or simulation step."""
+
+    table: str
+    task: str
+    name: str
+    words: tuple[str, ...] = ()
+    worker: str = "trained"
+    search: str = ""
+    rollouts: int = 0  # options of a random simulation
+    seed: int = 0
+    worker_seed: int | None = None
+
+
+def arms(seeds: Sequence[int]) -> Iterator[Arm]:
+    """Yield all rows, cheap ones first."""
+    for seed in seeds:
+        for task in ("maze", "apples 15", "key 15", "lab apples 15"):
+            yield from searches(task, seed)
+        for task in ("maze", "boat", "lab", "lab turn"):
+            yield from workers(task, seed)
+        for task in ("maze", "lab"):
+            yield from features(task, seed)
+        for length in (10, 25, 50, 100):
+            words = (f"option_steps={length}", f"novelty_radius={min(2.0, 0.04 * length):g}")
+            yield Arm("option length", "maze", f"{length} base steps", words, seed=seed)
+    for task in ("maze", "boat", "lab", "lab turn"):
+        for seed in range(10):
+            yield Arm(
+                "worker", task, "untrained", worker="untrained", seed=seeds[0], worker_seed=seed
+            )
+
+
+def searches(task: str, seed: int) -> Iterator[Arm]:
+    """Yield the searches of a task with one worker."""
+    uct = "planner/tree_policy=uct"
+    for name, words in {
+        "UCT, c = 1": (uct, "planner.tree_policy.c=1"),
+        "UCT, c = 0.3": (uct, "planner.tree_policy.c=0.3"),
+        "UCT, c = 0": (uct, "planner.tree_policy.c=0"),
+        "PUCT": ("planner/tree_policy=puct",),
+        "UCT, c = 0.3, max": (uct, "planner.tree_policy.c=0.3", "planner.backup=max"),
+    }.items():
+        yield Arm("search", task, name, words, seed=seed)
+    yield Arm("search", task, "random option", search="random option", seed=seed)
+    for name in ORDERS:
+        yield Arm("search", task, name, search=name, seed=seed)
+    if task in ("maze", "apples 15"):
+        for name, most in (("none", 0), ("random, 10 options", 10)):
+            for test in ("place", "none"):
+                words = (f"features={test}",)
+                label = f"simulation {name}; novelty {test}"
+                yield Arm("simulation", task, label, words, rollouts=most, seed=seed)
+
+
+def workers(task: str, seed: int) -> Iterator[Arm]:
+    """Yield the workers of a task."""
+    is_lab = task.startswith("lab")
+    key, unit = ("train_frames", 4) if is_lab else ("train_base_steps", 1)
+    for steps in (10_240, 20_480, 40_960) + (81_920,) * (task == "boat"):
+        words = (f"{key}={steps * unit}",)
+        yield Arm("worker", task, f"DIAYN, {steps:,} base steps", words, seed=seed)
+    for objective in ("metra", "lsd", "dads"):
+        yield Arm("worker", task, objective.upper(), (f"objective={objective}",), seed=seed)
+    yield Arm("worker", task, "hand-written", worker="hand-written", seed=seed)
+
+
+def features(task: str, seed: int) -> Iterator[Arm]:
+    """Yield what the novelty test compares."""
+    yield Arm("novelty", task, "(x, y), radius by hand", seed=seed)
+    whole = ("objective=metra", "objective_key=observation")
+    learned = ("objective=metra", "features=learned")
+    yield Arm("novelty", task, "METRA of the place, its radius found", learned, seed=seed)
+    words = (*whole, "features=learned")
+    yield Arm("novelty", task, "METRA of the whole observation, its radius found", words, seed=seed)
+    words = ("objective_key=observation", "features=learned")
+    yield Arm("novelty", task, "DIAYN's guess of the skill, its radius found", words, seed=seed)
+    words = ("objective_key=observation", "features=none")
+    yield Arm("novelty", task, "none; discriminator of the whole observation", words, seed=seed)
+    yield Arm("novelty", task, "none", ("features=none",), seed=seed)
+
+
+def steer(heading: Tensor, skill: Tensor) -> Tensor:
+    """Return 0 (ahead) when a body faces the direction of its skill, else 1 or 2 (left, right)."""
+    angle = skill * (torch.pi / 2)
+    cross = heading[..., 0] * angle.sin() - heading[..., 1] * angle.cos()
+    along = heading[..., 0] * angle.cos() + heading[..., 1] * angle.sin()
+    turn = torch.where(cross < 0.0, 1, 2)
+    return torch.where(along > 0.95, 0, turn)
+
+
+def hand_written(task: str) -> TensorDictModule:
+    """Return a worker by rule: thrust or walk in a direction, or turn to it and go ahead."""
+    if task in ("boat", "lab turn"):
+        flip = -1.0 if task == "lab turn" else 1.0  # y to the north
+        mirror = torch.tensor([1.0, flip])
+        return TensorDictModule(
+            lambda heading, skill: steer(heading * mirror, skill), ["heading", "skill"], ["action"]
+        )
+    return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+
+
+@lru_cache(maxsize=4)
+def trained(kit_name: str, words: tuple[str, ...]) -> tuple[Any, float]:
+    """Return a learned worker's loss and the CPU seconds that it took."""
+    kit = configured(kit_name, words)
+    learned = learn(kit)
+    return learned.loss, learned.seconds
+
+
+def configured(kit_name: str, words: Sequence[str]) -> Kit:
+    """Return the kit that words describe."""
+    experiment = DEMO if kit_name == "waterworld" else EXPERIMENTS["labmaze"]
+    return make_kit(parse_config(experiment, list(words)))
+
+
+_PLANNING = ("planner", "features", "search_", "mazes", "size", "novelty_radius", "option_steps")
+
+
+def measure(arm: Arm) -> dict[str, Any]:
+    """Solve the test mazes of an arm."""
+    kit_name, *words = TASKS[arm.task]
+    worker_seed = arm.seed if arm.worker_seed is None else arm.worker_seed
+    words += [*arm.words, f"seed={arm.seed}"]
+    kit = configured(kit_name, words)
+    kit.second_try = lambda: None  # type: ignore[method-assign]
+    seconds = 0.0
+    if arm.worker == "hand-written":
+        worker: Any = hand_written(arm.task)
+    elif arm.worker == "untrained":
+        made = configured(kit_name, [*words, f"seed={worker_seed}"])
+        worker = SkillPolicy(make_loss(made).actor_network, deterministic=True)
+    else:
+        learning = [word for word in words if not word.startswith(_PLANNING)]
+        loss, seconds = trained(kit_name, tuple(learning))
+        kit.note(loss)
+        worker = SkillPolicy(loss.actor_network, deterministic=True)
+    begin = time.process_time()
+    results = run(kit, arm, worker)
+    return {
+        **{name: getattr(arm, name) for name in ("table", "task", "seed")},
+        "arm": arm.name,
+        "worker_seed": worker_seed,
+        "words": " ".join([f"kit={kit_name}", *words]),
+        "solved": results.solved.astype(int).tolist(),
+        "simulated": results.simulated_steps.tolist(),
+        "executed": results.episode_steps.tolist(),
+        "rewards": [round(float(reward), 3) for reward in results.rewards],
+        "training_cpu_seconds": seconds,
+        "cpu_seconds": round(time.process_time() - begin, 1),
+    }
+
+
+def run(kit: Kit, arm: Arm, worker: Any) -> Results:
+    """Plan from each start, execute the plan in another instance."""
+    kit.prepare(worker)
+    starts = kit.starts("test", kit.config.mazes)
+    real = kit.make_options(kit.make_env("test"), worker, gamma=1.0)
+    planner = kit.make_planner(kit.make_simulator(worker))
+    if arm.search in ORDERS:
+        return plan_by_queue(planner, real, starts, arm.search, arm.seed)
+    if arm.search == "random option":
+        generator = torch.Generator().manual_seed(arm.seed)
+        planner.tree_policy = lambda at: torch.rand(at.option_visits.shape, generator=generator)
+    if not arm.rollouts:
+        return plan_and_execute(planner, real, starts)
+    # each search alone, with rollouts of its own, whose steps count
+    parts = []
+    for start in starts.split(1):
+        part = kit.make_planner(kit.make_simulator(worker))
+        rollouts = RolloutEvaluator(max_options=arm.rollouts)
+        part.evaluate = replace_evaluator(part, rollouts)
+        results = plan_and_execute(part, real, start)
+        parts.append(
+            replace(results, simulated_steps=results.simulated_steps + rollouts.num_base_steps)
+        )
+    return Results.concatenate(parts)
+
+
+def replace_evaluator(planner: Any, evaluator: Any) -> Any:
+    """Return a planner's evaluation of new nodes with another evaluator."""
+    made = type(planner.evaluate)(evaluator, None, planner.num_options)
+    made.bind(planner.simulator, planner.gamma)
+    return made
+
+
+def pooled(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Join the rows of an arm over its seeds, with intervals."""
+    solved, simulated, rewards, executed = (
+        np.concatenate([row[key] for row in rows])
+        for key in ("solved", "simulated", "rewards", "executed")
+    )
+    low, high = wilson(int(solved.sum()), len(solved))
+    mean, least, most = bootstrap(rewards.tolist())
+    return {
+        **{key: rows[0][key] for key in ("table", "task", "arm")},
+        "seeds": len({(row["seed"], row["worker_seed"]) for row in rows}),
+        "solved": f"{solved.mean():.0%} ({low:.0%} to {high:.0%})",
+        "by seed": ", ".join(f"{np.mean(row['solved']):.0%}" for row in rows),
+        "simulated": f"{np.median(simulated):,.0f} ({np.percentile(simulated, 95):,.0f})",
+        "executed": f"{np.median(executed[solved > 0]):,.0f}" if solved.any() else "",
+        "reward": f"{mean:.2f} ({least:.2f} to {most:.2f})",
+    }
+
+
+def tables(rows: Sequence[dict[str, Any]]) -> str:
+    """Return all tables as markdown, by table and task."""
+    groups: dict[tuple[str, str], dict[str, list[dict[str, Any]]]] = {}
+    for row in rows:
+        groups.setdefault((row["table"], row["task"]), {}).setdefault(row["arm"], []).append(row)
+    names = ("arm", "seeds", "solved", "by seed", "simulated", "executed", "reward")
+    columns = {name: (lambda row, name=name: row[name]) for name in names}
+    text = [
+        f"{table}, {task}\n\n{markdown(map(pooled, found.values()), columns)}\n"
+        for (table, task), found in groups.items()
+    ]
+    return "\n".join(text)
+
+
+def main() -> None:
+    args = read_arguments(
+        __doc__,
+        {"seeds": [0], "tasks": ["boat"], "tables": ["worker"]},
+        seeds=[0, 1, 2],
+        tables=(["all"], "search, simulation, worker, novelty, option length"),
+        tasks=(["all"], "those of TASKS"),
+    )
+    out = args.out or Path("runs/ablations.json")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    keys = ("table", "task", "arm", "seed", "worker_seed")
+    for arm in arms(args.seeds):
+        wanted = {"all", arm.table} & set(args.tables) and {"all", arm.task} & set(args.tasks)
+        done = json.loads(out.read_text())["rows"] if out.exists() else []
+        worker_seed = arm.seed if arm.worker_seed is None else arm.worker_seed
+        mine = (arm.table, arm.task, arm.name, arm.seed, worker_seed)
+        if not wanted or any(tuple(row[key] for key in keys) == mine for row in done):
+            continue
+        row = measure(arm)
+        add_row(out, row, *keys, command=COMMAND)
+        print(
+            markdown(
+                [pooled([row])],
+                {
+                    name: (lambda r, n=name: r[n])
+                    for name in ("table", "task", "arm", "solved", "simulated", "reward")
+                },
+            ).splitlines()[-1],
+            flush=True,
+        )
+    print(tables(json.loads(out.read_text())["rows"]))
+
+
+if __name__ == "__main__":
+    main()
