@@ -181,7 +181,7 @@ def measure(arm: Arm) -> dict[str, Any]:
     if arm.worker == "hand-written":
         worker: Any = hand_written(arm.task)
     elif arm.worker == "untrained":
-        made = configured(kit_name, [*words, f"seed={worker_seed}"])
+        made = configured(kit_name, [*words[:-1], f"seed={worker_seed}"])
         worker = SkillPolicy(make_loss(made).actor_network, deterministic=True)
     else:
         learning = [word for word in words if not word.startswith(_PLANNING)]
@@ -256,13 +256,17 @@ def pooled(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def by_name(*names: str) -> dict[str, Any]:
+    """Return columns that show entries of a row."""
+    return {name: (lambda row, name=name: row[name]) for name in names}
+
+
 def tables(rows: Sequence[dict[str, Any]]) -> str:
     """Return all tables as markdown, by table and task."""
     groups: dict[tuple[str, str], dict[str, list[dict[str, Any]]]] = {}
     for row in rows:
         groups.setdefault((row["table"], row["task"]), {}).setdefault(row["arm"], []).append(row)
-    names = ("arm", "seeds", "solved", "by seed", "simulated", "executed", "reward")
-    columns = {name: (lambda row, name=name: row[name]) for name in names}
+    columns = by_name("arm", "seeds", "solved", "by seed", "simulated", "executed", "reward")
     text = [
         f"{table}, {task}\n\n{markdown(map(pooled, found.values()), columns)}\n"
         for (table, task), found in groups.items()
@@ -290,16 +294,8 @@ def main() -> None:
             continue
         row = measure(arm)
         add_row(out, row, *keys, command=COMMAND)
-        print(
-            markdown(
-                [pooled([row])],
-                {
-                    name: (lambda r, n=name: r[n])
-                    for name in ("table", "task", "arm", "solved", "simulated", "reward")
-                },
-            ).splitlines()[-1],
-            flush=True,
-        )
+        shown = by_name("table", "task", "arm", "solved", "simulated", "reward")
+        print(markdown([pooled([row])], shown).splitlines()[-1], flush=True)
     print(tables(json.loads(out.read_text())["rows"]))
 
 

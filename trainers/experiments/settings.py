@@ -150,8 +150,8 @@ class DemoConfig(SkillsConfig):
     mazes: int = 100
     """Test mazes to solve, at most the 342 of the test split."""
     task: str = "maze"
-    """What there is to do: "maze" (reach the target), "boat" (the same with a body that must turn to
-    where it goes), "apples" (collect what is worth most before the fuel is spent) or "key" (the
+    """What there is to do: "maze" (reach the target), "boat" (the same with a body that must turn
+    to where it goes), "apples" (collect what is worth most before the fuel is spent) or "key" (the
     target is shut to who has not taken the key)."""
     size: int = 9
     """Tiles along a side of the test mazes: 9, 15 or 31. Skills are learned in mazes of 9."""
@@ -223,7 +223,8 @@ class LabMazeConfig(SkillsConfig):
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     task: str = "maze"
     """What there is to do: "maze" (find the goal), "turn" (the same without steps sideways or back)
-    or "apples" (collect apples, 1 each, before max_frames are over; the goal pays 1 and ends it)."""
+    or "apples" (collect apples, 1 each, before max_frames are over; the goal pays 1 and ends
+    it)."""
     size: int = 9
     """Cells along a side of the test mazes, border included, odd; the stock level has 15."""
     search_frames: int = 0

@@ -235,8 +235,8 @@ class Kit:
             encoder = getattr(self, "_encoder", None)
             if encoder is None or "displacement" in encoder.in_keys:
                 raise ExperimentError(
-                    "features=learned compares what the objective's network says of a state, and "
-                    "that of this run reads none. Add objective=metra, or objective_key=observation."
+                    "features=learned compares what the objective's network says of a state; "
+                    "this one reads none. Add objective=metra, or objective_key=observation."
                 )
             part |= {"key": encoder.out_keys[0], "encoder": encoder}
         return part
