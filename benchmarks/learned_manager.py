@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from maze_network import MazeNetwork
+from torchrl_hmcts.trainers.experiments.waterworld.maze_network import MazeNetwork
 from mazes import RADIUS, demo_loss, greedy, make_option_env, make_starts, planner
 from table import markdown, read_arguments, write
 from tensordict import TensorDictBase

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from maze_network import MazeNetwork, shortest_distances
+from torchrl_hmcts.trainers.experiments.waterworld.maze_network import (
+    MazeNetwork,
+    shortest_distances,
+)
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn

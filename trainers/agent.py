@@ -12,30 +12,31 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts import notebook
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.objectives import ExpertIterationLoss
 from torchrl_hmcts.planners import MCTSPlanner, Plan
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments import skills
 from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
 from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, make_kit
 from torchrl_hmcts.trainers.experiments.kits.gym import GymKit
+from torchrl_hmcts.trainers.experiments.managers import (
+    learn_manager,
+    load_manager,
+    save_manager,
+)
 from torchrl_hmcts.trainers.experiments.registry import KITS, find_experiment, load_config
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
-from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer
-from torchrl_hmcts.trainers.manager import ManagerPolicy, make_manager, scale_by
+from torchrl_hmcts.trainers.manager import ManagerPolicy
 from torchrl_hmcts.trainers.runs.console import Bar
 from torchrl_hmcts.trainers.runs.run import open_run
-from torchrl_hmcts.trainers.saving.checkpoints import plain_checkpoint
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import save_worker
 
-_MANAGER = "manager.torchrl"
 _OTHER_DRAWS = 1_000_003  # added to the seed of the env to act in, whose draws no planner knows
 
 
@@ -124,7 +125,7 @@ class HMCTS:
         self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
         self.kit = self._make_kit(config)
         self.learned: LearnedSkills | None = None
-        self.manager: TensorDictModule | None = None
+        self.manager: TensorDictModuleBase | None = None
         self._worker = self.kit.given_worker()
         if config.worker:
             self._take(skills.load_skills(self.kit, config.worker))
@@ -233,39 +234,22 @@ class HMCTS:
             Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search",
             2017, arXiv 1705.08439.
         """
-        keys = self.kit.manager_keys
-        if not keys:
-            raise ValueError(
-                f"{self} plans over features of which no network can learn. Distil from an env "
-                "whose observation shows its state."
-            )
-        goal = not self.kit.replans
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.config.seed)
-            network = make_manager(self.planner, keys, bounded=goal)
-        scale_by(network, self.planner, self.kit.starts("train", 4))
-        guided = self.kit.guide(self.kit.make_planner(self.env), network)
-        loss = ExpertIterationLoss(network, value_loss="log" if goal else "smooth_l1")
-        with _torchrl_quiet():
-            ExpertIterationTrainer(
-                self.env,
-                network,
-                self.planner,
-                planner=guided,
-                loss_module=loss,
+        env = self.kit.make_simulator(self.worker, "train")
+        with _torchrl_quiet(), contextlib.closing(env):
+            network = learn_manager(
+                self.kit,
+                env,
+                searches=searches,
                 iterations=iterations,
-                searches_per_iteration=searches,
-                updates_per_iteration=updates,
-                example_kwargs={"roots": not goal},
+                updates=updates,
                 progress=_bar("distil", progress),
-                seed=self.config.seed,
-            ).train()
+            )
         self._guide(network)
         return self
 
-    def _guide(self, network: TensorDictModule) -> None:
-        self.manager = network.eval()
-        self.__dict__["planner"] = self.kit.guide(self.kit.make_planner(self.env), network)
+    def _guide(self, network: TensorDictModuleBase) -> None:
+        self.manager = self.kit.manager_for(network, "test")
+        self.__dict__["planner"] = self.kit.guide(self.kit.make_planner(self.env), self.manager)
 
     def solve(self, seed: int = 0, *, search: bool = True) -> Solution:
         """Plan from a start and act in an env of its own.
@@ -355,7 +339,7 @@ class HMCTS:
             if self.learned is not None and self.learned.loss is not None:
                 save_worker(run.path, self.learned.loss, self.learned.worker_step)
             if self.manager is not None:
-                plain_checkpoint(manager=self.manager).save(run.path / _MANAGER)
+                save_manager(run.path, self.manager)
         return run.path
 
     @classmethod
@@ -375,10 +359,8 @@ class HMCTS:
         agent = cls(config)
         if config.options == "learned":
             agent._take(skills.load_skills(agent.kit, folder))
-        if (Path(folder) / _MANAGER).is_file():
-            bounded = not agent.kit.replans
-            network = make_manager(agent.planner, agent.kit.manager_keys, bounded=bounded)
-            plain_checkpoint(manager=network).load(Path(folder) / _MANAGER)
+        network = load_manager(agent.kit, folder, agent.env)
+        if network is not None:
             agent._guide(network)
         return agent
 

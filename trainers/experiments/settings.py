@@ -53,12 +53,27 @@ class SkillsConfig(RunConfig):
     """Parts of the planner: planner/PART=NAME, e.g. planner/tree_policy=puct, and their keywords:
     planner.KEY=VALUE, planner.PART.KEY=VALUE. They hold for Algorithm 3's training rounds too, but
     the expansions of those are round_expansions."""
+    manager: str = "novelty"
+    """How options are chosen: "novelty" (UCT that refuses places it knows), "source" (the
+    dissertation's four stages: UCT with a random simulation from each new node, no novelty test),
+    or "learned" (prior and value learned from searches in training mazes, carried to the test
+    mazes)."""
+    manager_searches: int = 400
+    """Training searches in each of the four iterations of manager=learned."""
     num_skills: int = 4
     """Skills of the worker, the options of the manager (the dissertation's N_policies)."""
     updates_per_step: float = 3 / 64
     """Updates of the networks per base step."""
     init_options: int = 64
-    """Options of Algorithm 3 that are drawn uniformly at first (the dissertation's N_init)."""
+    """Options of Algorithm 3 that are drawn uniformly at first (the dissertation's N_init); also
+    init_samples."""
+    dataset: str = ""
+    """Folder of transitions that Algorithm 3 trains on as well (the dissertation's D), as
+    replay_buffer.dumps writes it. Default: none."""
+    c_p: float = 1.0
+    """Constant of UCT in Algorithm 3's rounds."""
+    rounds: int = 0
+    """Rounds of Algorithm 3; 0: as many as the base steps of training allow."""
     retrain_interval: int = 4
     """Rounds of Algorithm 3 between two trainings of the worker (the dissertation's N_retrain)."""
     round_expansions: int = 2
@@ -90,13 +105,15 @@ class SkillsConfig(RunConfig):
     KIT: ClassVar[str] = ""  # name of the kit
     KEPT: ClassVar[tuple[str, ...]] = (
         *("seed", "toy", "options", "worker", "algorithm", "objective", "loss", "trainer"),
-        *("objective_key", "planner", "num_skills"),
+        *("objective_key", "planner", "manager", "manager_searches", "num_skills"),
     )
-    LEAST = {"curve_points": 0}
+    LEAST = {"curve_points": 0, "rounds": 0}
+    ALIASES = {"init_samples": "init_options"}
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("novelty_radius", "updates_per_step")
     CHOICES = {
         "options": ("learned", "actions"),
         "algorithm": ("diayn", "hmcts"),
+        "manager": ("novelty", "source", "learned"),
         "features": ("place", "learned", "none"),
         "keep": ("best", "last"),
         "collector": ("local", "ray"),
@@ -287,7 +304,7 @@ class LabMazeConfig(SkillsConfig):
         ),
         *("retrain_interval", "round_expansions", "novelty_radius", "gamma"),
     )
-    LEAST = {"curve_points": 0, "improve_expansions": 0, "stall_steps": 0, "search_frames": 0}
+    LEAST = {**SkillsConfig.LEAST, "improve_expansions": 0, "stall_steps": 0, "search_frames": 0}
     CHOICES = {**SkillsConfig.CHOICES, "task": ("maze", "turn", "apples")}
 
     def __post_init__(self) -> None:

@@ -36,10 +36,16 @@ from torchrl_hmcts.trainers.experiments.kits import (
     Trial,
     make_kit,
 )
+from torchrl_hmcts.trainers.experiments.managers import (
+    learn_manager,
+    load_manager,
+    save_manager,
+)
 from torchrl_hmcts.trainers.experiments.settings import BATCH_STEPS, SkillsConfig
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.trainers.parts import build, merged, named
 from torchrl_hmcts.trainers.runs import console
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
@@ -86,6 +92,21 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
     )
     if learned.loss is not None:
         save_worker(run.path, learned.loss, learned.worker_step)
+    if config.manager == "learned":
+        kit.prepare(learned.worker)
+        console.say("Learning prior and value of the options from searches ...")
+        network = learn_manager(
+            kit,
+            kit.make_simulator(learned.worker, "train"),
+            searches=config.manager_searches,
+            iterations=4,
+            updates=200,
+            save_dir=run.checkpoints / "manager",
+            resume=run.resumes,
+            progress=partial(console.Bar, desc="learn"),
+        )
+        save_manager(run.path, network)
+        kit.manager = kit.manager_for(network, "test")
     train_seconds = time.perf_counter() - begin
     trial = solve(kit, learned.worker, progress=True)
     metrics: dict[str, Any] = {
@@ -125,6 +146,12 @@ def evaluate_skills(config: SkillsConfig) -> dict[str, Any]:
         loss = make_loss(kit)
         checkpoint = load_networks(loss, config.out).name
         worker = SkillPolicy(loss.actor_network, deterministic=True)
+    if config.manager == "learned":
+        kit.prepare(worker)
+        network = load_manager(kit, config.out, kit.make_simulator(worker, "train"))
+        if network is None:
+            raise ExperimentError(f"{config.out} holds no manager; leave manager=learned out.")
+        kit.manager = kit.manager_for(network, "test")
     return {
         "checkpoint": checkpoint,
         "test": kit.figures(solve(kit, worker, progress=True)),
@@ -316,7 +343,9 @@ def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTr
     batch = config.retrain_interval * config.round_expansions * options
     expected = max(1, (config.train_steps - config.init_options * config.option_steps) // batch)
     own: dict[str, Any] = {
-        "rounds": 2**31,  # ended by total_frames
+        "rounds": config.rounds or 2**31,  # or ended by total_frames
+        "c_p": config.c_p,
+        "dataset": config.dataset or None,
         "num_init_samples": config.init_options,
         "retrain_interval": config.retrain_interval,
         "option_steps": config.option_steps,

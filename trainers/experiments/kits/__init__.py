@@ -31,6 +31,7 @@ from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.kits.trial import LearnedSkills, Trial
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.manager import make_manager, scale_by
 from torchrl_hmcts.trainers.parts import build, merged
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.transforms import OptionTransform
@@ -76,6 +77,8 @@ class Kit:
         replans (bool): whether it plans before every option, rather than execute one plan.
         can_be_solved (bool): whether it is known what counts as solved.
         shorter_paths (bool): whether a search accepts a shorter way to a place it knows.
+        learning_options (int): options that a guided search simulates while the manager learns: a
+            long search costs more than it teaches. 0: those of the budget.
 
     Example:
         >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
@@ -105,9 +108,12 @@ class Kit:
     replans = False
     can_be_solved = True
     shorter_paths = False
+    learning_options = 0
 
     def __init__(self, config: Any) -> None:
         self.config: SkillsConfig = config
+        self.manager: TensorDictModuleBase | None = None  # guides the planner once it is learned
+        self._encoder: TensorDictModuleBase | None = None
 
     # ------------------------------------------------------- envs: what every kit has
 
@@ -220,7 +226,7 @@ class Kit:
         """Take note of the networks that are learned: what ``features="learned"`` compares."""
         objective: Any = getattr(loss, "objective", None)
         network = getattr(objective, "encoder", getattr(objective, "discriminator", None))
-        self._encoder: TensorDictModuleBase | None = network
+        self._encoder = network
 
     def novelty_part(self) -> dict[str, Any] | None:
         """Return the entries of the planner's novelty test at the kit's defaults, by keyword."""
@@ -232,7 +238,7 @@ class Kit:
         if self.shorter_paths:
             part["shorter_paths"] = True
         if config.features == "learned":
-            encoder = getattr(self, "_encoder", None)
+            encoder = self._encoder
             if encoder is None or "displacement" in encoder.in_keys:
                 raise ExperimentError(
                     "features=learned compares what the objective's network says of a state; "
@@ -255,6 +261,8 @@ class Kit:
     def planner_part(self) -> dict[str, Any]:
         """Return the entries of the planner at the kit's defaults, by keyword."""
         config = self.config
+        if config.manager == "source":
+            return self._source_part()
         return {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
             "novelty": self.novelty_part(),
@@ -263,6 +271,20 @@ class Kit:
                 "expansions": config.expansions,
             },
             "leaves_per_wave": config.leaves_per_wave,
+        }
+
+    def _source_part(self) -> dict[str, Any]:
+        """Selection by UCT, expansion of one option, a random simulation, backup of the mean."""
+        planners = "torchrl_hmcts.planners"
+        return {
+            "_component_": f"{planners}.MCTSPlanner",
+            "tree_policy": {"_component_": f"{planners}.UCT"},
+            "leaf_evaluator": {"_component_": f"{planners}.RolloutEvaluator"},
+            "expand": "one",
+            "budget": {
+                "_component_": f"{planners}.SearchBudget",
+                "expansions": self.config.expansions,
+            },
         }
 
     def parts(self) -> dict[str, dict[str, Any]]:
@@ -290,7 +312,7 @@ class Kit:
         part = merged(self.planner_part(), self.config.planner)
         part["budget"] = {**part["budget"], **budget}
         planner: MCTSPlanner = build(**part, env=simulator)
-        return planner
+        return planner if self.manager is None else self.guide(planner, self.manager)
 
     @property
     def manager_keys(self) -> Sequence[NestedKey]:
@@ -319,6 +341,33 @@ class Kit:
     def second_try(self) -> Kit | None:
         """Return the kit with which starts are searched again that have no plan; None for none."""
         return None
+
+    def manager_network(
+        self, planner: MCTSPlanner, split: str, *, scale: bool = True
+    ) -> TensorDictModuleBase:
+        """Return an untrained network for the manager: logits of the options, value of a state.
+
+        Args:
+            planner: over the options.
+            split: in which it is to be used.
+            scale: whether its inputs are scaled by the states that a few searches meet.
+
+        Raises:
+            ExperimentError: if the states have nothing of which a network can learn.
+        """
+        if not self.manager_keys:
+            raise ExperimentError(
+                f"{self.title}: the planner sees features of which no network can learn. Choose an "
+                "env whose observation shows its state, or leave manager as it is."
+            )
+        network = make_manager(planner, self.manager_keys, bounded=not self.replans)
+        if scale:
+            scale_by(network, planner, self.starts(split, 4))
+        return network
+
+    def manager_for(self, network: TensorDictModuleBase, split: str) -> TensorDictModuleBase:
+        """Return a manager's network for the mazes of another split, with the same weights."""
+        return network
 
     def guide(self, planner: MCTSPlanner, network: TensorDictModuleBase) -> MCTSPlanner:
         """Return a planner with the prior and the values of a network.

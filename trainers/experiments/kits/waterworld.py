@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from operator import index
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
@@ -21,9 +23,15 @@ from torchrl_hmcts.envs import (
     maze_pool,
     shortest_path_lengths,
 )
+from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.trainers.experiments.kits import Kit, LearnedSkills, Trial
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.waterworld.maze_network import MazeNetwork
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.transforms import DisplacementTransform, OptionTransform, SkillTransform
+
+GUIDED_RADIUS = 0.2
+"""Novelty radius of a search that a network guides, tiles."""
 
 
 def make_training_env(
@@ -138,6 +146,7 @@ class WaterworldKit(Kit):
     config: DemoConfig
     title = "Solving random mazes by planning over learned skills"
     group = 1  # each search is timed on its own
+    learning_options = 400
 
     def __init__(self, config: DemoConfig) -> None:
         super().__init__(config)
@@ -188,6 +197,29 @@ class WaterworldKit(Kit):
 
     def starts(self, split: str, num_starts: int) -> TensorDictBase:
         return make_starts(self.make_env(split), num_starts, self.config.seed)
+
+    def manager_network(
+        self, planner: MCTSPlanner, split: str, *, scale: bool = True
+    ) -> MazeNetwork:
+        if self.config.task != "maze":
+            raise ExperimentError(
+                f"The network of Waterworld's manager knows mazes with a target; task="
+                f"{self.config.task} has more to see. Use task=maze, or leave manager out."
+            )
+        planner.simulator.keep(MazeNetwork.KEYS)
+        mazes = self.make_env(split).mazes
+        return MazeNetwork(mazes, self.config.num_skills, gamma=self.config.gamma)
+
+    def manager_for(self, network: TensorDictModuleBase, split: str) -> TensorDictModuleBase:
+        assert isinstance(network, MazeNetwork)
+        return network.on(self.make_env(split).mazes)
+
+    def guide(self, planner: MCTSPlanner, network: TensorDictModuleBase) -> MCTSPlanner:
+        guided = super().guide(planner, network)
+        guided.novelty = RadiusNovelty("position", GUIDED_RADIUS)  # values tell near states apart
+        if (nodes := guided.budget.expansions) is not None:  # now of one option each
+            guided.budget = replace(guided.budget, expansions=nodes * guided.num_options)
+        return guided
 
     def path_lengths(self, starts: TensorDictBase) -> np.ndarray:
         mazes = self.make_env("test").mazes

@@ -1,4 +1,4 @@
-"""A network that reads a Waterworld maze: which option to prefer, and how far the target is.
+"""A network that reads a maze of tiles: which option to prefer, and how far the target is.
 
 Letters: *B batch of states, m states in one dimension, U mazes with their targets, H rows, W
 columns, A options, C channels.
@@ -7,13 +7,14 @@ columns, A options, C channels.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -24,7 +25,7 @@ _CACHE_SIZE = 4096
 
 
 class MazeNetwork(TensorDictModuleBase):
-    r"""Prior and value for Waterworld mazes: learned step costs, shortest paths, a small head.
+    r"""Prior and value for mazes of tiles: learned step costs, shortest paths, a small head.
 
     A convolution over the walls gives each tile the costs :math:`c > 0` of moving to its 8
     neighbours. Shortest paths by these costs give each tile its distance to the target,
@@ -49,9 +50,10 @@ class MazeNetwork(TensorDictModuleBase):
         hidden: width of the head's two hidden layers. Default 64.
         steps_per_tile: unit of the distances in base steps. Default 15, what a tile takes at the
             speed that thrust reaches.
+        keys: entries read: place, velocity, target (float ``[*B, 2]``, in tiles), number of the
+            maze (int64 ``[*B]``). Default: Waterworld's.
 
-    Reads: ``"position"``, ``"velocity"``, ``"target"`` (float ``[*B, 2]``), ``"maze_index"`` (int64
-    ``[*B]``). Writes: ``"logits"`` (float ``[*B, A]``), ``"state_value"`` (float ``[*B, 1]``).
+    Writes: ``"logits"`` (float ``[*B, A]``), ``"state_value"`` (float ``[*B, 1]``).
 
     Raises:
         ValueError: if ``mazes`` has not three dimensions, or a number is out of its range.
@@ -69,7 +71,7 @@ class MazeNetwork(TensorDictModuleBase):
         (torch.Size([3, 4]), torch.Size([3, 1]))
     """
 
-    in_keys = ["position", "velocity", "target", "maze_index"]
+    KEYS = ("position", "velocity", "target", "maze_index")
     out_keys = ["logits", "state_value"]
 
     def __init__(
@@ -81,8 +83,10 @@ class MazeNetwork(TensorDictModuleBase):
         channels: int = 32,
         hidden: int = 64,
         steps_per_tile: float = 15.0,
+        keys: Sequence[NestedKey] = KEYS,
     ) -> None:
         super().__init__()
+        self.in_keys = list(keys)
         if not 0.0 < gamma < 1.0:
             raise ValueError(
                 f"MazeNetwork writes values gamma ** n, so gamma must lie in (0, 1); got {gamma}."
