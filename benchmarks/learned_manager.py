@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torchrl_hmcts.trainers.experiments.waterworld.maze_network import MazeNetwork
 from mazes import RADIUS, demo_loss, greedy, make_option_env, make_starts, planner
 from table import markdown, read_arguments, write
 from tensordict import TensorDictBase
@@ -32,6 +31,7 @@ from tqdm import tqdm
 from torchrl_hmcts.envs import maze_pool
 from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, SearchBudget
 from torchrl_hmcts.trainers.evaluation import plan_and_execute, spread
+from torchrl_hmcts.trainers.experiments.waterworld.maze_network import MazeNetwork
 from torchrl_hmcts.trainers.expert_iteration import ExpertIterationTrainer, make_guided_planner
 
 GAMMA = 0.99  # the demo's

@@ -8,10 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchrl_hmcts.trainers.experiments.waterworld.maze_network import (
-    MazeNetwork,
-    shortest_distances,
-)
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -30,6 +26,10 @@ from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import (
     ExpertIterationTrainer,
     make_guided_planner,
+)
+from torchrl_hmcts.trainers.experiments.waterworld.maze_network import (
+    MazeNetwork,
+    shortest_distances,
 )
 from torchrl_hmcts.trainers.expert_iteration import SearchCollector
 

@@ -60,7 +60,7 @@ class GymConfig(SkillsConfig):
     EXPERIMENT, KIT = "gym", "gym"
     TOY = {"train_base_steps": 1_280, "mazes": 2, "expansions": 200, "search_steps": 200}
     KEPT = (*SkillsConfig.KEPT, "id", "make", "option_steps", "skill_steps")
-    LEAST = {"curve_points": 0, "option_steps": 0, "skill_steps": 0, "processes": 0}
+    LEAST = {**SkillsConfig.LEAST, "option_steps": 0, "skill_steps": 0, "processes": 0}
     ABOVE_ZERO: ClassVar[tuple[str, ...]] = ("updates_per_step",)
     CHOICES = SkillsConfig.CHOICES | {
         "options": ("learned", "actions", "directions", "goals"),
