@@ -30,6 +30,7 @@ from torchrl_hmcts.planners import RolloutEvaluator
 from torchrl_hmcts.trainers.command_line.words import parse_config
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.kits import Kit, make_kit
+from torchrl_hmcts.trainers.experiments.managers import learn_manager
 from torchrl_hmcts.trainers.experiments.registry import DEMO, EXPERIMENTS
 from torchrl_hmcts.trainers.experiments.skills import learn, make_loss
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, wilson
@@ -37,6 +38,7 @@ from torchrl_hmcts.trainers.figures.intervals import bootstrap, wilson
 COMMAND = "python benchmarks/ablations.py --seeds 0 1 2 --out docs/results/ablations.json"
 TASKS: dict[str, tuple[str, ...]] = {  # kit, then words
     "maze": ("waterworld", "mazes=100"),
+    "maze, few": ("waterworld", "mazes=20"),
     "maze 15": ("waterworld", "mazes=50", "size=15", "search_steps=30000"),
     "boat": ("waterworld", "mazes=50", "task=boat", "search_steps=15000"),
     "key 15": ("waterworld", "mazes=50", "task=key", "size=15", "search_steps=60000"),
@@ -70,10 +72,15 @@ def arms(seeds: Sequence[int]) -> Iterator[Arm]:
     for seed in seeds:
         for task in ("maze", "apples 15", "key 15", "lab apples 15"):
             yield from searches(task, seed)
-        for task in ("maze", "boat", "lab", "lab turn"):
+        for task in ("boat", "lab turn", "maze", "lab"):
             yield from workers(task, seed)
         for task in ("maze", "lab"):
             yield from features(task, seed)
+        for task in ("maze", "maze 15"):
+            for manager in ("novelty", "learned"):
+                yield Arm("manager", task, manager, (f"manager={manager}",), seed=seed)
+        yield from simulations("maze, few", seed)
+        yield from simulations("apples 15", seed)
         for length in (10, 25, 50, 100):
             words = (f"option_steps={length}", f"novelty_radius={min(2.0, 0.04 * length):g}")
             yield Arm("option length", "maze", f"{length} base steps", words, seed=seed)
@@ -98,12 +105,16 @@ def searches(task: str, seed: int) -> Iterator[Arm]:
     yield Arm("search", task, "random option", search="random option", seed=seed)
     for name in ORDERS:
         yield Arm("search", task, name, search=name, seed=seed)
-    if task in ("maze", "apples 15"):
-        for name, most in (("none", 0), ("random, 10 options", 10)):
-            for test in ("place", "none"):
-                words = (f"features={test}",)
-                label = f"simulation {name}; novelty {test}"
-                yield Arm("simulation", task, label, words, rollouts=most, seed=seed)
+
+
+def simulations(task: str, seed: int) -> Iterator[Arm]:
+    """Yield the simulation steps of a task, with and without a novelty test."""
+    few = ("expansions=100",) if task == "maze, few" else ()
+    for name, most in (("none", 0), ("random, 10 options", 10)):
+        for test in ("place", "none"):
+            words = (f"features={test}", *few)
+            label = f"simulation {name}; novelty {test}"
+            yield Arm("simulation", task, label, words, rollouts=most, seed=seed)
 
 
 def workers(task: str, seed: int) -> Iterator[Arm]:
@@ -167,7 +178,16 @@ def configured(kit_name: str, words: Sequence[str]) -> Kit:
     return make_kit(parse_config(experiment, list(words)))
 
 
-_PLANNING = ("planner", "features", "search_", "mazes", "size", "novelty_radius", "option_steps")
+_PLANNING = (
+    "planner",
+    "manager",
+    "features",
+    "search_",
+    "mazes",
+    "size",
+    "novelty_radius",
+    "option_steps",
+)
 
 
 def measure(arm: Arm) -> dict[str, Any]:
@@ -188,6 +208,12 @@ def measure(arm: Arm) -> dict[str, Any]:
         loss, seconds = trained(kit_name, tuple(learning))
         kit.note(loss)
         worker = SkillPolicy(loss.actor_network, deterministic=True)
+    if kit.config.manager == "learned":
+        begin = time.process_time()
+        train = kit.make_simulator(worker, "train")
+        network = learn_manager(kit, train, searches=400, iterations=4, updates=200)
+        kit.manager = kit.manager_for(network, "test")
+        seconds += time.process_time() - begin
     begin = time.process_time()
     results = run(kit, arm, worker)
     return {
@@ -199,7 +225,7 @@ def measure(arm: Arm) -> dict[str, Any]:
         "simulated": results.simulated_steps.tolist(),
         "executed": results.episode_steps.tolist(),
         "rewards": [round(float(reward), 3) for reward in results.rewards],
-        "training_cpu_seconds": seconds,
+        "training_cpu_seconds": round(seconds, 1),
         "cpu_seconds": round(time.process_time() - begin, 1),
     }
 
