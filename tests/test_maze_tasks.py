@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from queue_search import ORDERS, search
+from queue_search import ORDERS, plan_by_queue, search
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
@@ -24,8 +24,8 @@ from torchrl_hmcts.planners import (
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import DemoConfig, make_kit
 from torchrl_hmcts.trainers.experiments.managers import learn_manager, load_manager, save_manager
-from torchrl_hmcts.trainers.experiments.skills import make_loss, solve
 from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
+from torchrl_hmcts.trainers.experiments.skills import make_loss, solve
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -246,7 +246,7 @@ def test_a_queue_finds_the_only_plan_of_a_chain(order: str) -> None:
     assert found["found"]
 
 
-def test_a_queue_takes_the_larger_of_two_rewards_and_keeps_its_budget() -> None:
+def test_a_queue_takes_all_that_pays_and_keeps_its_budget() -> None:
     maze, _, _ = maze_from_text(".......")
     env = WaterworldMazeEnv(maze[None], items=MazeItems(apples=2), max_steps=400)
     env._placed.places[0] = [[2.5, 0.5], [6.5, 0.5]]
@@ -256,6 +256,6 @@ def test_a_queue_takes_the_larger_of_two_rewards_and_keeps_its_budget() -> None:
     novelty = RadiusNovelty(["position", "items"], 0.5, scale=[1.0, 10.0])
     budget = SearchBudget(base_steps=4_000, until_plan=False)
     planner = MCTSPlanner(macro, novelty=novelty, budget=budget)
-    found = search(planner, start, ORDERS["breadth first"])
-    assert found["options"][-1] in (2, 3)
-    assert found["simulated_steps"] <= 4_000 + 4 * 20
+    results = plan_by_queue(planner, macro, start, "breadth first", seed=0)
+    assert results.rewards.tolist() == pytest.approx([2.1])  # both apples, then the target
+    assert results.simulated_steps[0] <= 4_000 + 4 * 20

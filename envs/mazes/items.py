@@ -6,6 +6,7 @@ Letters: *B batch, n its elements, M mazes, K things per maze.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,6 +97,14 @@ class PlacedItems:
         if items.key:
             self.worth[:, -1] = 0.0
         self._key, self._reach = items.key, touch**2
+
+    def draw(self, axes: Any, maze: int) -> None:
+        """Draw the items of a maze in axes of matplotlib: apples by their worth, the key a star."""
+        x, y = self.places[maze].T
+        size = 8.0 + 32.0 * self.worth[maze] / max(1e-9, float(self.worth.max()))
+        last = len(x) - self._key
+        axes.scatter(x[:last], y[:last], s=size[:last], color="#d55e00", zorder=3)
+        axes.scatter(x[last:], y[last:], s=90.0, marker="*", color="#cc79a7", zorder=3)
 
     def take(
         self, maze: np.ndarray, position: np.ndarray, left: np.ndarray

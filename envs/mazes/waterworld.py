@@ -19,7 +19,7 @@ from torchrl_hmcts.checks import instance, real_number
 from torchrl_hmcts.envs.mazes.chipmunk import ChipmunkMazes
 from torchrl_hmcts.envs.mazes.items import MazeItems, PlacedItems
 from torchrl_hmcts.envs.mazes.maze_env import TileMazeEnv
-from torchrl_hmcts.envs.mazes.rendering import draw_maze
+from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, draw_maze
 
 _DIRECTIONS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))  # (x, y) of up, down, left, right
 _HEADINGS = 32  # of a boat, which turns from one to the next in a base step
@@ -375,7 +375,19 @@ class WaterworldMazeEnv(TileMazeEnv):
         state = self._write_state(at, moving, goal, maze, steps, shape, **entries)
         return state.update({k: torch.zeros_like(steps, dtype=torch.bool) for k in self.done_keys})
 
+    def draw_map(self, axes: Any, tensordict: TensorDictBase) -> None:
+        super().draw_map(axes, tensordict)
+        if self._placed is not None:
+            self._placed.draw(axes, int(tensordict["maze_index"]))
+
     def _draw(self, tensordict: TensorDictBase, options: dict[str, Any]) -> np.ndarray:
+        if self._placed is not None:
+            lying = self._placed.places[int(tensordict["maze_index"])][tensordict["items"].numpy()]
+            options = {"dots": lying, **options}
+        if self.steering == "heading":
+            bow = tensordict["position"] + 0.45 * tensordict["heading"]
+            line = (torch.stack((tensordict["position"], bow)).numpy(), PLAYER_COLOR)
+            options = {**options, "paths": [*options.get("paths", ()), line]}
         return draw_maze(
             self.mazes[tensordict["maze_index"]].cpu(),
             player=tensordict["position"].tolist(),
