@@ -37,13 +37,13 @@ from torchrl_hmcts.trainers.figures.intervals import bootstrap, wilson
 
 COMMAND = "python benchmarks/ablations.py --seeds 0 1 2 --out docs/results/ablations.json"
 TASKS: dict[str, tuple[str, ...]] = {  # kit, then words
-    "maze": ("waterworld", "mazes=100"),
+    "maze": ("waterworld", "mazes=50"),
     "maze, few": ("waterworld", "mazes=20"),
     "maze 15": ("waterworld", "mazes=50", "size=15", "search_steps=30000"),
     "boat": ("waterworld", "mazes=50", "task=boat", "search_steps=15000"),
-    "key 15": ("waterworld", "mazes=50", "task=key", "size=15", "search_steps=60000"),
+    "key 15": ("waterworld", "mazes=30", "task=key", "size=15", "search_steps=60000"),
     "apples 15": ("waterworld", "mazes=50", "task=apples", "size=15"),
-    "lab": ("labmaze", "mazes=100", "curve_points=0"),
+    "lab": ("labmaze", "mazes=50", "curve_points=0"),
     "lab turn": ("labmaze", "mazes=50", "task=turn", "curve_points=0", "search_frames=80000"),
     "lab apples 15": (
         *("labmaze", "mazes=50", "task=apples", "size=15", "curve_points=0"),
@@ -68,14 +68,23 @@ class Arm:
 
 
 def arms(seeds: Sequence[int]) -> Iterator[Arm]:
-    """Yield all rows, cheap ones first."""
+    """Yield all rows, the tasks in which the parts matter first."""
+    for task in ("boat", "lab turn", "maze", "lab"):
+        for seed in range(10):
+            yield Arm(
+                "worker", task, "untrained", worker="untrained", seed=seeds[0], worker_seed=seed
+            )
     for seed in seeds:
-        for task in ("maze", "apples 15", "key 15", "lab apples 15"):
-            yield from searches(task, seed)
-        for task in ("boat", "lab turn", "maze", "lab"):
+        yield from searches("apples 15", seed)
+        for task in ("boat", "lab turn"):
             yield from workers(task, seed)
         for task in ("maze", "lab"):
             yield from features(task, seed)
+    for seed in seeds:
+        for task in ("maze", "lab"):
+            yield from workers(task, seed)
+        for task in ("lab apples 15", "key 15", "maze"):
+            yield from searches(task, seed)
         for task in ("maze", "maze 15"):
             for manager in ("novelty", "learned"):
                 yield Arm("manager", task, manager, (f"manager={manager}",), seed=seed)
@@ -84,11 +93,6 @@ def arms(seeds: Sequence[int]) -> Iterator[Arm]:
         for length in (10, 25, 50, 100):
             words = (f"option_steps={length}", f"novelty_radius={min(2.0, 0.04 * length):g}")
             yield Arm("option length", "maze", f"{length} base steps", words, seed=seed)
-    for task in ("maze", "boat", "lab", "lab turn"):
-        for seed in range(10):
-            yield Arm(
-                "worker", task, "untrained", worker="untrained", seed=seeds[0], worker_seed=seed
-            )
 
 
 def searches(task: str, seed: int) -> Iterator[Arm]:

@@ -235,6 +235,7 @@ GOOD: dict[str, Good] = {
         LabMazeEnv={"maze_seeds": range(2)},
         GridFeatures={},
         GridMoves={},
+        MazeItems={"apples": 2},
         RepeatActions={"actions": 3},
         SharedMLP={"num_options": 2, "num_actions": 3, "hidden": (4,)},
     ),
