@@ -184,9 +184,8 @@ class WaterworldKit(Kit):
 
     def planner_part(self) -> dict[str, Any]:
         config, part = self.config, super().planner_part()
-        if (
-            self.has_items and config.features == "place"
-        ):  # a place is another one with other items around
+        if self.has_items and config.features == "place" and part.get("novelty"):
+            # The same place is another state when other items are left.
             part["novelty"] |= {"key": ["position", "items"], "scale": [1.0, 10.0]}
         if config.task == "apples":
             part["tree_policy"] = {"_component_": "torchrl_hmcts.planners.UCT", "c": 0.3}
@@ -240,9 +239,11 @@ class WaterworldKit(Kit):
 
         steps = results.episode_steps[solved]
         per_tile = steps / self.path_lengths(trial.starts)[solved]
+        earned = {"reward_mean": round(float(results.rewards.mean()), 3)} if self.has_items else {}
         return {
             "mazes": len(solved),
             "solved": int(solved.sum()),
+            **earned,
             "train_base_steps": learned.steps,
             "compile_seconds": round(trial.compile_seconds, 2),
             "plan_seconds_median": round(median(results.plan_seconds), 4),
@@ -275,4 +276,6 @@ class WaterworldKit(Kit):
             ("base steps per tile of the shortest path", "{episode_base_steps_over_shortest:.1f}"),
             ("whole demo", "{seconds:.1f} s"),
         ]
+        if self.has_items:
+            rows.insert(1, ("reward of an episode, mean", "{reward_mean:.2f}"))
         return "\n".join(["", *(f"  {name:<42}{form.format(**metrics):>8}" for name, form in rows)])
