@@ -11,6 +11,7 @@ are not run again.
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -275,11 +276,12 @@ def pooled(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     )
     low, high = wilson(int(solved.sum()), len(solved))
     mean, least, most = bootstrap(rewards.tolist())
+    shares = [np.mean(row["solved"]) for row in sorted(rows, key=lambda r: r["worker_seed"])]
     return {
         **{key: rows[0][key] for key in ("table", "task", "arm")},
         "seeds": len({(row["seed"], row["worker_seed"]) for row in rows}),
         "solved": f"{solved.mean():.0%} ({low:.0%} to {high:.0%})",
-        "by seed": ", ".join(f"{np.mean(row['solved']):.0%}" for row in rows),
+        "by seed": ", ".join(f"{share:.0%}" for share in shares),
         "simulated": f"{np.median(simulated):,.0f} ({np.percentile(simulated, 95):,.0f})",
         "executed": f"{np.median(executed[solved > 0]):,.0f}" if solved.any() else "",
         "reward": f"{mean:.2f} ({least:.2f} to {most:.2f})",
@@ -291,17 +293,25 @@ def by_name(*names: str) -> dict[str, Any]:
     return {name: (lambda row, name=name: row[name]) for name in names}
 
 
-def tables(rows: Sequence[dict[str, Any]]) -> str:
+def tables(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
     """Return all tables as markdown, by table and task."""
     groups: dict[tuple[str, str], dict[str, list[dict[str, Any]]]] = {}
     for row in rows:
         groups.setdefault((row["table"], row["task"]), {}).setdefault(row["arm"], []).append(row)
-    columns = by_name("arm", "seeds", "solved", "by seed", "simulated", "executed", "reward")
-    text = [
-        f"{table}, {task}\n\n{markdown(map(pooled, found.values()), columns)}\n"
-        for (table, task), found in groups.items()
-    ]
-    return "\n".join(text)
+    text = {}
+    for (table, task), found in groups.items():
+        last = "reward" if "apples" in task else "executed"
+        columns = by_name("arm", "seeds", "solved", "by seed", "simulated", last)
+        text[f"{table}, {task}"] = markdown(map(pooled, found.values()), columns)
+    return text
+
+
+def fill(page: str, found: dict[str, str]) -> str:
+    """Return a page with the table behind each comment that names one."""
+    for name, table in found.items():
+        pattern = rf"(<!-- {re.escape(name)} -->\n\n)(?:\|.*\n)*"
+        page = re.sub(pattern, lambda match, table=table: f"{match[1]}{table}\n", page)
+    return page
 
 
 def main() -> None:
@@ -311,6 +321,7 @@ def main() -> None:
         seeds=[0, 1, 2],
         tables=(["all"], "search, simulation, worker, novelty, option length"),
         tasks=(["all"], "those of TASKS"),
+        page=("", "page whose tables are to be filled"),
     )
     out = args.out or Path("runs/ablations.json")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -326,7 +337,11 @@ def main() -> None:
         add_row(out, row, *keys, command=COMMAND)
         shown = by_name("table", "task", "arm", "solved", "simulated", "reward")
         print(markdown([pooled([row])], shown).splitlines()[-1], flush=True)
-    print(tables(json.loads(out.read_text())["rows"]))
+    found = tables(json.loads(out.read_text())["rows"])
+    if args.page:
+        page = Path(args.page)
+        page.write_text(fill(page.read_text(), found))
+    print("\n\n".join(f"{name}\n\n{table}" for name, table in found.items()))
 
 
 if __name__ == "__main__":
