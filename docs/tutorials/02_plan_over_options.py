@@ -149,7 +149,7 @@ left.set(
     ylim=(0, 20.5),
 )
 right.boxplot(
-    costs, tick_labels=labels, whis=(5, 95), showfliers=False, medianprops={"color": "#e66100"}
+    costs, tick_labels=labels, whis=(5, 95), showfliers=False, medianprops={"color": "#d51178"}
 )
 right.set(
     title="simulated base steps per search",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from operator import index
 from typing import Any
 
@@ -180,8 +180,8 @@ class WaterworldKit(Kit):
 
         return WaterworldMap(env)  # type: ignore[arg-type]
 
-    def table(self, metrics: Mapping[str, Any]) -> str:
-        rows = [
+    def rows(self) -> list[tuple[str, str]]:
+        return [
             ("mazes solved at the first trial", "{solved} of {mazes}"),
             ("worker training", "{train_seconds:.1f} s"),
             ("planning, one maze, median", "{plan_seconds_median:.3f} s"),
@@ -192,6 +192,5 @@ class WaterworldKit(Kit):
             ("options per plan, median", "{plan_options_median:.0f}"),
             ("base steps per episode, median", "{episode_base_steps_median:.0f}"),
             ("base steps per tile of the shortest path", "{episode_base_steps_over_shortest:.1f}"),
-            ("whole demo", "{seconds:.1f} s"),
+            ("whole run", "{seconds:.1f} s"),
         ]
-        return "\n".join(["", *(f"  {name:<42}{form.format(**metrics):>8}" for name, form in rows)])
