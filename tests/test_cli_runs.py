@@ -71,7 +71,7 @@ def test_a_run_is_tested_again_with_other_starts(run: Path, capsys) -> None:
     [
         ([], "say which run"),
         (["run={run}", "sed=1"], "Did you mean: seed"),
-        (["run={run}", "out=elsewhere"], "no out="),
+        (["run={run}", "out=elsewhere"], "Leave out= away"),
         (["run={run}/checkpoints"], "no folder of a run"),
         (["run={run}", "hidden=7"], "not those of this configuration"),
     ],

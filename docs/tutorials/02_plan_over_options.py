@@ -3,7 +3,7 @@ Plan over your own options
 ==========================
 
 Give a planner a handful of behaviours, and it finds how to string them together. Here: random
-mazes, four behaviours that nobody trained, and a tree search over them.
+mazes, four behaviours that need no training, and a tree search over them.
 """
 
 # %%

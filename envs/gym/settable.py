@@ -109,8 +109,8 @@ def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords:
         made = made(**keywords)
     if not isinstance(made, gymnasium.Env):
         raise TypeError(
-            f"An id such as 'CartPole-v1', a gymnasium.Env or a function that makes one is needed; "
-            f"got a {type(made).__name__}."
+            "The env must be an id such as 'CartPole-v1', a gymnasium.Env or a function that "
+            f"makes one; got a {type(made).__name__}."
         )
     made = _with_arrays(made)
     return PrivateRandom(made) if _draws_globally(made) else made

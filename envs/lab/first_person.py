@@ -31,7 +31,7 @@ def draw_first_person(
     height: int = 240,
     field_of_view: float = 90.0,
 ) -> np.ndarray:
-    """Draw what the player sees: brick walls, apples as dark red balls, the goal as a light green one.
+    """Draw what the player sees: brick walls, dark red apples, a light green goal.
 
     A picture for people, not the engine's: its textures and lights are others. The direction of a
     column :math:`u` of the picture is :math:`d + \\tan(\\text{fov} / 2)\\, u\\, r` with the heading

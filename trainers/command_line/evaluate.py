@@ -36,7 +36,7 @@ def evaluate(words: Sequence[str]) -> int:
         experiment, saved = load_config(run)
         changed = parse_config(experiment, rest, saved, ["run", "log_level"])
         if changed.out != saved.out:
-            raise ValueError("the figures go to the folder of the run, next to its own; no out=.")
+            raise ValueError("the figures are written into the folder of the run. Leave out= away.")
         before = vars(saved)
         changes = {key: value for key, value in vars(changed).items() if value != before[key]}
         for key in ("resume", "overwrite"):

@@ -42,7 +42,7 @@ def told(command: str, *wrong: type[Exception], resume: Sequence[str] = ()) -> I
 
     Args:
         command: as users type it, e.g. ``"train experiment=labmaze"``.
-        *wrong: errors that come of wrong words, e.g. ``WRONG_WORDS``; exit status 2.
+        *wrong: errors that wrong words cause, e.g. ``WRONG_WORDS``; exit status 2.
         resume: holds the command that continues the run, once there is one.
     """
     try:

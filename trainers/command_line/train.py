@@ -130,7 +130,7 @@ def _continued(folder: str, words: Sequence[str]) -> tuple[str, Experiment, Any]
     if others:
         raise ValueError(
             f"resume={folder} continues exactly as the run was begun; {others[0]!r} would change "
-            f"it. To change keys on the way: experiment=NAME out={folder} resume=true and the keys."
+            f"it. To change keys, type: experiment=NAME out={folder} resume=true and the keys."
         )
     experiment, config = load_config(read_run(home(folder)))
     config = dataclasses.replace(config, resume=True, overwrite=False)

@@ -266,8 +266,8 @@ class GymKit(Kit):
             return GridMoves(int(moves.n)) if self._moves else RepeatActions(fixed_actions(space))
         if self.look.discrete:
             raise ValueError(
-                f"options=goals brings a feature to a value between others; those of {config.id} "
-                "are kinds without an order. Use options=actions."
+                f"options=goals moves a feature to a value; the features of {config.id} are "
+                "categories without an order. Use options=actions."
             )
         return find_goals(
             partial(make_task, self._env, self.look, False, config.make),
