@@ -72,7 +72,10 @@ class Bar(tqdm):
 
     def update(self, n: float | None = 1) -> bool | None:
         """Move it on by a number of steps."""
-        return super().update((1 if n is None else n) * self.scale)
+        moved = (1 if n is None else n) * self.scale
+        if self.total is not None and self.n + moved > self.total:  # the last batch is whole
+            self.total = self.n + moved
+        return super().update(moved)
 
     def set_postfix(self, *_: Any, refresh: bool = True, **figures: Any) -> None:
         """Show figures beside it; those that are no number yet are left out."""
