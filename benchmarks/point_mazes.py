@@ -66,16 +66,20 @@ def solve(agent: HMCTS, num_starts: int) -> dict[str, Any]:
 
 
 def run(
-    name: str, seed: int, starts: int, ablation_starts: int
+    name: str, seed: int, starts: int, ablation_starts: int, known: dict[str, Any]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Learn and plan in one env, and beside it the ablations; give each as it is done."""
-    begin = time.process_time()
-    agent = HMCTS(name, num_skills=SKILLS, seed=seed).learn(STEPS, progress=False)
-    seconds = round(time.process_time() - begin, 1)
-    found = {
-        key: getattr(agent.config, key) for key in ("option_steps", "skill_steps", "novelty_radius")
-    }
-    yield "learned", {"training_cpu_seconds": seconds, **found, **solve(agent, starts)}
+    """Learn and plan in one env, and beside it the ablations; give each as it is done.
+
+    With no starts nothing is learned; the ablations take the settings of the ``known`` row.
+    """
+    keys = ("option_steps", "skill_steps", "novelty_radius")
+    found = {key: known[key] for key in keys if key in known}
+    if starts:
+        begin = time.process_time()
+        agent = HMCTS(name, num_skills=SKILLS, seed=seed).learn(STEPS, progress=False)
+        seconds = round(time.process_time() - begin, 1)
+        found = {key: getattr(agent.config, key) for key in keys}
+        yield "learned", {"training_cpu_seconds": seconds, **found, **solve(agent, starts)}
     if ablation_starts:
         same = {**found, "planner": {"budget": {"base_steps": LIMIT}}}
         fixed = HMCTS(name, seed=seed, **same)
@@ -98,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("envs", nargs="*", default=ENVS)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--starts", type=int, default=50)
+    parser.add_argument("--starts", type=int, default=50, help="0: the ablations only")
     parser.add_argument("--ablation-starts", type=int, default=10, help="of the first seed")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
@@ -106,7 +110,9 @@ def main() -> None:
     for seed in arguments.seeds:
         for name in arguments.envs:
             others = arguments.ablation_starts if seed == arguments.seeds[0] else 0
-            for way, row in run(name, seed, arguments.starts, others):
+            before = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {}
+            known = before.get("runs", {}).get(name, {}).get(str(seed), {}).get("learned", {})
+            for way, row in run(name, seed, arguments.starts, others, known):
                 print(name, seed, way, row, flush=True)
                 add(arguments.out, name, seed, way, row)
 

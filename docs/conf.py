@@ -12,6 +12,8 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "_extensions"))
 
+from repository_links import repository  # noqa: E402
+
 import torchrl_hmcts  # noqa: E402
 
 project = "torchrl_hmcts"
@@ -141,4 +143,7 @@ html_theme_options = {
     "pygments_light_style": "tango",
     "pygments_dark_style": "monokai",
 }
+if address := repository(HERE.parent):  # without one there is no link
+    icon = {"name": "Repository", "url": address, "icon": "fa-solid fa-code-branch"}
+    html_theme_options["icon_links"] = [icon]
 html_sidebars = {"index": [], "getting_started": [], "auto_results/index": [], "changelog": []}

@@ -194,7 +194,10 @@ def test_an_agent_learns_plans_and_lends_its_skills(tmp_path: Path) -> None:
     ("make", "sentence"),
     [
         (lambda: HMCTS("PointMaze_UMaze-v3", kit="ant"), "has no ant: its model has 2 positions"),
-        (lambda: HMCTS("antmaze-medium-v0", kit="labmaze"), "'labmaze' is none of Gymnasium envs"),
+        (
+            lambda: HMCTS("antmaze-medium-v0", kit="labmaze"),
+            "'labmaze' is not a kit of Gymnasium envs",
+        ),
         (
             lambda: AntConfig(id="antmaze-medium-v0", algorithm="hmcts").check_inputs(),
             "learns by LSD with algorithm=diayn",

@@ -151,7 +151,7 @@ def test_weights_are_written_back_into_the_network_they_came_from() -> None:
     worker.store(other.parameters())
     for a, b in zip(network.parameters(), other.parameters(), strict=True):
         assert a.equal(b)
-    with pytest.raises(ValueError, match=r"wants parameters of the shapes \[\(16, 128\)"):
+    with pytest.raises(ValueError, match=r"needs parameters of the shapes \[\(16, 128\)"):
         worker.store(SkillMLP(128, 5, 2, hidden=(16, 8)).parameters())
 
 
@@ -395,7 +395,7 @@ def test_while_the_critics_warm_up_the_actor_stays_and_then_it_learns() -> None:
         (lambda: FollowGoals([ByteGoal(128, 0, 0, 1, 2)]), ValueError, "0 to 127; got .*=128"),
         (lambda: JoinedWorkers([]), ValueError, "at least one worker; got none"),
         (lambda: OccasionalAction(RepeatActions(2), 1, 1.5), ValueError, "from 0 to 1; got 1.5"),
-        (lambda: load_worker({"kind": "magic"}), ValueError, "kind 'magic' are not known"),
+        (lambda: load_worker({"kind": "magic"}), ValueError, "kind of options: 'magic'"),
         (lambda: plain_worker(Given(None)), TypeError, "Given cannot be saved as plain data"),
         (lambda: OptionGoals([]), ValueError, "got none"),
         (lambda: OptionGoals([3], scale=0.0), ValueError, "scale > 0.0.*; got 0.0"),
@@ -408,7 +408,7 @@ def test_while_the_critics_warm_up_the_actor_stays_and_then_it_learns() -> None:
         (lambda: TrainedSource("diayn", base_step=3), TypeError, "'base_step'"),
         (lambda: train("diayn", discriminator="ram"), ValueError, "'controllable'.*'ram'"),
         (lambda: train("fine_tuned", Given(TRACKERS)), TypeError, "executed by FollowGoals"),
-        (lambda: train("retrained", Given(SharedMLP(2, 4))), TypeError, "for is not known"),
+        (lambda: train("retrained", Given(SharedMLP(2, 4))), TypeError, "options.* is unknown"),
         (lambda: train("retrained", distilled(), rounds=0), ValueError, "rounds >= 1; got 0"),
         (lambda: train("retrained", distilled(), warm_up=2.0), ValueError, "warm_up .*2.0"),
         (lambda: train("fine_tuned", distilled(), warm_up=-1), ValueError, "warm_up .*-1"),

@@ -71,7 +71,7 @@ def test_a_run_is_tested_again_with_other_starts(run: Path, capsys) -> None:
     [
         ([], "say which run"),
         (["run={run}", "sed=1"], "Did you mean: seed"),
-        (["run={run}", "out=elsewhere"], "no out="),
+        (["run={run}", "out=elsewhere"], "Leave out= away"),
         (["run={run}/checkpoints"], "no folder of a run"),
         (["run={run}", "hidden=7"], "not those of this configuration"),
     ],
@@ -162,6 +162,30 @@ def test_values_go_to_other_loggers_as_well(tmp_path, logger) -> None:
     content = b"".join((tmp_path / p).read_bytes() for p in events)
     assert b"train/entropy" in content
     assert b"pictures/search" in content
+
+
+@pytest.mark.parametrize("logger", ["tensorboard", "wandb"])
+def test_a_board_gets_groups_and_what_the_page_shows(tmp_path, capsys, logger, monkeypatch) -> None:
+    pytest.importorskip(logger)
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    words = ["kit=waterworld", "toy=true", "curve_points=1", f"logger={logger}", f"out={tmp_path}"]
+    assert main(["train", *words]) == 0
+    watch = {
+        "tensorboard": f"tensorboard --logdir {tmp_path}\n",
+        "wandb": f"W&B is offline: afterwards wandb sync {tmp_path}/wandb/offline-run-*\n",
+    }
+    assert f"  watch   {watch[logger]}" in capsys.readouterr().out
+    written = [p for p in (tmp_path / logger).rglob("*") if p.is_file() and not p.is_symlink()]
+    events = [p for p in written if p.name.startswith("events.out") or p.suffix == ".wandb"]
+    content = b"".join(path.read_bytes() for path in events)
+    for tag in (b"loss/actor_loss", b"train/entropy", b"eval/solved"):
+        assert tag in content
+    shown = json.loads((tmp_path / "page.json").read_text())["pictures"]
+    assert {"episode.gif", "search.png", "skills.png", "losses.png"} <= set(shown)
+    for name in shown:
+        assert f"pictures/{name.partition('.')[0]}".encode() in content
+    films = [path for path in written if path.suffix == ".gif"]
+    assert films if logger == "wandb" else b"GIF89a" in content
 
 
 @pytest.mark.parametrize(

@@ -316,7 +316,7 @@ def test_goals_are_found_on_features_that_actions_control() -> None:
     solution = agent.solve(seed=0)
     assert solution.solved
     assert solution.base_steps == 9
-    with pytest.raises(ValueError, match="are kinds without an order. Use options=actions"):
+    with pytest.raises(ValueError, match="are categories without an order. Use options=actions"):
         HMCTS("FrozenLake-v1", options="goals")
 
 

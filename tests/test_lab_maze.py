@@ -391,7 +391,7 @@ class TestReadOuts:
 
         assert pixel(1.5, 1.5) == [37, 99, 235]
         assert pixel(1.5, 3.5) == [22, 163, 74]
-        assert pixel(3.5, 1.5) == [220, 38, 38]
+        assert pixel(3.5, 1.5) == [213, 17, 120]
         assert pixel(2.5, 2.5) == [255, 255, 255]
         assert pixel(0.5, 0.5) == [24, 24, 27]
         assert pixel(1.8, 1.5) == [37, 99, 235]  # it looks to the east

@@ -187,7 +187,7 @@ def test_algorithm_3_learns_within_its_frames_and_logs_the_same_losses() -> None
     [
         ({"algorithm": "sac"}, "algorithm is one of"),
         ({"size": 10}, "size must be odd and at least 5 cells; got 10"),
-        ({"option_frames": 90}, "option_frames=90 is no whole number of base steps"),
+        ({"option_frames": 90}, "option_frames=90 is not a multiple of frames_per_step=4"),
         ({"train_frames": 255}, "train_frames=255 are too few"),
         ({"algorithm": "hmcts", "train_frames": 9_000}, "train_frames=9000 are too few"),
         ({"keep": "first"}, "keep is one of best, last; got 'first'"),

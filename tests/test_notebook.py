@@ -7,11 +7,18 @@ import subprocess
 import sys
 
 import pytest
+from gymnasium.envs.classic_control import CartPoleEnv
 from tensordict.nn import TensorDictModule
-from torchrl.envs import TransformedEnv
+from torchrl.envs import StepCounter, TransformedEnv
 
 import torchrl_hmcts
-from torchrl_hmcts.envs import LabMazeEnv, OptionPool, RepeatActions, WaterworldMazeEnv
+from torchrl_hmcts.envs import (
+    LabMazeEnv,
+    OptionPool,
+    RepeatActions,
+    SettableGymEnv,
+    WaterworldMazeEnv,
+)
 from torchrl_hmcts.planners import (
     PUCT,
     UCT,
@@ -79,6 +86,20 @@ def test_agents_pools_and_trainers_show_what_they_are() -> None:
     assert PICTURE not in trainer._repr_html_()
     trainer.train()
     assert PICTURE in trainer._repr_html_()
+
+
+def test_a_gymnasium_env_shows_its_state_also_below_transforms() -> None:
+    pytest.importorskip("pygame")
+    env = SettableGymEnv("CartPole-v1", seed=0)
+    start = env._repr_html_()
+    assert start == env._repr_html_()  # no step was taken
+    assert start.startswith("<pre>SettableGymEnv(CartPole-v1, ")
+    for _ in range(4):
+        env.step(env.full_action_spec.zero())
+    assert PICTURE in env._repr_html_() != start
+    assert TransformedEnv(env, StepCounter())._repr_html_() == env._repr_html_()
+    nameless = SettableGymEnv(CartPoleEnv, seed=0)  # without an id no copy can be made that draws
+    assert nameless._repr_html_() == f"<pre>{nameless!r}</pre>"
 
 
 @pytest.mark.parametrize("env", [WaterworldMazeEnv(seed=0), LabMazeEnv(maze_seeds=[1], seed=0)])

@@ -135,7 +135,7 @@ class TestBaseSteps:
         after = env.step(env.reset().set("outer", torch.tensor([1, 1])))["next"]
         assert after["reward"].flatten().tolist() == pytest.approx([4.68559] * 2)
         assert after["outer_duration"].flatten().tolist() == [6, 6]
-        with pytest.raises(ValueError, match="read base steps from 'nothing'.*does not write"):
+        with pytest.raises(ValueError, match="reads base steps from 'nothing'.*does not write"):
             TransformedEnv(ChainEnv(6), level("o", "action", 2, base_duration_key="nothing"))
 
     def test_a_termination_is_told_the_base_steps(self) -> None:
@@ -407,7 +407,7 @@ def test_a_controller_without_its_primer_or_with_another_decision_is_refused() -
     with pytest.raises(ValueError, match="if it is the option, pass skill_key='told'"):
         env.append_transform(OptionTransform(controller, 2, 4, skills=table))
     env = GymEnv("Pendulum-v1").append_transform(controller.make_tensordict_primer())
-    with pytest.raises(ValueError, match="vectors of 1 numbers and is told options by their num"):
+    with pytest.raises(ValueError, match="vectors of 1 numbers, but gets options as their num"):
         env.append_transform(OptionTransform(controller, 2, 4, skill_key="told"))
 
 
@@ -564,7 +564,7 @@ class TestAutoReset:
 
     def test_a_batch_that_resets_itself_is_refused(self) -> None:
         resetting = TransformedEnv(SerialEnv(2, cart_pole), AutoResetTransform())
-        with pytest.raises(ValueError, match=r"steps, and at their end resets, all its 2 at once"):
+        with pytest.raises(ValueError, match=r"steps and resets all its 2 elements at once"):
             resetting.append_transform(level("o", "action", 4))
 
     def test_options_of_one_step_run_in_them(self) -> None:
@@ -646,7 +646,7 @@ def test_a_termination_of_another_form_is_refused(ends: Any, got: str) -> None:
 
 def test_more_options_than_a_worker_has_skills_are_refused() -> None:
     actor = SkillActor(4, Categorical(2), num_skills=3, in_keys=["observation"])
-    with pytest.raises(ValueError, match="has 3 skills and is to run 4 options.*num_options=3"):
+    with pytest.raises(ValueError, match="has 3 skills, but there are 4 options.*num_options=3"):
         TransformedEnv(cart_pole(), OptionTransform(SkillPolicy(actor), 4, 5))
 
 

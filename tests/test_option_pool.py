@@ -196,7 +196,7 @@ def test_a_ticket_is_of_one_pool_counts_once_and_frees_its_room(pool: OptionPool
     with pytest.raises(TypeError, match="neither copied nor sent"):
         copy.deepcopy(ticket)
     pool.step_wait(ticket)
-    with pytest.raises(RuntimeError, match=r"waited for before.*step_async again"):
+    with pytest.raises(RuntimeError, match=r"returned or dropped before.*step_async"):
         pool.step_wait(ticket)
     pool.step_abandon(ticket)
     for _ in range(NUM_SLOTS // 2):  # three options each
@@ -448,7 +448,7 @@ def test_arguments_that_make_no_sense_are_refused(
     ("change", "words"),
     [
         (lambda td: td.set("option", torch.tensor(2)), "Option 2 does not exist"),
-        (lambda td: td.exclude("snapshot"), "under 'snapshot', which the tensordict has not"),
+        (lambda td: td.exclude("snapshot"), "under 'snapshot', which the tensordict lacks"),
         (lambda td: td.set("snapshot", td["snapshot"][:-1]), r"has \[80\] numbers; got \[79\]"),
     ],
 )

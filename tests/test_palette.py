@@ -6,11 +6,14 @@ blindness is simulated in linear RGB (Machado, Oliveira and Fernandes, 2009, sev
 
 from __future__ import annotations
 
+import re
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from torchrl_hmcts.envs.lab import first_person
 from torchrl_hmcts.envs.mazes import rendering
 from torchrl_hmcts.planners.drawing import OPTION_COLORS
 from torchrl_hmcts.trainers.figures.pictures import COLORS
@@ -41,7 +44,30 @@ TO_XYZ = np.array(
     ]
 )
 WHITE = np.array([0.95047, 1.0, 1.08883])
-MARKS = [rendering.TARGET_COLOR, rendering.PLAYER_COLOR, rendering.DOT_COLOR]
+
+
+def from_hex(text: str) -> tuple[int, int, int]:
+    return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
+
+
+ROOT = Path(__file__).parents[1]
+SETS = {  # what one picture tells apart, and how far apart it is at least
+    "options": (OPTION_COLORS, 30),
+    "curves": ([from_hex(color) for color in COLORS], 30),
+    "mazes": (
+        [
+            *(rendering.TARGET_COLOR, rendering.PLAYER_COLOR, rendering.DOT_COLOR),
+            *(rendering.WALL_COLOR, rendering.FREE_COLOR),
+        ],
+        25,
+    ),
+    "the player's view": (
+        [getattr(first_person, f"_{name}") for name in ("APPLE", "GOAL", "WALL", "FLOOR", "SKY")],
+        25,
+    ),
+}
+HEX = re.compile(r'"(#[0-9a-f]{6})"')
+DRAWN_IN = ("trainers", "torchrl_hmcts", "envs", "benchmarks", "docs/tutorials", "docs/_extensions")
 
 
 def seen(color: tuple[int, int, int], vision: str) -> np.ndarray:
@@ -58,15 +84,19 @@ def closest(colors: list[tuple[int, int, int]], vision: str) -> float:
     return min(float(np.linalg.norm(a - b)) for a, b in combinations(places, 2))
 
 
-def from_hex(text: str) -> tuple[int, int, int]:
-    return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
+@pytest.mark.parametrize("vision", VISION)
+@pytest.mark.parametrize("name", SETS)
+def test_no_two_categories_are_closer_than_a_stated_distance(name: str, vision: str) -> None:
+    colors, least = SETS[name]
+    assert closest(list(colors), vision) >= least
 
 
 @pytest.mark.parametrize("vision", VISION)
-def test_no_two_categories_are_closer_than_a_stated_distance(vision: str) -> None:
-    assert closest(list(OPTION_COLORS), vision) >= 30
-    assert closest([from_hex(color) for color in COLORS], vision) >= 30
-    assert closest(MARKS, vision) >= 20
+def test_no_file_that_draws_names_two_colors_that_are_close(vision: str) -> None:
+    for folder in DRAWN_IN:
+        for path in (ROOT / folder).rglob("*.py"):
+            colors = {from_hex(color) for color in HEX.findall(path.read_text(encoding="utf-8"))}
+            assert len(colors) < 2 or closest(list(colors), vision) >= 25, path
 
 
 def test_the_simulation_finds_red_and_green_to_be_one_colour() -> None:

@@ -353,7 +353,7 @@ def test_the_search_stops_at_its_first_plan_or_improves_it_for_a_while() -> None
 @pytest.mark.parametrize("name", ["expansions", "simulations", "base_steps", "seconds", "nodes"])
 @pytest.mark.parametrize("value", [0, -1])
 def test_a_budget_of_nothing_is_refused_with_its_value(name: str, value: int) -> None:
-    with pytest.raises(ValueError, match=f"{name} > 0.*no plan; got {value}"):
+    with pytest.raises(ValueError, match=f"{name} > 0; got {value}"):
         SearchBudget(**{name: value})
 
 

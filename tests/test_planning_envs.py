@@ -107,7 +107,7 @@ def test_options_have_a_mask_of_their_own_while_the_worker_sees_the_base_actions
 
 
 def test_a_mask_of_as_many_base_actions_as_options_is_refused_where_it_is_named() -> None:
-    with pytest.raises(ValueError, match=r"'legal', which TableEnv writes of its 2 base actions"):
+    with pytest.raises(ValueError, match=r"in TableEnv this is the mask of the 2 base actions"):
         MCTSPlanner(legal_options(2, "legal"), mask_key="legal")
     with pytest.raises(ValueError, match=r"which of the 3 options .* that is torch.bool \[2\]"):
         MCTSPlanner(legal_options(3, "legal"), mask_key="legal")

@@ -43,29 +43,40 @@ def speed(monkeypatch: pytest.MonkeyPatch) -> Any:
     return results_tables
 
 
+def untrained(env: str) -> str:
+    """Mazes that skills of random weights solve, by seed."""
+    if env == "lab":  # the first point of the curve of training
+        curves = [
+            data("lab/labmaze.json")["results"][f"diayn {s} training"]["curve"] for s in range(3)
+        ]
+        assert {curve["training_steps"][0] for curve in curves} == {0.0}
+        return f"{listed(round(20 * curve['solved'][0]) for curve in curves)} of 20"
+    rows = [r for r in data("skills/untrained.json")["rows"] if r["worker"] == "untrained"]
+    return f"{listed(r['solved'] for r in rows)} of {rows[0]['starts']}"
+
+
 def readme_claims() -> list[str]:
     """The rows of README's table of results, as the data have them."""
     demo, maze = data("demo/seeds.csv"), data("settable/point_mazes.json")
-    untrained = [r for r in data("skills/untrained.json")["rows"] if r["worker"] == "untrained"]
     lab = [data("lab/labmaze.json")["results"][f"diayn {seed} size 9"] for seed in range(3)]
     frames = data("lab/labmaze.json")["results"]["diayn 0 training"]["frames"]
     large = maze["runs"]["PointMaze_Large-v3"]
+    bare, ant_bare = large["0"]["untrained"], data("antmaze/results.json")["solving"]
+    ant_bare = ant_bare["AntMaze_Large-v5 untrained seed 0"]
     ants = [data("antmaze/results.json")["solving"][f"AntMaze_Large-v5 seed {s}"] for s in (0, 1)]
     ant = ", ".join(f"{ant['solved']} of {ant['starts']}" for ant in ants)
     steps = f"{int(demo[0]['train_base_steps']):,} steps of training"
     return [
         f"mazes, 4 skills, {steps} | {listed(r['solved'] for r in demo)} of {demo[0]['mazes']} "
-        f"| {len(demo)} |",
-        f"the first {untrained[0]['starts']} of these mazes, untrained skills | "
-        f"{listed(r['solved'] for r in untrained)} of {untrained[0]['starts']} "
-        f"| {len(untrained)} |",
+        f"| {untrained('waterworld')} | {len(demo)} |",
         f"{frames:,} frames of training | {listed(r['solved'] for r in lab)} of {lab[0]['mazes']} "
-        f"| {len(lab)} |",
+        f"| {untrained('lab')} | {len(lab)} |",
         f"PointMaze_Large-v3, {maze['skills']} skills, {maze['training_steps']:,} steps of "
         f"training | {listed(run['learned']['solved'] for run in large.values())} of "
         f"{large['0']['learned']['starts']} "
-        f"| {len(large)} |",
-        f"AntMaze_Large-v5, ant trained without a maze | {ant} | {len(ants)} |",
+        f"| {bare['solved']} of {bare['starts']} | {len(large)} |",
+        f"AntMaze_Large-v5, ant trained without a maze | {ant} "
+        f"| {ant_bare['solved']} of {ant_bare['starts']} | {len(ants)} |",
     ]
 
 
@@ -87,6 +98,24 @@ def test_the_home_page_says_what_the_demo_measured() -> None:
     text = flat(page("docs/index.md"))
     assert "solves 100 of 100 such mazes at the first trial, in each of three seeds" in text
     assert f"in {int(demo[0]['train_base_steps']):,} steps" in text
+
+
+# Pages with a table of solved mazes.
+IN_WATERWORLD = (
+    *("diayn", "skill_objectives", "mcts_over_options", "expert_iteration", "option_model"),
+    *("option_termination", "growing_skills", "hmcts"),
+)
+
+
+@pytest.mark.parametrize("name", [f"algorithms/{name}" for name in IN_WATERWORLD] + ["index"])
+def test_the_untrained_worker_stands_beside_what_is_solved_in_waterworld(name: str) -> None:
+    mazes = untrained("waterworld").replace(" of 20", "")
+    assert f"ntrained skills solve {mazes} of" in flat(page(f"docs/{name}.md"))
+
+
+@pytest.mark.parametrize("name", ["algorithms/hmcts", "lab_maze"])
+def test_the_untrained_worker_stands_beside_what_is_solved_in_the_lab(name: str) -> None:
+    assert f"ntrained skills solve {untrained('lab')} other mazes" in flat(page(f"docs/{name}.md"))
 
 
 def test_speed_is_said_in_the_same_words_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:

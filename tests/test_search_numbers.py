@@ -622,7 +622,7 @@ def test_a_planner_and_its_search_hold_the_same_settings_which_cannot_be_changed
 @pytest.mark.parametrize(
     ("name", "value", "error"),
     [
-        ("tree_policy", Gumbel(), "Gumbel halves a known number"),
+        ("tree_policy", Gumbel(), "Gumbel needs a fixed number"),
         ("leaves_per_wave", 0, "leaves_per_wave from 1 to 255; got 0"),
         ("expand", "some", "expand is 'all' or 'one'; got 'some'"),
         ("settings", UCT(), "SearchSettings for settings"),

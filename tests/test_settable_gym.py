@@ -353,5 +353,5 @@ def test_minigrid_keeps_the_types_of_the_agents_place(kind: Any) -> None:
     assert repr(inner.agent_pos) == repr(kind((np.int64(2), 3)))
     assert (inner.agent_dir, inner.step_count) == (0, 0)
     inner.agent_pos = (1.5, 1)
-    with pytest.raises(SnapshotError, match=r"\(1\.5, 1\).*no whole numbers"):
+    with pytest.raises(SnapshotError, match=r"\(1\.5, 1\).*not whole numbers"):
         snapshot.read()

@@ -259,7 +259,7 @@ def test_a_prior_is_a_sequence_or_an_object_of_the_right_size() -> None:
         make_objective("diayn", prior=FixedSkillPrior(4))
     with pytest.raises(ValueError, match="num_skills="):
         METRAEncoderLoss(SkillNetwork(torch.nn.Identity(), ["x"], "representation"))
-    with pytest.raises(ValueError, match="told of 5 skills.*3 skills"):
+    with pytest.raises(ValueError, match="made for 5 skills.*3 skills"):
         METRAEncoderLoss(SkillEncoder(2, 3), num_skills=5)
     with pytest.raises(AttributeError, match="target_key"):
         SkillDynamicsLoss(identity_encoder(3))

@@ -331,14 +331,14 @@ def on_pendulum(worker: Any, **kwargs: Any) -> EnvBase:
             "METRAEncoderLoss takes a prior over a number of skills",
         ),
         (lambda: SkillMLP(2, 2, UnitSphere(2)), "Use ConcatSkillMLP"),
-        (lambda: SkillDiscriminator(2, UnitSphere(2)), "tells a number of skills apart.*METRA"),
+        (lambda: SkillDiscriminator(2, UnitSphere(2)), "needs numbered skills.*METRA"),
         (
             lambda: SkillDiscriminatorLoss(SkillEncoder(2, UnitSphere(2))),
-            "SkillDiscriminatorLoss tells a number of skills apart.*METRA",
+            "SkillDiscriminatorLoss needs numbered skills.*METRA",
         ),
         (
             lambda: METRAEncoderLoss(SkillEncoder(2, UnitSphere(2)), num_skills=3),
-            "told of 3 skills, but its SkillEncoder distinguishes vectors of 2 numbers",
+            "made for 3 skills, but its SkillEncoder distinguishes vectors of 2 numbers",
         ),
         (lambda: SkillTransform(Bounded(-1, 1, shape=(2, 2))), r"float32, shape \[2, 2\]"),
         (lambda: SkillTransform(MultiCategorical([2, 3])), "got MultiCategorical of torch.int64"),
@@ -361,11 +361,11 @@ def on_pendulum(worker: Any, **kwargs: Any) -> EnvBase:
         ),
         (
             lambda: on_pendulum(SkillPolicy(follows(UnitSphere(2), 3))),
-            r"vectors of 2 numbers and is told options by their numbers.*\[4, 2\].*spread_skills",
+            r"vectors of 2 numbers, but gets options as their numbers.*\[4, 2\].*spread_skills",
         ),
         (
             lambda: on_pendulum(SkillPolicy(follows(UnitSphere(2), 3)), skills=torch.zeros(4, 3)),
-            "told options by vectors of 3 numbers",
+            "gets options as vectors of 3 numbers",
         ),
         (
             lambda: on_pendulum(SkillPolicy(follows(Categorical(4), 3)), skills=torch.zeros(4, 3)),
@@ -379,7 +379,7 @@ def on_pendulum(worker: Any, **kwargs: Any) -> EnvBase:
             lambda: DIAYNTrainer.make_loss(
                 TransformedEnv(GymEnv("Pendulum-v1"), SkillTransform(UnitSphere(2)))
             ),
-            "tells a number of skills apart.*METRAEncoderLoss",
+            "needs numbered skills.*METRAEncoderLoss",
         ),
     ],
 )
@@ -407,5 +407,5 @@ def test_a_trainer_compares_what_its_env_draws_with_what_its_networks_know() -> 
         ValueError, match="draws 7 skills.*SkillPolicy that knows 6 skills.*SkillTransform.6."
     ):
         DIAYNTrainer(env(SkillTransform(7)), numbered)
-    with pytest.raises(ValueError, match="SkillReward finds an env that draws 7 skills"):
+    with pytest.raises(ValueError, match="SkillReward: the env draws 7 skills"):
         env(SkillTransform(7), SkillReward(numbered.objective)).rollout(1)

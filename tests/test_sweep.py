@@ -273,9 +273,9 @@ def test_no_value_is_drawn_twice_by_a_sweep_that_continues(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["z=[1,2]"], "has a sweep of something else: space"),
-        (["x=[1,2]", "steps=5"], "has a sweep of something else: fixed {}"),
-        (["x=[1,2]", "objective=-test.cost"], "has a sweep of something else: objective test.y"),
+        (["z=[1,2]"], "holds another sweep: space"),
+        (["x=[1,2]", "steps=5"], "holds another sweep: fixed {}"),
+        (["x=[1,2]", "objective=-test.cost"], "holds another sweep: objective test.y"),
     ],
 )
 def test_trials_of_other_settings_are_not_mixed(tmp_path, capsys, words, message) -> None:
@@ -290,7 +290,7 @@ def test_trials_of_other_settings_are_not_mixed(tmp_path, capsys, words, message
 def test_the_folder_of_a_run_is_refused(tmp_path, capsys) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     assert sweep(tmp_path, "x=[1,2]", "trials=1") == 2
-    assert "holds what is no sweep (metrics.json)" in capsys.readouterr().err
+    assert "holds files that are not a sweep's (metrics.json)" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]
 
 

@@ -231,7 +231,7 @@ def test_episodes_that_cannot_continue_are_refused_on_request(tmp_path: Path) ->
 
 
 def test_a_collector_in_other_processes_is_refused() -> None:
-    with pytest.raises(TypeError, match="MultiSyncCollector keeps its own"):
+    with pytest.raises(TypeError, match="MultiSyncCollector keeps them in other"):
         RunningEpisodes(object.__new__(MultiSyncCollector))
 
 

@@ -357,5 +357,5 @@ def test_a_final_choice_of_ones_own_replaces_that_of_gumbel() -> None:
 )
 def test_gumbel_says_what_it_needs(kwargs: dict[str, Any]) -> None:
     rest = {"budget": SearchBudget(simulations=8), "expand": "one", **kwargs}
-    with pytest.raises(ValueError, match=r"Gumbel halves a known number.*leaves_per_wave=1"):
+    with pytest.raises(ValueError, match=r"Gumbel needs a fixed number.*leaves_per_wave=1"):
         MCTSPlanner(ChainEnv(4), tree_policy=Gumbel(), **rest)

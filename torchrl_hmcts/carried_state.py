@@ -119,8 +119,8 @@ def apart(env: EnvBase, *, recorders: bool = True) -> EnvBase:
         return env
     if type(env) is not TransformedEnv:
         raise ValueError(
-            f"A planner makes a copy of the transforms of an env with CatFrames, InitTracker or a "
-            f"recorder, and cannot make one of {_name(env)}. Use a plain TransformedEnv."
+            "A planner copies the transforms of an env that has CatFrames, InitTracker or a "
+            f"recorder. It cannot copy {_name(env)}. Use a plain TransformedEnv."
         )
     return TransformedEnv(base, Compose(*map(carried, kept)), auto_unwrap=False)
 
@@ -141,9 +141,9 @@ def planning_env(env: EnvBase) -> EnvBase:
                 if behind or unravel_key(key) not in shown:
                     what = f"is written again by {_name(behind[0])}" if behind else "is taken away"
                     raise ValueError(
-                        f"MCTSPlanner sets the frames of CatFrames by their stack, the entry "
-                        f"{key!r}, which {what} behind it. Leave it in the observation as it is: "
-                        f"let what is behind CatFrames write to another key, or move it before it."
+                        "MCTSPlanner sets the frames of CatFrames by their stack, the entry "
+                        f"{key!r}. It {what} after CatFrames. Keep it in the observation: let "
+                        "later transforms write another key, or move them before CatFrames."
                     )
     return plan
 
@@ -154,7 +154,7 @@ def _refuse_states(env: EnvBase, inside: str | None) -> None:
         reason = _reason(transform, env, inside)
         if reason is not None:
             raise ValueError(
-                f"MCTSPlanner sets {env_name(env)} to states in the tensordict, and its "
+                f"MCTSPlanner sets {env_name(env)} to states of the tensordict, but its "
                 f"{_name(transform)} keeps a state elsewhere: it {reason}."
             )
     for below in envs_below(env):
@@ -244,10 +244,10 @@ class ForeignStates:
                 self.put_back(before)
         if changed is not None:
             raise ValueError(
-                f"{changed} of {env} changed while MCTSPlanner searched: a transform keeps "
-                f"a state in itself, which cannot be set, so that nodes of the tree see each "
-                f"other's. Keep it in the tensordict: read it from the first argument of _step, "
-                f"write it to the second, and declare it in the state and observation specs."
+                f"{changed} of {env} changed while MCTSPlanner searched. A transform keeps a state "
+                "that a planner cannot set, so nodes of the tree would share it. Keep it in the "
+                "tensordict: read it from the first argument of _step, write it to the second, "
+                "and declare it in the state and observation specs."
             )
 
 

@@ -54,7 +54,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 class _PrivateFolder(UserWideCacheLocator):
-    """The last resort, which loads code only from a folder that nobody else can write."""
+    """The last resort, which loads code only from a folder that no other user can write."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         super().__init__(function, file)

@@ -128,8 +128,8 @@ def known_gamma(env: EnvBase) -> float | None:
     gammas = sorted({g for g in map(known_gamma, envs_below(env)) if g is not None})
     if len(gammas) > 1:
         raise ValueError(
-            f"The envs of this {env_name(env)} have options of the discounts {gammas}. Make them "
-            f"with one, or name yours: MCTSPlanner(env, gamma={gammas[0]})."
+            f"The envs of this {env_name(env)} have options with different discounts: {gammas}. "
+            f"Use one discount, or pass MCTSPlanner(env, gamma={gammas[0]})."
         )
     return gammas[0] if gammas else None
 
@@ -145,8 +145,8 @@ def option_gamma(env: EnvBase, duration_key: NestedKey | None) -> float:
         return gamma
     if duration_key is not None:
         raise ValueError(
-            f"{env_name(env)} writes {duration_key!r}, base steps by which values are discounted, "
-            f"and no OptionTransform tells the discount of a base step. Name the one by which its "
-            f"rewards are summed: MCTSPlanner(env, gamma=0.99)."
+            f"{env_name(env)} writes {duration_key!r}, the base steps of a step, but no "
+            "OptionTransform gives the discount per base step. Pass the discount of its rewards: "
+            "MCTSPlanner(env, gamma=0.99)."
         )
     return _DEFAULT_GAMMA

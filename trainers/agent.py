@@ -120,7 +120,7 @@ class HMCTS:
                 keys["num_skills"] = num_skills
             made = find_experiment(kit, KITS).config_class
             if not issubclass(made, GymConfig):
-                raise ValueError(f"kit={kit!r} is none of Gymnasium envs: use 'gym' or 'ant'.")
+                raise ValueError(f"kit={kit!r} is not a kit of Gymnasium envs. Use 'gym' or 'ant'.")
             config = made(id=env if isinstance(env, str) else "", **keys)
         self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
         self.kit = self._make_kit(config)
@@ -191,8 +191,8 @@ class HMCTS:
         """
         if not isinstance(self._asked, GymConfig):
             raise ValueError(
-                f"{self} is of the kit {self.config.KIT}: train it with hmcts train "
-                f"kit={self.config.KIT}, and load the folder."
+                f"{self} has the kit {self.config.KIT}, which only the command line trains: hmcts "
+                f"train kit={self.config.KIT}. Then load its folder."
             )
         changes: dict[str, Any] = {"options": "learned", "worker": ""}
         if base_steps is not None:
@@ -417,6 +417,9 @@ def load_worker(folder: str | Path) -> SkillPolicy:
     """
     worker = HMCTS.load(folder).worker
     if not isinstance(worker, SkillPolicy):
-        raise ValueError(f"{folder} holds an agent whose options are given, not learned.")
+        raise ValueError(
+            f"{folder} holds an agent whose options are given, so it has no learned worker. Load "
+            f"the agent: HMCTS.load({str(folder)!r})."
+        )
     worker.eval()
     return worker

@@ -306,10 +306,10 @@ class DIAYNTrainer(OffPolicyTrainer):
             loss_class = losses[0]
         if loss_class not in losses:
             raise ValueError(
-                f"{loss_class.__name__} is no loss for a worker with "
-                f"{type(action_spec).__name__} actions and "
-                f"{'no other objective' if objective is None else type(objective).__name__}; these "
-                f"are: {', '.join(loss.__name__ for loss in losses)}."
+                f"{loss_class.__name__} does not fit a worker with {type(action_spec).__name__} "
+                "actions and "
+                f"{'no other objective' if objective is None else type(objective).__name__}. These "
+                f"do: {', '.join(loss.__name__ for loss in losses)}."
             )
         with torch.random.fork_rng(devices=[], enabled=seed is not None):
             if seed is not None:

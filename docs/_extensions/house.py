@@ -27,7 +27,7 @@ FOLDERS = {
     "torchrl_hmcts.trainers": "trainers",
     "torchrl_hmcts": "torchrl_hmcts",
 }
-COLORS = {"torchrl_hmcts": "#cfe3f5", "envs": "#f8e3c4", "trainers": "#d9ead6"}  # colour-blind safe
+COLORS = {"torchrl_hmcts": "#a9cdf0", "envs": "#ffcf70", "trainers": "#ffffff"}
 ALGORITHMS = re.compile(r"a3c|skills|diayn|hmcts|expert_iteration|evaluation|collectors|off_policy")
 
 

@@ -6,11 +6,22 @@ the site a folder of results means the page of results, and a file at the top th
 
 from __future__ import annotations
 
+import ipaddress
 import posixpath
 import re
-from typing import Any
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
-from sphinx.application import Sphinx
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # sphinx and pytest need it there
 
 _LINK = re.compile(r"(?<!!)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)]*)?\)")
 _PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
@@ -31,6 +42,46 @@ def site_target(page: str, target: str) -> str:
     if path.startswith("results") and not posixpath.splitext(path)[1]:
         return "/auto_results/index.md"
     return target
+
+
+def repository(root: Path) -> str:
+    """Return the public address of the repository, or "" where none is known.
+
+    Args:
+        root: with pyproject.toml, whose ``[project.urls] Repository`` is taken; where there is
+            none, the address of git's remote ``origin``.
+    """
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = project.get("urls", {}).get("Repository", "")
+    if named:
+        return public_address(named)
+    command = ["git", "-C", str(root), "remote", "get-url", "origin"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True)
+    except OSError:  # no git
+        return ""
+    return public_address(done.stdout.strip()) if done.returncode == 0 else ""
+
+
+def public_address(address: str) -> str:
+    """Return an address that everybody can open, or "".
+
+    Example:
+        >>> public_address("https://github.com/somebody/torchrl_hmcts.git")
+        'https://github.com/somebody/torchrl_hmcts'
+        >>> public_address("git@github.com:somebody/torchrl_hmcts.git")
+        ''
+    """
+    parts = urlsplit(address)
+    host = parts.hostname or ""
+    hidden = parts.username is not None or parts.port is not None or "." not in host
+    if parts.scheme != "https" or hidden or host.endswith((".local", ".internal", ".localhost")):
+        return ""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return address.removesuffix("/").removesuffix(".git")
+    return ""
 
 
 def _rewrite(app: Sphinx, docname: str, source: list[str]) -> None:

@@ -3,7 +3,7 @@ Plan over your own options
 ==========================
 
 Give a planner a handful of behaviours, and it finds how to string them together. Here: random
-mazes, four behaviours that nobody trained, and a tree search over them.
+mazes, four behaviours that need no training, and a tree search over them.
 """
 
 # %%
@@ -149,7 +149,7 @@ left.set(
     ylim=(0, 20.5),
 )
 right.boxplot(
-    costs, tick_labels=labels, whis=(5, 95), showfliers=False, medianprops={"color": "#e66100"}
+    costs, tick_labels=labels, whis=(5, 95), showfliers=False, medianprops={"color": "#d51178"}
 )
 right.set(
     title="simulated base steps per search",

@@ -107,7 +107,7 @@ print(
 # ----------------
 #
 # Ten mini-episodes of every skill from the middle of an open room. They fan out in different
-# directions, although nobody said what a direction is.
+# directions, although no reward says what a direction is.
 
 import matplotlib.pyplot as plt
 from torchrl_hmcts.modules import SkillPolicy

@@ -197,7 +197,7 @@ class AtariRAMEnv(EnvBase):
             if row is None:
                 raise ValueError(
                     'AtariRAMEnv is set to the state under "emulator_state", which the tensordict '
-                    "has not. Pass what an env with include_state=True wrote."
+                    "lacks. Pass a tensordict that an env with include_state=True wrote."
                 )
             emulator.set_state(row.numpy(force=True))
         else:

@@ -45,8 +45,9 @@ class EmulatorStates:
         cpu = re.search(rb"M6502(Low|High)", template)
         if text is None or ram < 0 or cpu is None or template[ram + 5 : ram + 9] != b"\x80\0\0\0":
             raise ValueError(
-                f"The serialised state of {game} ({len(template)} bytes) has not the layout that "
-                f"ale-py 0.10 to 0.12 writes. Install one of these: pip install 'ale-py<0.13'."
+                f"The serialised state of {game} ({len(template)} bytes) does not have the layout "
+                "that ale-py 0.10 to 0.12 writes. Install one of these: pip install "
+                "'ale-py<0.13'."
             )
         self._inner = 28  # the emulator's own state; before it six integers and its length
         self._cells = ram + 9
@@ -101,7 +102,7 @@ class EmulatorStates:
         """Return the serialised state of a row, without the random generator."""
         if len(row) not in (self.width, self.width_with_rng) or (row[_GAME] != self._check).any():
             raise ValueError(
-                f"This is no state of {self.game}: got {len(row)} bytes beginning with "
+                f"This row is not a state of {self.game}: got {len(row)} bytes beginning with "
                 f"{row[:4].tolist()}, not {self.width} (or {self.width_with_rng} with the random "
                 f"generator) with {self._check.tolist()} at 1. Pass a row as the env wrote it."
             )

@@ -126,8 +126,8 @@ class MiniGridSnapshot(AttributeSnapshot):
             kinds.append((tuple, np.ndarray).index(type(place)))
         except ValueError:
             raise SnapshotError(
-                f"The agent of {self.env} is at {place!r} and looks to {direction!r}, which are no "
-                "whole numbers. Pass snapshot=AttributeSnapshot."
+                f"The agent of {self.env} is at {place!r} and looks to {direction!r}, which are "
+                "not whole numbers. Pass snapshot=AttributeSnapshot."
             ) from None
         code = kinds[0] | kinds[1] << 1 | kinds[2] << 2 | kinds[3] << 3
         return code, *numbers, steps

@@ -91,8 +91,8 @@ class RoboticsMaze(MujocoTask):
         super().__init__(env)
         if self.env.reset_target:
             raise SnapshotError(
-                f"{env} draws a new goal where one is reached, which is no function of the state. "
-                "Make it with reset_target=False."
+                f"{env} draws a new goal when one is reached, so its steps depend on more than the "
+                "state. Make it with reset_target=False."
             )
 
     def goal(self) -> np.ndarray:
@@ -198,7 +198,7 @@ def task_of(env: gymnasium.Env) -> MujocoTask:
         if names <= bases:
             return kind(env)
     raise SnapshotError(
-        f"MujocoBatch knows the point and ant mazes of gymnasium-robotics and OGBench, and not "
+        "MujocoBatch knows the point and ant mazes of gymnasium-robotics and OGBench, but not "
         f"{env}. Pass task=, a MujocoTask that tells its observation, reward and end; or use "
         "SettableGymEnv."
     )

@@ -67,8 +67,8 @@ class ProcessPool(EnvBase):
         num_processes = whole_number(owner, "num_processes", num_processes)
         if num_processes and sys.platform == "win32":
             raise ValueError(
-                f"{owner} feeds its processes through POSIX pipes, which Windows has not. Use "
-                "num_processes=0 there, which runs options in the calling process."
+                f"{owner} sends data to its processes through POSIX pipes, which Windows lacks. "
+                "Use num_processes=0 there, which runs options in the calling process."
             )
         if start_method not in ("forkserver", "spawn"):
             raise ValueError(
@@ -203,7 +203,7 @@ class ProcessPool(EnvBase):
             if value is None:
                 raise ValueError(
                     f"{type(self).__name__} continues from the state under {key!r}, which the "
-                    "tensordict has not. Pass what reset() or a step wrote."
+                    "tensordict lacks. Pass a tensordict from reset() or a step."
                 )
             array = self._cut(_array(value))
             if array.shape[len(tensordict.batch_size) :] != size:  # type: ignore[union-attr]
@@ -294,8 +294,8 @@ class ProcessPool(EnvBase):
     def _end_step(self, ticket: PendingStep) -> TensorDictBase:
         if ticket.used or ticket not in self._under_way:
             raise RuntimeError(
-                "This step was waited for before, and its outcome returned then, or given up. Call "
-                "step_async again to take another."
+                "The outcome of this step was returned or dropped before. Call step_async to take "
+                "another step."
             )
         try:
             self._settle(ticket)
@@ -314,7 +314,7 @@ class ProcessPool(EnvBase):
         return result
 
     def step_abandon(self, ticket: PendingStep) -> None:
-        """Give up a step that was begun: its outcome, or error, is nobody's.
+        """Give up a step that was begun: its outcome, or error, is dropped.
 
         Blocks until its options have been run, unless the processes have been stopped.
         """

@@ -203,7 +203,7 @@ class OptionProcesses:
         if not self._lost.isdisjoint(slots):
             raise RuntimeError(
                 "The processes were stopped while this step was under way, by an error or by "
-                "close(), so that it has no outcome. Take the step again."
+                "close(), so it has no outcome. Take the step again."
             )
         try:
             deaths = silences = 0
@@ -221,17 +221,17 @@ class OptionProcesses:
                 if silences >= _SILENCES_IN_A_ROW:
                     raise RuntimeError(
                         f"The processes of the pool took no step for {self.step_seconds:g} s, "
-                        f"{silences} times one after the other, so they were ended. If a step may "
-                        f"take longer, raise step_seconds; else look at what the worker waits for."
+                        f"{silences} times in a row, so they were ended. If a step can take "
+                        "longer, raise step_seconds. If not, find what the worker waits for."
                     )
                 if not dead:  # all that are stopped or hang cannot be told from those that wait
                     self.num_restarts += 1
                 if deaths >= _DEATHS_IN_A_ROW:
                     raise RuntimeError(
-                        f"{deaths} processes of the pool died one after the other without an "
-                        f"outcome, with the exit codes {dead} (a negative one is a signal). If "
-                        f"they die at once, put what the script does under "
-                        f"`if __name__ == '__main__':`, as multiprocessing needs it."
+                        f"{deaths} processes of the pool died in a row without an outcome, with "
+                        f"the exit codes {dead} (a negative one is a signal). If they die at once, "
+                        "put the script's code under `if __name__ == '__main__':`; "
+                        "multiprocessing needs it."
                     )
                 self.start()
                 self._write(sorted(self._waiting))

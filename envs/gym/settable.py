@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import random
@@ -17,6 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.envs import GymWrapper
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
@@ -109,8 +111,8 @@ def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords:
         made = made(**keywords)
     if not isinstance(made, gymnasium.Env):
         raise TypeError(
-            f"An id such as 'CartPole-v1', a gymnasium.Env or a function that makes one is needed; "
-            f"got a {type(made).__name__}."
+            "The env must be an id such as 'CartPole-v1', a gymnasium.Env or a function that "
+            f"makes one; got a {type(made).__name__}."
         )
     made = _with_arrays(made)
     return PrivateRandom(made) if _draws_globally(made) else made
@@ -314,6 +316,31 @@ class SettableGymEnv(GymWrapper):
             entries[FEATURES_KEY] = _tensor(self._features(self._env, observation))
         td = TensorDict(entries, [])
         return td if self.device is None else td.to(self.device)
+
+    def _picture(self) -> np.ndarray:
+        """The state as the env draws it; a copy draws where the env itself does not.
+
+        Raises:
+            LookupError: if there is no picture, e.g. without a display that MuJoCo can draw on.
+        """
+        picture, env = None, self._env
+        with contextlib.suppress(Exception):  # what a renderer raises is its own affair
+            if env.render_mode != "rgb_array":
+                env = gymnasium.make(env.spec, render_mode="rgb_array")
+                snapshot_of(env, type(self.snapshot)).restore(self.snapshot.read())
+            picture = env.render()
+            if env is not self._env:
+                env.close()
+        if not isinstance(picture, np.ndarray):
+            raise LookupError("the env draws no picture")
+        return picture
+
+    def _repr_html_(self) -> str:
+        def draw(axes: Any) -> None:
+            axes.imshow(self._picture())
+            axes.axis("off")
+
+        return notebook.shown(repr(self), draw)
 
     def __repr__(self) -> str:
         spec = self._env.spec

@@ -103,9 +103,9 @@ class SharedNetwork:
         given = list(parameters)
         if [tuple(p.shape) for p in given] != wanted:
             raise ValueError(
-                f"{type(self).__name__} wants parameters of the shapes {wanted}; got "
+                f"{type(self).__name__} needs parameters of the shapes {wanted}; got "
                 f"{[tuple(p.shape) for p in given]}. Build the network with the same widths, "
-                f"options and actions."
+                "options and actions."
             )
         return list(zip(views, given, strict=True))
 

@@ -149,7 +149,7 @@ class SkillWorker:
 
 
 def _as_told(actor: SkillActor, skills: Tensor | None) -> np.ndarray:
-    """What a network that is shown the skill is told of each option, float32 ``[Z, ...]``."""
+    """Input for each option of a network that reads the skill, float32 ``[Z, ...]``."""
     if actor.num_skills is not None and skills is None:
         return np.eye(actor.num_skills, dtype=np.float32)
     size = actor.skill_spec.shape[-1:]

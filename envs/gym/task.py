@@ -116,7 +116,8 @@ def fixed_actions(space: gymnasium.Space) -> list[Any]:
     if not 1 <= len(found) <= _MAX_OPTIONS:
         raise ValueError(
             f"Options that repeat an action need 1 to {_MAX_OPTIONS} actions; {space} has "
-            f"{len(found) or 'other ones'}. Learn skills, or pass a worker of your own."
+            f"{len(found) or 'actions of another kind'}. Learn skills, or pass a worker of your "
+            "own."
         )
     return found
 

@@ -51,7 +51,7 @@ class DeepMindLabEnv(EnvBase):
         observations (mapping of str): further observations of the engine and the keys to write them
             under, e.g. ``{"RGB_INTERLEAVED": "pixels"}``. Default none.
         num_steps, actions, terminate_on_goal, max_frames, fps, read_outs: as of
-            :class:`LabMazeEnv`; ``fps`` is told to the engine.
+            :class:`LabMazeEnv`; the engine gets ``fps``.
         renderer ("software" or "hardware"): the engine's. Default software.
         seed (int, optional): of the draws of mazes.
 

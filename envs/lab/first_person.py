@@ -18,7 +18,8 @@ from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
 from torchrl_hmcts.envs.lab.view import heading_degrees
 
 _EYE = 0.51  # height of the eye in cells; the ceiling is at 1
-_APPLE, _GOAL = (214, 40, 40), (34, 160, 80)
+_APPLE, _GOAL = (120, 0, 40), (90, 230, 40)
+_WALL, _FLOOR, _SKY = (176, 138, 104), (96, 104, 116), (186, 204, 222)
 _RADII = (0.12, 0.22)  # of apples and the goal, in cells
 
 
@@ -30,7 +31,7 @@ def draw_first_person(
     height: int = 240,
     field_of_view: float = 90.0,
 ) -> np.ndarray:
-    """Draw what the player sees: walls of brick, apples as red balls and the goal as a green one.
+    """Draw what the player sees: brick walls, dark red apples, a light green goal.
 
     A picture for people, not the engine's: its textures and lights are others. The direction of a
     column :math:`u` of the picture is :math:`d + \\tan(\\text{fov} / 2)\\, u\\, r` with the heading
@@ -130,13 +131,13 @@ def _cast(image, depth, walls, x, y, angle, wide, pitch):
                 seam = min(up * 8.0 - brick, offset - math.floor(offset) if distance < 4.0 else 1.0)
                 if seam < 0.09:
                     tone *= 0.78
-                red, green, blue = 176.0, 138.0, 104.0
+                red, green, blue = _WALL
             else:
                 flat = (_EYE if v < 0.0 else 1.0 - _EYE) / max(abs(v), 1e-6)
                 shade = 1.0 / (1.0 + 0.05 * flat * flat)
                 odd = (math.floor(2.0 * (x + flat * dx)) + math.floor(2.0 * (y + flat * dy))) % 2
                 tone = 1.0 - 0.10 * odd
-                red, green, blue = (96.0, 104.0, 116.0) if v < 0.0 else (186.0, 204.0, 222.0)
+                red, green, blue = _FLOOR if v < 0.0 else _SKY
             light = shade * tone
             image[row, column, 0] = red * light
             image[row, column, 1] = green * light

@@ -63,7 +63,7 @@ class LabLayout:
         self.apples, self.num_apples = self._places(letters == APPLE)
         self.spawn, self.num_spawns = self._places(letters == SPAWN)
         if self.max_apples > 62:
-            raise ValueError(f"A maze can hold 62 apples; one has {self.max_apples}.")
+            raise ValueError(f"A maze can hold at most 62 apples; one has {self.max_apples}.")
         goals, num_goals = self._places(letters == GOAL)
         for i in range(len(text)):
             if num_goals[i] > 1 or self.num_spawns[i] < 1:

@@ -102,7 +102,7 @@ class ChipmunkMazes:
 
     followed by Chipmunk's contact impulses with friction and elasticity 0. The depth a disc has
     sunk into a wall is taken back within the same call (a second C step at rest), so that nothing
-    Chipmunk keeps between calls bears on the next result. Threads take turns, since Chipmunk
+    Chipmunk keeps between calls changes the next result. Threads take turns, since Chipmunk
     does not hold Python's lock, and a forked process builds a space of its own.
 
     Args:

@@ -136,10 +136,10 @@ def generate_mazes(
     seen = wall_histogram.nonzero().flatten().tolist()
     raise RuntimeError(
         f"Found only {len(kept)} distinct{' connected' * connected} {height}x{width} mazes with "
-        f"{'any number of' if num_walls is None else num_walls} walls in {max_draws:,} draws, "
-        f"{num_mazes} were asked for. Draws with complexity={complexity}, density={density} had "
-        f"{seen[0]} to {seen[-1]} walls, most often {int(wall_histogram.argmax())}: ask for such a "
-        f"number, for fewer mazes, or change complexity and density."
+        f"{'any number of' if num_walls is None else num_walls} walls in {max_draws:,} draws, but "
+        f"num_mazes={num_mazes}. Draws with complexity={complexity}, density={density} had "
+        f"{seen[0]} to {seen[-1]} walls, most often {int(wall_histogram.argmax())}. Use such a "
+        "number, fewer mazes, or another complexity and density."
     )
 
 

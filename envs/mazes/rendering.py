@@ -17,7 +17,7 @@ WALL_COLOR: Color = (24, 24, 27)
 FREE_COLOR: Color = (255, 255, 255)
 PLAYER_COLOR: Color = (37, 99, 235)
 TARGET_COLOR: Color = (22, 163, 74)
-DOT_COLOR: Color = (220, 38, 38)
+DOT_COLOR: Color = (213, 17, 120)
 
 _BORDER_TILES = 0.25  # 9x9 tiles of 32 pixels become 304 x 304, a size video encoders accept
 _LINE_RADIUS = 0.06
@@ -49,7 +49,7 @@ def draw_maze(
         target_radius (float): in tiles. Default 0.25.
         paths (sequence): pairs (points, colour) with points ``[N, 2]`` (x, y) in tiles, drawn as a
             line; the colour is one RGB triple of 0 to 255, or ``[N - 1, 3]``, one per segment.
-        dots (array or Tensor): ``[K, 2]`` centres of small red dots, e.g. the goals of a plan.
+        dots (array or Tensor): ``[K, 2]`` centres of small magenta dots, e.g. the goals of a plan.
         tile_pixels (int): pixels per tile, at least 4. Default 32.
 
     Returns:
@@ -60,7 +60,7 @@ def draw_maze(
             neither one colour nor one per segment.
 
     Reference:
-        Dissertation, figures 3.1, 3.2 (maze, player, target) and 3.5 (goals as red dots).
+        Dissertation, figures 3.1, 3.2 (maze, player, target) and 3.5 (goals, red there).
 
     Example:
         >>> walls = np.array([[False, True], [False, False]])

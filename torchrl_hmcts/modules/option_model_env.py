@@ -112,8 +112,8 @@ class OptionModelEnv(ModelBasedEnvBase):
             real_number(owner, "max_disagreement", max_disagreement, least=0.0)
         if model.num_models == 1 and (max_disagreement is not None or disagreement_coeff):
             raise ValueError(
-                "OptionModelEnv is to heed the disagreement of the members, and the model has one "
-                "member. Make it with OptionModel(..., num_models=5)."
+                "OptionModelEnv needs two or more members to measure their disagreement; the "
+                "model has one. Make it with OptionModel(..., num_models=5)."
             )
         device = (env.device or "cpu") if device is None else device
         super().__init__(model, device=device, batch_size=torch.Size(batch_size))

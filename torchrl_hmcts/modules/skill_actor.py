@@ -65,7 +65,7 @@ class _OneHotCategorical(OneHotCategorical):
 
 
 def is_to_sample(deterministic: bool) -> bool:
-    """Return whether to sample: where nobody says otherwise, the caller or the exploration type."""
+    """Return whether to sample: as the caller says, or the exploration type."""
     return not deterministic and interaction_type() in (None, InteractionType.RANDOM)
 
 

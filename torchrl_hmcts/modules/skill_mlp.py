@@ -85,8 +85,8 @@ class SkillMLP(nn.Module):
             )
         if self.num_skills is None:
             raise ValueError(
-                f"{owner} has a head for each of a number of skills; these are "
-                f"{described(self.skill_spec)}. Use ConcatSkillMLP, which reads them."
+                f"{owner} has one head per skill, so it needs numbered skills; got "
+                f"{described(self.skill_spec)}. Use ConcatSkillMLP, which reads vectors."
             )
         self.trunk = hidden_layers(owner, self.in_features, hidden, activation)
         self.heads = nn.Linear(hidden[-1], self.num_skills * self.out_features)
@@ -185,7 +185,7 @@ class ConcatSkillMLP(SkillMLP):
         if self.num_skills is None:
             raise ValueError(
                 f"{type(self).__name__} cannot return its outputs for every skill: its skills are "
-                f"{described(self.skill_spec)}. Call it with the skills that are meant."
+                f"{described(self.skill_spec)}. Call it with skills."
             )
         x = torch.cat(features, -1).unsqueeze(-2)
         x = x.expand(*x.shape[:-2], self.num_skills, -1)
@@ -360,8 +360,8 @@ def refuse_unknown(skill: Tensor, num_skills: int | None) -> None:
     if low < 0 or high >= num_skills:
         raise ValueError(
             f"Skill {low if low < 0 else high} does not exist: a network of "
-            f"num_skills={num_skills} knows 0 to {num_skills - 1}. Give the "
-            f"SkillTransform or OptionTransform as many."
+            f"num_skills={num_skills} knows 0 to {num_skills - 1}. Make the SkillTransform or "
+            "OptionTransform with the same number."
         )
 
 

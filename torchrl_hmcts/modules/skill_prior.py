@@ -16,7 +16,7 @@ class SkillPrior(nn.Module, ABC):
 
     .. math:: p(z) \ge 0, \qquad \sum_{z < Z} p(z) = 1
 
-    A skill with ``p(z) = 0`` is switched off: nobody draws it and no discriminator guesses it.
+    A skill with ``p(z) = 0`` is switched off: it is not drawn and no discriminator guesses it.
     Sub-classes define :meth:`probs`. Readers hold a prior without registering it as a sub-module:
     whoever owns it moves, trains and saves it.
 
@@ -65,7 +65,7 @@ class SkillPrior(nn.Module, ABC):
 
 
 class FixedSkillPrior(SkillPrior):
-    """Given probabilities, uniform unless told otherwise.
+    """Given probabilities, uniform by default.
 
     Args:
         num_skills (int): number of skills ``Z``.
@@ -93,7 +93,7 @@ class FixedSkillPrior(SkillPrior):
         p = _per_skill("FixedSkillPrior", "weights", weights, num_skills, default=1.0)
         if not ((p >= 0).all() and (p > 0).any()):
             raise ValueError(
-                "FixedSkillPrior needs weights, none negative and one positive at least; got "
+                "FixedSkillPrior needs weights >= 0, at least one of them above 0; got "
                 f"weights={p.tolist()}."
             )
         self.register_buffer("p", p / p.sum())

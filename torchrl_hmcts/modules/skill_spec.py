@@ -87,9 +87,8 @@ def as_skill_spec(owner: str, skills: Skills, name: str = "num_skills") -> Tenso
     vectors = isinstance(skills, (Bounded, Unbounded)) and skills.dtype.is_floating_point
     if not vectors or skills.ndim != 1 or not skills.shape[0]:
         raise ValueError(
-            f"{owner} needs for {name} a number of skills, or the spec of one skill that is a "
-            f"vector: {_KINDS}; got {type(skills).__name__} of {skills.dtype}, shape "
-            f"{list(skills.shape)}."
+            f"{owner} needs a number of skills for {name}, or the spec of one skill vector: "
+            f"{_KINDS}; got {type(skills).__name__} of {skills.dtype}, shape {list(skills.shape)}."
         )
     if isinstance(skills, Bounded):
         ends = torch.stack((skills.space.low, skills.space.high))
@@ -107,13 +106,13 @@ def number_of(spec: TensorSpec) -> int | None:
 
 
 def needs_number(owner: str, skills: Skills) -> int:
-    """Returns the number of skills; refuses vectors, which nobody can tell apart by a list."""
+    """Returns the number of skills; refuses vectors, which have no number."""
     spec = as_skill_spec(owner, skills)
     number = number_of(spec)
     if number is None:
         raise ValueError(
-            f"{owner} tells a number of skills apart; these are {described(spec)}. Take "
-            f"METRAEncoderLoss, LSDEncoderLoss or SkillDynamicsLoss for them."
+            f"{owner} needs numbered skills; got {described(spec)}. For vectors use "
+            "METRAEncoderLoss, LSDEncoderLoss or SkillDynamicsLoss."
         )
     return number
 
@@ -138,8 +137,8 @@ def require_known(owner: str, reader: object, known: TensorSpec, drawn: TensorSp
         fits = number <= most
     if not fits:
         raise ValueError(
-            f"{owner} finds an env that draws {described(drawn)}, and a {type(reader).__name__} "
-            f"that knows {described(known)}. Give both the same: "
+            f"{owner}: the env draws {described(drawn)}, but {type(reader).__name__} knows "
+            f"{described(known)}. Give both the same: "
             + ("one spec." if most is None else f"SkillTransform({most}).")
         )
 
@@ -197,7 +196,7 @@ def spread_skills(spec: TensorSpec, number: int, *, seed: int = 0) -> Tensor:
     if isinstance(spec, Categorical):
         raise ValueError(
             f"spread_skills chooses among vectors; got a spec of {described(spec)}, which are "
-            f"options as they are. Pass {_KINDS}."
+            f"options already. Pass {_KINDS}."
         )
     generator = torch.Generator().manual_seed(seed)
     drawn = draw_vectors(spec, (max(4096, 256 * number),), generator)

@@ -24,7 +24,7 @@ def use_durations(
     .. math:: R + \gamma^k (1 - d) V(s')
 
     TorchRL's on-policy trainers (``PPOTrainer``, ``A2CTrainer``, ``ReinforceTrainer``) estimate
-    advantages by a ``GAE`` of their own, which does not know what the loss was told: give them
+    advantages by a ``GAE`` of their own, which does not know the loss's setting: give them
     ``gae=use_durations(GAE(...))``. A later ``make_value_estimator`` makes an estimator that does
     not know durations; call this again after it.
 

@@ -206,7 +206,7 @@ def _known_skills(
     spec = as_skill_spec(owner, known if skills is None else skills)
     if None not in (known, skills) and not same_skills(as_skill_spec(owner, known), spec):
         raise ValueError(
-            f"{owner} was told of {described(spec)}, but its {type(network).__name__} "
+            f"{owner} was made for {described(spec)}, but its {type(network).__name__} "
             f"distinguishes {described(as_skill_spec(owner, known))}. Give both the same."
         )
     return spec

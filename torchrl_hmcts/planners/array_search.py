@@ -42,7 +42,7 @@ class Root(NamedTuple):
         value (Array): ``[B]`` float32.
         embedding (Array): ``[B, ...]`` what the transition function needs of a state, any dtype. Or
             a mapping or tuple of such arrays, nested in any way, a TensorDict included; or a list
-            of B states of any kind, which the search keeps and nobody may change.
+            of B states of any kind, which the search keeps and no other code may change.
 
     Example:
         >>> import numpy as np

@@ -64,8 +64,7 @@ class SearchBudget:
             real_number("SearchBudget", name, value, finite=False)
             if value <= 0:
                 raise ValueError(
-                    f"SearchBudget needs {name} > 0: a search of nothing has no plan; got {value}. "
-                    f"Use None for no limit."
+                    f"SearchBudget needs {name} > 0; got {value}. Use None for no limit."
                 )
             if name != "seconds":
                 object.__setattr__(self, name, whole_number("SearchBudget", name, value))

@@ -1,4 +1,4 @@
-"""Leaf evaluators and option priors: what a search is told about a new state.
+"""Leaf evaluators and option priors: a search's first estimates for a new state.
 
 Letters: ``m`` states of one call, ``A`` options, ``w`` rollouts that still run.
 """
@@ -270,8 +270,8 @@ class RolloutEvaluator:
             bound.given_env is not simulator.given_env or gamma != self._gamma
         ):
             raise ValueError(
-                "This RolloutEvaluator simulates for a planner with another env or discount. Give "
-                "each planner one of its own."
+                "This RolloutEvaluator belongs to a planner with another env or discount. Make "
+                "one for each planner."
             )
         self._simulator, self._gamma = simulator, gamma
         _bind(self.bootstrap, simulator, gamma)

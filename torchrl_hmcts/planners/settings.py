@@ -122,8 +122,8 @@ class SearchSettings:
             )
         if self.chance is not None and self.transpositions is not None:
             raise ValueError(
-                "Transpositions share what follows a state, which chance redraws; leave one of "
-                "transpositions and chance out."
+                "Transpositions share the nodes after a state; chance draws these nodes each "
+                "time. Use transpositions or chance, not both."
             )
 
     @property

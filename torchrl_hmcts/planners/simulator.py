@@ -159,7 +159,7 @@ class Simulator:
         return self._completed(states, self.env.step_wait(ticket))
 
     def abandon(self, sent: Any) -> None:
-        """Give up what :meth:`send` began and nobody will receive."""
+        """Give up what :meth:`send` began."""
         if self.works_beside:
             self.env.step_abandon(sent[1])
 

@@ -105,9 +105,10 @@ def check_durations_and_masks(
         below = _masks_actions_below_options(env, mask_key)
         if below:
             raise ValueError(
-                f"MCTSPlanner reads which options may be taken from {mask_key!r}, which "
-                f"{env_name(env)} writes of its {below} base actions, below the OptionTransform. "
-                f"Write the options' own mask in a transform behind it, or pass mask_key=None."
+                f"MCTSPlanner reads which options may be taken from {mask_key!r}, but in "
+                f"{env_name(env)} this is the mask of the {below} base actions, written before the "
+                "OptionTransform. Write a mask of the options in a transform after it, or pass "
+                "mask_key=None."
             )
 
 
@@ -178,7 +179,7 @@ def find_done_keys(env: EnvBase) -> tuple[NestedKey, NestedKey]:
     if "done" not in ends and len(ends) != 1:
         raise ValueError(
             f"MCTSPlanner needs one entry that says that an episode is over; {env_name(env)} has "
-            f'{ends}. Write "done" in a transform, e.g. where all of them are.'
+            f'{ends}. Write "done" in a transform, e.g. True where all of them are True.'
         )
     done = "done" if "done" in ends else ends[0]
     terminated = "terminated" if isinstance(done, str) else (*done[:-1], "terminated")

@@ -49,8 +49,8 @@ def _listed(roots: list[Any], as_tensor: bool) -> tuple[Any, Callable[..., Any]]
             following = getattr(answer, "embedding", None)
             if not isinstance(following, list) or len(following) != len(places):
                 raise ValueError(
-                    f"The transition function was given a list of {len(places)} states and must "
-                    f"return a Transition whose embedding is one of as many; got "
+                    f"The transition function got a list of {len(places)} states. It must return a "
+                    f"Transition whose embedding is a list of {len(places)} states; got "
                     f"{_described(following)}."
                 )
             states.extend(following)

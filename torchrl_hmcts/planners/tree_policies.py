@@ -257,11 +257,11 @@ class Gumbel(CompiledPolicy):
         """Refuse simulations of unknown or very large number, or several at a time."""
         if num_simulations is None or expand != "one" or leaves_per_wave * waves_in_flight != 1:
             raise ValueError(
-                f"Gumbel halves a known number of simulations of one option each; got "
+                "Gumbel needs a fixed number of simulations of one option each; got "
                 f"budget.simulations={num_simulations}, expand={expand!r}, "
                 f"leaves_per_wave={leaves_per_wave}, waves_in_flight={waves_in_flight}. Pass "
-                f"budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
-                f"leaves_per_wave=1."
+                "budget=SearchBudget(simulations=32, until_plan=False), expand='one' and "
+                "leaves_per_wave=1."
             )
         if num_simulations > _MOST_HALVED:
             raise ValueError(

@@ -157,7 +157,7 @@ def check_macro_env(
         require(
             (duration >= 1).all(),
             f"{name}: a step took {int(duration.min())} base steps ({duration_key!r}). Each takes "
-            "at least one, or a search would go round in a circle without any discount.",
+            "at least one, or a search could loop without any discount.",
         )
     if simulator.mask_key is not None:
         stuck = ~after.get(simulator.mask_key).any(-1)

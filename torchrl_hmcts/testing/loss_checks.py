@@ -312,7 +312,7 @@ class _Loss:
             value = self.data.get(key, None)
             require(
                 value is not None,
-                f"{self.name} announces the in_key {key!r}, which it does without: the data have "
+                f"{self.name} announces the in_key {key!r}, but works without it: the data have "
                 f"{sorted(map(str, leaves(self.data)))}. Correct in_keys.",
             )
             flat["_".join(parts(key))] = value.clone()

@@ -104,7 +104,7 @@ def _check_accept(name: str, novelty: NoveltyTest, features: np.ndarray) -> None
     require(
         not len(twice),
         f"{name} accepts state {twice[:1]} a second time. Remember what was accepted, or a search "
-        "goes round in a circle.",
+        "visits the same states again and again.",
     )
     require(
         np.array_equal(ask(novelty, 1), first),

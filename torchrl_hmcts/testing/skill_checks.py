@@ -129,6 +129,6 @@ def check_skill_prior(prior: SkillPrior) -> None:
     with torch.no_grad():
         require(
             torch.equal(prior.probs(), probs),
-            f"{name}: probs() gives another distribution when asked again. Change it in methods "
-            "that are called for that.",
+            f"{name}: probs() gives another distribution at its second call. Change the "
+            "distribution only in methods made for that.",
         )

@@ -198,7 +198,7 @@ def _refuses(it: _Transform, check: str, use: Callable[[], object], method: str)
         )
         return
     raise ContractError(
-        f"{it.name} is silently accepted {where}, where it is not to work. Raise a {how}, or tell "
+        f"{it.name} is silently accepted {where}, where it cannot work. Raise a {how}, or tell "
         "check_transform that it works there."
     )
 

@@ -51,7 +51,7 @@ def check_worker(
             :class:`~torchrl_hmcts.transforms.OptionTransform`. If it is stateless (``batch_locked``
             is False) batches are tried.
         num_options (int): A, the options it knows.
-        skill_key (NestedKey): by which it is told its option, int64 ``[*B]``. Default ``"skill"``.
+        skill_key (NestedKey): from which it reads its option, int64 ``[*B]``. Default ``"skill"``.
         deterministic (bool): whether state and option decide the action. Default ``True``; with
             ``False`` the same seed must give the same action.
         tolerance (float): difference between a float action alone and among others that is allowed,

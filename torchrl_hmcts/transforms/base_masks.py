@@ -1,4 +1,4 @@
-"""Masks of the base actions, under a name at which nobody takes them for the options'."""
+"""Masks of the base actions, under a name that is not that of the options' masks."""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ class EnvTransform(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse stored data, which hold what the transform writes already."""
         raise RuntimeError(
-            f"{type(self).__name__} follows an env from step to step; stored data hold what it "
-            "writes already. Append it to a TransformedEnv instead of a replay buffer."
+            f"{type(self).__name__} follows an env from step to step; stored data already hold "
+            "what it writes. Append it to a TransformedEnv instead of a replay buffer."
         )
 
     def _stays_outside(self) -> str | None:

@@ -73,7 +73,7 @@ class OptionTransform(HasOptions):
         option_key (NestedKey): the macro action, int64 ``[*B]`` (one-hot bool ``[*B, num_options]``
             with ``one_hot=True``); ``[*B, n]`` in a group of n agents. With ``"action"`` every
             TorchRL actor, loss and trainer fits without ``set_keys``. Default ``"option"``.
-        skill_key (NestedKey): the entry by which the worker is told the option, int64 ``[*B]``, or
+        skill_key (NestedKey): the entry from which the worker reads the option, int64 ``[*B]``, or
             a vector of ``skills``, ``[*B, D]``. Default ``"skill"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
         one_hot (bool): options are one-hot instead of categorical. Default ``False``.
@@ -90,7 +90,7 @@ class OptionTransform(HasOptions):
             with what its primer says, zeros without one, and the state of the macro env is that of
             the env alone, or ``"keep"``, so that it begins where the option before ended; the env
             must then hand its memory on, by a ``TensorDictPrimer`` before this transform.
-        skills (Tensor, optional): ``[num_options, D]``, the vector that the worker is told for each
+        skills (Tensor, optional): ``[num_options, D]``, the vector that the worker gets for each
             option, e.g. of :func:`~torchrl_hmcts.modules.spread_skills`. Default: the option's
             number.
 

@@ -55,7 +55,7 @@ class HasOptions(EnvTransform):
     skills: Tensor | None
 
     def told(self, option: Tensor) -> Tensor:
-        """Return what the worker is told of options, int64 ``[*B]``: themselves or vectors."""
+        """Return what the worker gets for options, int64 ``[*B]``: themselves or vectors."""
         return option if self.skills is None else self.skills.to(option.device)[option]
 
 
@@ -142,10 +142,10 @@ def _check_holds_elements(env: EnvBase) -> None:
     n = env.batch_size.numel()
     if n > 1 and (resets or isinstance(env, GymLikeEnv)):
         raise ValueError(
-            f"OptionTransform lets the elements of a batch whose option has ended wait for the "
-            f"others; {type(env).__name__} steps, and at their end resets, all its {n} at once, so "
-            f"that episodes would continue unseen inside an option. Make {n} envs of one each: "
-            f"SerialEnv({n}, make_env) or ParallelEnv({n}, make_env)."
+            "OptionTransform makes elements whose option has ended wait for the others. "
+            f"{type(env).__name__} steps and resets all its {n} elements at once, so they cannot "
+            f"wait. Make {n} envs of one element: SerialEnv({n}, make_env) or ParallelEnv({n}, "
+            "make_env)."
         )
 
 
@@ -171,7 +171,7 @@ def duration_key(transform: HasOptions, env: EnvBase) -> NestedKey | None:
     told = transform.base_duration_key
     if told is not None and told not in available:
         raise ValueError(
-            f"OptionTransform is to read base steps from {told!r}, which {env_name(env)} does not "
+            f"OptionTransform reads base steps from {told!r}, which {env_name(env)} does not "
             f"write; it writes {sorted(map(str, available))}."
         )
     names = [] if told is None else [told]
@@ -222,7 +222,7 @@ def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
     known = getattr(worker, "num_skills", None)
     if isinstance(known, int) and known < transform.num_options:
         raise ValueError(
-            f"{name} has {known} skills and is to run {transform.num_options} options. Make "
+            f"{name} has {known} skills, but there are {transform.num_options} options. Make "
             f"OptionTransform with num_options={known}, or a worker with more."
         )
     outputs = map(unravel_key, getattr(worker, "out_keys", ()))
@@ -257,15 +257,15 @@ def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
     lost = [key for key in memory if key not in shown]
     if lost and transform.worker_memory == "keep":
         raise ValueError(
-            f"{name} is to keep {lost} from one option to the next, which {base} does not hand on. "
-            "Append the worker's make_tensordict_primer() before OptionTransform, or take "
+            f"{name} keeps {lost} from one option to the next, but {base} does not pass it on. "
+            "Append the worker's make_tensordict_primer() before OptionTransform, or pass "
             "worker_memory='reset'."
         )
     return Trial(td, writes, memory, lost)
 
 
 def _check_skills(name: str, transform: HasOptions) -> None:
-    """Refuse a worker that is told numbers and knows vectors, or the other way round."""
+    """Refuse a worker that gets numbers and knows vectors, or gets vectors and knows numbers."""
     spec, table = getattr(transform.worker, "skill_spec", None), transform.skills
     decisions = getattr(transform.worker, "decision_spec", None)  # of TorchRL's LowLevelController
     if isinstance(decisions, Composite):
@@ -275,12 +275,12 @@ def _check_skills(name: str, transform: HasOptions) -> None:
     told = "their numbers" if table is None else f"vectors of {table.shape[-1]} numbers"
     known = "numbers" if not spec.ndim else f"vectors of {spec.shape[-1]} numbers"
     raise ValueError(
-        f"{name} knows skills as {known} and is told options by {told}. Pass OptionTransform "
+        f"{name} knows skills as {known}, but gets options as {told}. Pass OptionTransform "
         + (
             f"skills=, a table [{transform.num_options}, {spec.shape[-1]}], e.g. "
             f"spread_skills(spec, {transform.num_options})."
             if spec.ndim
-            else "no skills=, so that it tells the options' numbers."
+            else "no skills=, so that the worker gets the options' numbers."
         )
     )
 

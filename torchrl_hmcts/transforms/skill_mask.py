@@ -84,9 +84,9 @@ class SkillMaskTransform(EnvTransform):
             options = getattr(self.parent.full_action_spec[key].space, "n", number)
             if int(options) != number:
                 raise ValueError(
-                    f"SkillMaskTransform says of {number} skills which are on, but the action "
-                    f"{key!r} has {int(options)} options. Build the OptionTransform with "
-                    f"num_options={number}, and append the mask after it."
+                    f"SkillMaskTransform has a mask of {number} skills, but the action {key!r} has "
+                    f"{int(options)} options. Build the OptionTransform with num_options={number}, "
+                    "and append the mask after it."
                 )
         shape = torch.Size([*observation_spec.shape, number])
         observation_spec[self.mask_key] = Binary(

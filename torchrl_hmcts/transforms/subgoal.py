@@ -171,8 +171,8 @@ class SubgoalTransform(EnvTransform):
         plan_goals = getattr(planner, "plan_goals", planner)
         if not callable(plan_goals):
             raise TypeError(
-                f"SubgoalTransform needs a planner: a callable planner(td) -> (goals, lengths) or "
-                f"an object with such a method plan_goals; got {type(planner).__name__}."
+                "SubgoalTransform needs a planner: a callable planner(td) -> (goals, lengths) or "
+                f"an object with a method plan_goals(td) like it; got {type(planner).__name__}."
             )
         self.position_key = key("position_key", position_key)
         self.goals_key = key("goals_key", goals_key)

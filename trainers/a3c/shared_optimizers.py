@@ -54,8 +54,8 @@ def share_optimizer(optimizer: Optimizer) -> Optimizer:
 def _build_state(optimizer: Optimizer, parameters: list[Tensor]) -> None:
     if not any(kind.__name__ in _SHAREABLE for kind in type(optimizer).__mro__):
         raise TypeError(
-            f"{type(optimizer).__name__} builds its state at its first step, so that every learner "
-            f"would have one of its own. Use one of {', '.join(_SHAREABLE)}."
+            f"{type(optimizer).__name__} builds its state at its first step, so each learner would "
+            f"have its own. Use one of {', '.join(_SHAREABLE)}."
         )
     before = [p.detach().clone() for p in parameters]
     decay = [group.get("weight_decay", 0.0) for group in optimizer.param_groups]

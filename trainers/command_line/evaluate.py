@@ -30,10 +30,13 @@ def evaluate(words: Sequence[str]) -> int:
         if "run" not in own:
             raise ValueError("say which run: run=DIR, the folder that a training wrote.")
         run = read_run(home(own["run"]))
+    level = own.get("log_level", "info")
+    with told("evaluate", *WRONG_WORDS), printing(level):
+        print(f"hmcts evaluate tests the newest checkpoint of {run.path}", flush=True)
         experiment, saved = load_config(run)
         changed = parse_config(experiment, rest, saved, ["run", "log_level"])
         if changed.out != saved.out:
-            raise ValueError("the figures go to the folder of the run, next to its own; no out=.")
+            raise ValueError("the figures are written into the folder of the run. Leave out= away.")
         before = vars(saved)
         changes = {key: value for key, value in vars(changed).items() if value != before[key]}
         for key in ("resume", "overwrite"):
@@ -43,8 +46,7 @@ def evaluate(words: Sequence[str]) -> int:
         changed.check_inputs()
     if is_locked(run.path):
         print(f"{run.path} is still running: its newest checkpoint is tested.", file=sys.stderr)
-    with told("evaluate", ValueError), printing(own.get("log_level", "info")):
-        print(f"hmcts evaluate tests the newest checkpoint of {run.path}", flush=True)
+    with told("evaluate", ValueError), printing(level):
         function = experiment.evaluation  # loads torch
         from torchrl_hmcts.trainers.runs.console import alive, figures_table
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchrl_hmcts.trainers.command_line.words import with_parts
 from torchrl_hmcts.trainers.experiments.registry import Experiment
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.run import free_folder, open_run
@@ -41,7 +42,7 @@ def told(command: str, *wrong: type[Exception], resume: Sequence[str] = ()) -> I
 
     Args:
         command: as users type it, e.g. ``"train experiment=labmaze"``.
-        *wrong: errors that come of wrong words, e.g. ``WRONG_WORDS``; exit status 2.
+        *wrong: errors that wrong words cause, e.g. ``WRONG_WORDS``; exit status 2.
         resume: holds the command that continues the run, once there is one.
     """
     try:
@@ -96,6 +97,7 @@ def run_experiment(
     log_level: str = "info",
     *,
     fresh: bool = False,
+    parts: Sequence[str] = (),
 ) -> int:
     """Run an experiment, with ``run.json`` in its folder; return the exit status.
 
@@ -106,6 +108,7 @@ def run_experiment(
         words: the whole command line, for the record.
         log_level: how much is printed.
         fresh: no folder was named: take the first of ``out``, ``out_2``, ... that holds nothing.
+        parts: words that change the parts, which are read after the first lines: they load torch.
     """
     resume: list[str] = []  # how to continue, once there is a run
     try:
@@ -116,6 +119,8 @@ def run_experiment(
             from torchrl_hmcts.trainers.runs.console import alive
 
             print(_announcement(name, config, announced), flush=True)
+            with told(name, *WRONG_WORDS):
+                config = with_parts(config, parts)
             _ = experiment.function  # loads torch
             with open_run(config, experiment=experiment.name, command=words, fresh=fresh) as run:
                 resume.append(run.resume_command)

@@ -31,10 +31,14 @@ def sweep(words: Sequence[str]) -> int:
                 "(all: hmcts list)."
             )
         experiment = find_experiment(own["experiment"])
+        folder = own.get("out", f"runs/sweep_{experiment.name}{'_toy' * ('toy=true' in rest)}")
+        level = own.get("log_level", "info")
+        with printing(level):
+            print(f"hmcts sweep experiment={experiment.name} starts\n  output  {folder}")
+            print(f"  watch   hmcts report {shlex.quote(folder)}   (the trials so far)", flush=True)
         from torchrl_hmcts.trainers.runs.sweep import Sweep, parse_space
 
         space, fixed = parse_space(experiment.config_class, rest)
-        folder = own.get("out", f"runs/sweep_{experiment.name}{'_toy' * ('toy=true' in fixed)}")
         others = [*_OWN, "log_level"]
         config = parse_config(experiment, [*fixed, f"out={folder}"], others=others)
         trials = read_value("trials", own.get("trials", "20"), "int")
@@ -55,7 +59,6 @@ def sweep(words: Sequence[str]) -> int:
             own.get("storage"),
         )
         study = plan.study()  # before any trial: says what is wrong with storage or folder
-    level = own.get("log_level", "info")
     line = ["hmcts", "sweep", *words]
     from torchrl_hmcts.trainers.runs.console import alive
 

@@ -18,7 +18,7 @@ from torchrl_hmcts.trainers.command_line.running import (
 from torchrl_hmcts.trainers.command_line.words import (
     expand,
     no_bare_words,
-    parse_config,
+    parse_keys,
     split_words,
 )
 from torchrl_hmcts.trainers.experiments.registry import (
@@ -89,12 +89,12 @@ def train(words: Sequence[str]) -> int:
 def _new(name: str, experiment: Experiment, words: Sequence[str], line: Sequence[str]) -> int:
     with told(name, *WRONG_WORDS):
         own, rest = split_words(words, [])
-        config = parse_config(experiment, rest, others=["log_level"])
+        config, parts = parse_keys(experiment, rest, others=["log_level"])
         fresh = False
         if not any(word.removeprefix("env.").startswith("out=") for word in rest):
             config, fresh = _default_folder(config)
     level = own.get("log_level", "info")
-    return run_experiment(name, experiment, config, line, level, fresh=fresh)
+    return run_experiment(name, experiment, config, line, level, fresh=fresh, parts=parts)
 
 
 def _default_folder(config: Any) -> tuple[Any, bool]:
@@ -130,7 +130,7 @@ def _continued(folder: str, words: Sequence[str]) -> tuple[str, Experiment, Any]
     if others:
         raise ValueError(
             f"resume={folder} continues exactly as the run was begun; {others[0]!r} would change "
-            f"it. To change keys on the way: experiment=NAME out={folder} resume=true and the keys."
+            f"it. To change keys, type: experiment=NAME out={folder} resume=true and the keys."
         )
     experiment, config = load_config(read_run(home(folder)))
     config = dataclasses.replace(config, resume=True, overwrite=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -25,6 +24,8 @@ def parse_config(
 ) -> Any:
     """Return the configuration of an experiment; its parts are composed with Hydra.
 
+    It is :func:`with_parts` of :func:`parse_keys`.
+
     Args:
         experiment: whose keys they are.
         words: ``key=value``; ``objective=metra``, ``planner/tree_policy=puct`` and
@@ -40,6 +41,17 @@ def parse_config(
         >>> parse_config(DEMO, ["seed=3"]).seed
         3
     """
+    return with_parts(*parse_keys(experiment, words, base, others))
+
+
+def parse_keys(
+    experiment: Experiment, words: Sequence[str], base: Any = None, others: Sequence[str] = ()
+) -> tuple[Any, list[str]]:
+    """Return the configuration without its parts, and the words that change these; load no torch.
+
+    Args:
+        experiment, words, base, others: as of :func:`parse_config`.
+    """
     kinds = key_kinds(experiment.config_class)
     names = {name for name, kind in kinds.items() if kind == "dict"}
     chosen = [w for w in words if w.partition("=")[0].replace("/", ".").split(".")[0] in names]
@@ -52,12 +64,20 @@ def parse_config(
         keywords: Any = OmegaConf.to_container(OmegaConf.from_dotlist(made))
         config = replace(config, make={**config.make, **keywords["make"]})
         chosen = [word for word in chosen if word not in made]
+    return config, chosen
+
+
+def with_parts(config: Any, chosen: Sequence[str]) -> Any:
+    """Return a configuration whose parts are changed by words.
+
+    Args:
+        config, chosen: of :func:`parse_keys`.
+    """
     if not chosen:
         return config
-    print("Reading the parts ...", file=sys.stderr, flush=True)  # before torch is loaded
     first = [word for word in chosen if word.startswith("objective")]
     if 0 < len(first) < len(chosen):  # the default of the loss depends on it
-        config = parse_config(experiment, first, config)
+        config = with_parts(config, first)
         chosen = [word for word in chosen if word not in first]
     from torch.random import fork_rng
 

@@ -102,7 +102,7 @@ _ALL = (
     ),
     SourceFigure(
         "3.5",
-        "the manager's goals as red dots in an episode",
+        "the manager's goals as dots in an episode",
         "draw_goals",
         "drawn afresh with a scripted worker, or with the worker of a run of waterworld_goals",
     ),

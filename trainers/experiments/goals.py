@@ -291,7 +291,7 @@ def _draw_episode(
     shown = int(by_length[int(0.85 * (len(by_length) - 1))])
     start = starts[shown]
     track = run_goal_episodes(env, policy, starts[shown : shown + 1], record=True).tracks[0]
-    words = "A test maze: the player (blue) on its way along the goals (red) to the target (green)."
+    words = "A test maze: the player (blue) follows the goals (magenta) to the target (green)."
     if not track.solved:
         steps = len(track.positions) - 1
         words = words.replace("maze", f"maze that was NOT solved in {steps} base steps")

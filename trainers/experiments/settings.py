@@ -206,8 +206,8 @@ class DemoConfig(SkillsConfig):
             raise ValueError(f"size is 9, 15 or 31 tiles; got {self.size}.")
         if self.train_base_steps % BATCH_STEPS:
             raise ValueError(
-                f"train_base_steps={self.train_base_steps} is no whole number of batches of "
-                f"{BATCH_STEPS} base steps; use a multiple of {BATCH_STEPS}."
+                f"train_base_steps={self.train_base_steps} is not a multiple of {BATCH_STEPS}, the "
+                "base steps of a batch. Use one."
             )
         if self.mazes > NUM_TEST_MAZES:
             raise ValueError(f"mazes={self.mazes}, but the test split has {NUM_TEST_MAZES} mazes.")
@@ -316,8 +316,8 @@ class LabMazeConfig(SkillsConfig):
         for name in ("option_frames", "skill_frames"):
             if getattr(self, name) % self.frames_per_step:
                 raise ValueError(
-                    f"{name}={getattr(self, name)} is no whole number of base steps of "
-                    f"frames_per_step={self.frames_per_step} frames; use a multiple."
+                    f"{name}={getattr(self, name)} is not a multiple of "
+                    f"frames_per_step={self.frames_per_step}. Use one."
                 )
         if not 0.0 <= self.robust_error <= 0.3:
             raise ValueError(f"robust_error must be in [0, 0.3]; got {self.robust_error}.")
@@ -451,7 +451,7 @@ class WaterworldGoalsConfig(WaterworldA3CConfig):
         super().__post_init__()
         if not 0.0 < self.goal_met_threshold < self.goal_divergence_threshold:
             raise ValueError(
-                "A goal must be met closer to it than where the worker has strayed: "
-                f"0 < goal_met_threshold < goal_divergence_threshold; got "
+                "A goal counts as met at a smaller distance than that at which the worker counts "
+                "as lost: 0 < goal_met_threshold < goal_divergence_threshold; got "
                 f"{self.goal_met_threshold} and {self.goal_divergence_threshold}."
             )

@@ -494,8 +494,8 @@ def _solve(
     """Plan and act from a group of starts after the other."""
     real = kit.make_options(kit.make_env("test"), worker, gamma=1.0)
     parts: list[Results] = []
-    name = kit.start_name.split()[-1] if len(kit.start_name.split()) == 1 else "starts"
-    bar = console.Bar(len(starts), desc="solve", unit=name) if progress else None
+    unit = kit.start_name.split()[0]
+    bar = console.Bar(len(starts), desc="solve", unit=unit) if progress else None
     for some in starts.split(kit.group):
         parts.append(kit.act(planner, real, some))
         if bar is not None:

@@ -27,7 +27,7 @@ _ACTIONS = ("up", "down", "left", "right", "none")
 def draw_goals(
     env: WaterworldMazeEnv, start: TensorDictBase, track: Any, step: int, *, tile_pixels: int = 32
 ) -> np.ndarray:
-    """Draw one base step of an episode: goals not yet met as red dots, the path so far in blue.
+    """Draw one base step of an episode: goals not yet met as magenta dots, the path so far in blue.
 
     Args:
         env: draws the maze.

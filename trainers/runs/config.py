@@ -129,7 +129,7 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         return dict(value)
     value = os.fspath(value) if isinstance(value, os.PathLike) else value
     if not isinstance(value, str):
-        raise TypeError(f"{name} must be a text; got {value!r}.")
+        raise TypeError(f"{name} must be a string; got {value!r}.")
     if "\0" in value:
         raise ValueError(f"{name} must not hold a zero byte; got {value!r}.")
     return value

@@ -72,7 +72,10 @@ class Bar(tqdm):
 
     def update(self, n: float | None = 1) -> bool | None:
         """Move it on by a number of steps."""
-        return super().update((1 if n is None else n) * self.scale)
+        moved = (1 if n is None else n) * self.scale
+        if self.total is not None and self.n + moved > self.total:  # the last batch is whole
+            self.total = self.n + moved
+        return super().update(moved)
 
     def set_postfix(self, *_: Any, refresh: bool = True, **figures: Any) -> None:
         """Show figures beside it; those that are no number yet are left out."""
@@ -166,7 +169,7 @@ def alive() -> Iterator[None]:
                 _State.bar.refresh()
                 continue
             _State.spoken = now
-            doing = _State.phase.rstrip(" .")[: WIDTH - 20] or "Working"
+            doing = _State.phase.partition(" (")[0].rstrip(" .")[: WIDTH - 20] or "Working"
             print(f"{doing}: {now - _State.begun:.0f} s so far", file=sys.stderr, flush=True)
 
     _State.phase, _State.begun = "", _State.spoken
@@ -181,13 +184,16 @@ def alive() -> Iterator[None]:
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
-    """Return names and values as lines of two columns.
+    """Return names and values as lines of two columns; a number of nothing, NaN, is a dash.
 
     Example:
         >>> print(table([("mazes solved", "99 of 100")]))
           mazes solved                                     99 of 100
     """
-    return "\n".join(f"  {name[:_NAME_WIDTH]:<{_NAME_WIDTH}}  {value:>10}" for name, value in rows)
+    shown = [
+        (name[:_NAME_WIDTH], "-" if value.startswith("nan") else value) for name, value in rows
+    ]
+    return "\n".join(f"  {name:<{_NAME_WIDTH}}  {value:>10}" for name, value in shown)
 
 
 def figures_table(figures: Mapping[str, Any]) -> str:

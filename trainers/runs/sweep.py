@@ -164,8 +164,8 @@ class Sweep:
         there = run_files(self.folder)
         if there and not {"journal.log", "sweep.json"} & set(there):
             raise ValueError(
-                f"{self.folder} holds what is no sweep ({', '.join(there[:4])}). Choose another "
-                f"folder, e.g. out={next_free(str(self.folder))}."
+                f"{self.folder} holds files that are not a sweep's ({', '.join(there[:4])}). "
+                f"Choose another folder, e.g. out={next_free(str(self.folder))}."
             )
         self.folder.mkdir(parents=True, exist_ok=True)
         study = self._open()
@@ -176,9 +176,9 @@ class Sweep:
         differing = [key for key in before if before[key] != described.get(key)]
         if differing:
             raise ValueError(
-                f"{self.folder} has a sweep of something else: "
-                f"{', '.join(f'{key} {before[key]}' for key in differing)}. Give this one a folder "
-                "of its own with out=DIR."
+                f"{self.folder} holds another sweep: "
+                f"{', '.join(f'{key} {before[key]}' for key in differing)}. Choose another "
+                "folder with out=DIR."
             )
         study.set_user_attr(_SPACE, {**described, **before})
         return study

@@ -219,8 +219,8 @@ class DurableRotation(CheckpointRotation):
             raise FileExistsError(
                 f"{str(self.directory)!r} holds the checkpoints of another run: "
                 f"{', '.join(path.name for path in others)}. Continue it with load(), choose "
-                "another save_dir, or pass overwrite=True to have them removed as soon as this "
-                "run has written one of its own."
+                "another save_dir, or pass overwrite=True: they are removed once this run has "
+                "written its first."
             )
         self._began, self._others = True, others
 

@@ -177,8 +177,8 @@ class ResumableTrainer(Trainer):
         frames, updates = self.collected_frames, self._num_updates()
         if not all(type(n) is int and n >= 0 for n in (frames, updates)):
             raise CheckpointError(
-                f"The checkpoint {str(found)!r} has {frames!r} base steps and {updates!r} "
-                "updates, which are no counts. Load an older one."
+                f"The checkpoint {str(found)!r} has {frames!r} base steps and {updates!r} updates, "
+                "which are not counts. Load an older one."
             )
         if isinstance(self.checkpoint_rotation, DurableRotation):
             self.checkpoint_rotation.continue_from(found)

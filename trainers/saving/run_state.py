@@ -58,9 +58,9 @@ class RunningEpisodes:
     def __init__(self, collector: BaseCollector) -> None:
         if not isinstance(collector, Collector):
             raise TypeError(
-                f"RunningEpisodes saves the episodes of a Collector, which runs in this process; "
-                f"{type(collector).__name__} keeps its own in others. Collect with "
-                "torchrl.collectors.Collector, or do without exact resume."
+                "RunningEpisodes saves the episodes of a Collector, which runs in this process; "
+                f"{type(collector).__name__} keeps them in other processes. Collect with "
+                "torchrl.collectors.Collector, or give up exact resume."
             )
         self.collector = collector
         self.new_episodes: bool | None = None
@@ -108,7 +108,7 @@ class RunningEpisodes:
         if saved != old.batch_size:
             raise ValueError(
                 f"The checkpoint has episodes of an env of batch size {list(saved)}; this one has "
-                f"{list(old.batch_size)}. Resume with as many copies as before."
+                f"{list(old.batch_size)}. Resume with the same number of copies."
             )
         if "traj_pool" in state_dict and self.collector.track_traj_ids:
             # Whenever a collector loads, it numbers an episode of each copy that it would begin.

@@ -135,6 +135,6 @@ class AtariConfig(RunConfig):
             raise ExperimentError(str(error)) from None
         if self.options_from and not os.path.isdir(os.path.join(self.options_from, "checkpoints")):
             raise ExperimentError(
-                f"options_from={self.options_from} is no run of this experiment: it has no folder "
-                "checkpoints. Name a folder that hmcts train experiment=atari wrote."
+                f"options_from={self.options_from} is not a run of this experiment: it has no "
+                "folder checkpoints. Name a folder that hmcts train experiment=atari wrote."
             )

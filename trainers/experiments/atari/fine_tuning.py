@@ -105,7 +105,7 @@ def _goal_training(found: Options, kit: AtariKit) -> Training:
     network = network_of(found.worker)
     if found.teacher is None:
         raise TypeError(
-            "What these options are for is not known. Wrap goals or actions to repeat: "
+            "The purpose of these options is unknown. Wrap goals or actions to repeat: "
             "TrainedSource('distilled', RuleSource('goals'))."
         )
     hidden = tuple(network.sizes[1:])

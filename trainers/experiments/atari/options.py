@@ -129,7 +129,7 @@ def load_worker(part: dict[str, Any]) -> OptionWorker:
         return OccasionalAction(load_worker(part["worker"]), part["action"], part["probability"])
     if kind == "joined":
         return JoinedWorkers([load_worker(p) for p in part["parts"]])
-    raise ValueError(f"Options of the kind {kind!r} are not known.")
+    raise ValueError(f"Unknown kind of options: {kind!r}.")
 
 
 def network_of(worker: OptionWorker) -> SharedMLP:
@@ -154,6 +154,6 @@ def goals_of(worker: OptionWorker) -> list[ByteGoal | int]:
     if isinstance(worker, RepeatActions):
         return list(worker.actions)
     raise TypeError(
-        f"What the options of a {type(worker).__name__} are for is not known. Goals and repeated "
-        f"actions have it: use a RuleSource under TrainedSource('distilled', ...)."
+        f"The purpose of the options of a {type(worker).__name__} is unknown. That of goals and "
+        "repeated actions is known: use a RuleSource under TrainedSource('distilled', ...)."
     )

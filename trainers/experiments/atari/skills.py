@@ -52,8 +52,8 @@ def learn_skills(
         report["controllable"] = bytes_seen = probed["controllable"]
         if not bytes_seen:
             raise ValueError(
-                f"No byte of {kit.game} was found that actions raise and lower, so that the "
-                f"discriminator has nothing to see. Use discriminator='displacement'."
+                f"No byte of {kit.game} was found that actions raise and lower, so the "
+                "discriminator has no input. Use discriminator='displacement'."
             )
     env = kit.make_training_env(
         num_skills, option_steps=skill_steps, num_envs=num_envs, bytes_seen=bytes_seen

@@ -33,6 +33,7 @@ from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.manager import make_manager, scale_by
 from torchrl_hmcts.trainers.parts import build, merged
+from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -69,7 +70,7 @@ class Kit:
         worker_keys (sequence of NestedKey): what the worker sees besides its skill.
         state_keys (sequence of NestedKey): what pictures need of a state.
         captions (mapping): of the pictures.
-        start_name (str): what a start is called, in the plural.
+        start_name (str): what starts are called; the first word is their unit, in the plural.
         unit (str): of the times that are reported.
         curve_steps (str): column of the steps in ``curves.csv``, named for their unit.
         title (str): of the page.
@@ -100,7 +101,7 @@ class Kit:
         "skills.png": "The skills: 10 mini-episodes for each, in an open room and in a maze.",
         "losses.png": "Training of the worker: actor, both critics, discriminator.",
     }
-    start_name = "test mazes that the worker has never seen"
+    start_name = "mazes that the worker has never seen"
     unit = "base steps"
     curve_steps = "base_steps"
     title = "Planning over learned skills"
@@ -558,10 +559,21 @@ class Kit:
         states = list(episode.states[0].unbind(0))
         maps.write_episode_gif(drawing, states, options, episode.plans[0], path)
 
+    def rows(self) -> list[tuple[str, str]]:
+        """Return names and formats of the figures in the table that ends a run."""
+        return [
+            ("starts solved at the first trial", "{test[solved]} of {test[starts]}"),
+            ("base steps of training", "{training_base_steps:,}"),
+            ("CPU seconds of training", "{training_cpu_seconds:,.1f}"),
+            ("simulated base steps per plan, median", "{test[simulated_steps][median]:,.0f}"),
+            ("options per plan, median", "{test[plan_options][median]:.0f}"),
+            ("base steps per episode, median", "{test[episode_steps][median]:,.0f}"),
+            ("seconds of the run", "{seconds:,.1f}"),
+        ]
+
     def table(self, metrics: Mapping[str, Any]) -> str:
-        """Return what is printed at the end of a run."""
-        test = metrics["test"]
-        return f"{test['solved']} of {test['starts']} starts solved at the first trial."
+        """Return the table that ends a run."""
+        return console.table([(name, form.format(**metrics)) for name, form in self.rows()])
 
 
 def make_kit(config: SkillsConfig, *env: Any) -> Kit:

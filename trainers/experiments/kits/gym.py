@@ -110,7 +110,7 @@ class GymKit(Kit):
         "options), and how far it came.",
         "skills.png": "The skills: 10 mini-episodes for each, from one start.",
     }
-    start_name = "starts, at one trial each"
+    start_name = "starts at one trial each"
     title = "Planning over options of a Gymnasium env"
     group = 1  # each search is timed on its own
     config: GymConfig
@@ -270,8 +270,8 @@ class GymKit(Kit):
             return GridMoves(int(moves.n)) if self._moves else RepeatActions(fixed_actions(space))
         if self.look.discrete:
             raise ValueError(
-                f"options=goals brings a feature to a value between others; those of {config.id} "
-                "are kinds without an order. Use options=actions."
+                f"options=goals moves a feature to a value; the features of {config.id} are "
+                "categories without an order. Use options=actions."
             )
         return find_goals(
             partial(make_task, self._env, self.look, False, config.make),
@@ -468,11 +468,15 @@ class GymKit(Kit):
             found["reward_threshold"] = threshold
         return found | {"plan_seconds": spread(results.plan_seconds)}
 
-    def table(self, metrics: Mapping[str, Any]) -> str:
-        if self.can_be_solved:
-            return super().table(metrics)
-        mean = metrics["test"]["reward"]["mean"]
-        return f"Mean return {mean:.4g}; {self.config.id} names none that counts as solved."
+    def rows(self) -> list[tuple[str, str]]:
+        solved, *others = super().rows()
+        first = [solved] if self.can_be_solved else [("return that counts as solved", "none")]
+        return [
+            *first,
+            ("return, mean over starts", "{test[reward][mean]:.4g}"),
+            ("seconds per plan, median", "{test[plan_seconds][median]:.2f}"),
+            *others,
+        ]
 
     @property
     def can_be_solved(self) -> bool:  # type: ignore[override]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import count, islice
 from typing import Any
 
@@ -418,13 +418,18 @@ class LabMazeKit(Kit):
             view = draw_first_person(env, trial.starts[0], width=640, height=480)
             temporary.write_bytes(iio.imwrite("<bytes>", view, extension=".png"))
 
-    def table(self, metrics: Mapping[str, Any]) -> str:
-        test = metrics["test"]
-        return (
-            f"{test['solved']} of {test['mazes']} mazes solved at the first trial, in "
-            f"{test['frames']['mean']:.0f} frames (a script on the shortest path: "
-            f"{test['script_frames']['mean']:.0f})."
-        )
+    def rows(self) -> list[tuple[str, str]]:
+        return [
+            ("mazes solved at the first trial", "{test[solved]} of {test[mazes]}"),
+            ("frames per episode, mean", "{test[frames][mean]:,.0f}"),
+            ("frames of a script on the shortest path, mean", "{test[script_frames][mean]:,.0f}"),
+            ("frames of training", "{training_frames:,}"),
+            ("CPU seconds of training", "{training_cpu_seconds:,.1f}"),
+            ("simulated frames per plan, median", "{test[simulated_frames][median]:,.0f}"),
+            ("options per plan, median", "{test[plan_options][median]:.0f}"),
+            ("CPU seconds per plan, median", "{test[plan_cpu_seconds][median]:.3f}"),
+            ("seconds of the run", "{seconds:,.1f}"),
+        ]
 
 
 def stall_transform(env: LabMazeEnv) -> StallTransform:

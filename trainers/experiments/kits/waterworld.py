@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import index
 from typing import Any
@@ -262,9 +262,11 @@ class WaterworldKit(Kit):
 
         return WaterworldMap(env)  # type: ignore[arg-type]
 
-    def table(self, metrics: Mapping[str, Any]) -> str:
-        rows = [
+    def rows(self) -> list[tuple[str, str]]:
+        earned = [("reward of an episode, mean", "{reward_mean:.2f}")] if self.has_items else []
+        return [
             ("mazes solved at the first trial", "{solved} of {mazes}"),
+            *earned,
             ("worker training", "{train_seconds:.1f} s"),
             ("planning, one maze, median", "{plan_seconds_median:.3f} s"),
             ("planning, one maze, 95th percentile", "{plan_seconds_p95:.3f} s"),
@@ -274,8 +276,5 @@ class WaterworldKit(Kit):
             ("options per plan, median", "{plan_options_median:.0f}"),
             ("base steps per episode, median", "{episode_base_steps_median:.0f}"),
             ("base steps per tile of the shortest path", "{episode_base_steps_over_shortest:.1f}"),
-            ("whole demo", "{seconds:.1f} s"),
+            ("whole run", "{seconds:.1f} s"),
         ]
-        if self.has_items:
-            rows.insert(1, ("reward of an episode, mean", "{reward_mean:.2f}"))
-        return "\n".join(["", *(f"  {name:<42}{form.format(**metrics):>8}" for name, form in rows)])

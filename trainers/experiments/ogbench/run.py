@@ -25,7 +25,7 @@ from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
 from torchrl_hmcts.trainers.experiments.ogbench.data import load, record, save
 from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.figures.intervals import wilson
-from torchrl_hmcts.trainers.runs.console import counted
+from torchrl_hmcts.trainers.runs.console import counted, table
 from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, plain_checkpoint
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
@@ -80,8 +80,14 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
                 plot_landmarks(
                     agent.model, [e["places"] for e in episodes[:: config.episodes]], path
                 )
-    solved = 100 * metrics["test"]["solved"]
-    print(f"{solved:.1f} % of {len(episodes)} episodes of five tasks solved.")
+    test = metrics["test"]
+    rows = [
+        ("episodes solved, mean of five tasks", f"{100 * test['solved']:.1f} %"),
+        ("episodes", str(test["episodes"])),
+        ("base steps of solved episodes, median", f"{test['steps']['median']:,.0f}"),
+        ("CPU seconds per plan, median", f"{test['plan_cpu_seconds']['median']:.3f}"),
+    ]
+    print(table(rows))
     return metrics
 
 
