@@ -113,8 +113,9 @@ class RoboticsPointMaze(RoboticsMaze):
     frame_skip = 1
 
     def begin(self, model: Any, data: Any, action: np.ndarray) -> None:
-        data.ctrl[:] = np.clip(action, -1.0, 1.0)
-        np.clip(data.qvel, -5.0, 5.0, out=data.qvel)
+        data.ctrl[:] = np.minimum(np.maximum(action, -1.0), 1.0)  # np.clip takes four times as long
+        np.maximum(data.qvel, -5.0, out=data.qvel)
+        np.minimum(data.qvel, 5.0, out=data.qvel)
 
     def observe(
         self, qpos: np.ndarray, qvel: np.ndarray, derived: np.ndarray, goal: np.ndarray

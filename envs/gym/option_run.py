@@ -21,6 +21,7 @@ from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
 from torchrl_hmcts.envs.gym.generators import generator_memory, set_generator_state
+from torchrl_hmcts.envs.gym.quick import quick_step
 from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
 from torchrl_hmcts.envs.gym.snapshots import (
     SNAPSHOT_KEY,
@@ -256,6 +257,11 @@ class GymRun(OptionRun):
         self.block = next((e for e in self._layers if isinstance(e, PrivateRandom)), self.block)
         self._take = inner.step
         self.step = self._noted_step if self._notes_actions else self._take
+        derived = getattr(self.snapshot, "derived", ())
+        quick = None if self._notes_actions or derived else quick_step(self.env)
+        if quick is not None and len(self._clocks) <= 1:
+            self.step, self.block = quick, nullcontext()
+            self.clock = self._clocks[0] if self._clocks else None
         observation = self.first_observation()
         self._paths = _paths(observation)
         self._single = self._paths == [()]
