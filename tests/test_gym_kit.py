@@ -320,6 +320,18 @@ def test_goals_are_found_on_features_that_actions_control() -> None:
         HMCTS("FrozenLake-v1", options="goals")
 
 
+def test_keys_and_skills_that_do_not_fit_are_told(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="no key 'option_step'. Nearest: option_steps"):
+        HMCTS("CartPole-v1", option_step=3)
+    given = HMCTS("MountainCar-v0", option_steps=14).save(tmp_path / "given")
+    with pytest.raises(ValueError, match=r"options are given \(options=directions\), not learned"):
+        HMCTS("MountainCar-v0", worker=given)
+    agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
+    learned = agent.save(tmp_path / "learned")
+    with pytest.raises(ValueError, match="learned in MountainCar-v0; CartPole-v1 has other obs"):
+        HMCTS("CartPole-v1", worker=learned)
+
+
 def test_no_skills_no_worker() -> None:
     with pytest.raises(RuntimeError, match=r"Call learn\(\) first"):
         HMCTS("MountainCar-v0", options="learned").solve()

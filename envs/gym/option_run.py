@@ -135,7 +135,12 @@ class OptionRun(ABC):
         with self.block:
             for step in range(1, self.max_steps + 1):
                 action = act(observation, option, generator)
-                observation, gained, terminated, truncated, _ = take(action)
+                try:
+                    observation, gained, terminated, truncated, _ = take(action)
+                except Exception as error:
+                    if wrong := self._wrong(action, option):
+                        raise ValueError(wrong) from error
+                    raise
                 work[0] += 1  # a step of Atari adds to it as well
                 reward += discount * float(gained)
                 discount *= gamma
@@ -196,11 +201,14 @@ class OptionRun(ABC):
             if self._begun is not None:
                 self._begun(observation, option)
             action = worker.act(observation, option, np.random.default_rng(0))
-            if wanted := self.check_action(action):
-                raise ValueError(
-                    f"The worker {type(worker).__name__} took the action {action!r} in option "
-                    f"{option}; {wanted}."
-                )
+            if wrong := self._wrong(action, option):
+                raise ValueError(wrong)
+
+    def _wrong(self, action: Any, option: int) -> str:
+        wanted = self.check_action(action)
+        kind = type(self.worker).__name__
+        told = f"The worker {kind} took the action {action!r} in option {option}; {wanted}."
+        return told if wanted else ""
 
     def first_observation(self) -> Any:
         """Return an observation of an episode's beginning."""

@@ -65,8 +65,11 @@ def _physics(task: Any) -> tuple[Any, Callable[[Any], tuple[float, float]]]:
     model, data = find_physics(task.env)
     arrays = SimpleNamespace(qpos=data.qpos, qvel=data.qvel, ctrl=data.ctrl)
     begin, step, skip, qpos = task.begin, mujoco.mj_step, task.frame_skip, data.qpos
+    shape = task.env.action_space.shape
 
     def move(action: Any) -> tuple[float, float]:
+        if np.shape(action) != shape:
+            raise ValueError(f"An action of this maze is an array of {shape}; got {action!r}.")
         begin(model, arrays, action)
         step(model, data, nstep=skip)
         x, y = qpos.tolist()
