@@ -69,8 +69,8 @@ TASKS: dict[str, Task] = {
     "CartPole-v1": Task(
         {"max_episode_steps": 100}, 0.02, 100, 2, lambda r: r >= 100, {"search_steps": 300}
     ),
-    "MiniGrid-Empty-5x5-v0": Task({}, 0.1, 15, 2, positive),
-    "MiniGrid-FourRooms-v0": Task({"max_steps": 50}, 0.1, 50, 4, positive),
+    "MiniGrid-Empty-5x5-v0": Task({}, 0.1, 15, 1, positive),
+    "MiniGrid-FourRooms-v0": Task({"max_steps": 50}, 0.1, 50, 1, positive),
 }
 
 
