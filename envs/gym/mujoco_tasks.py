@@ -148,10 +148,12 @@ class OGBenchMaze(MujocoTask):
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
         kind = self.env
-        if kind._teleport_info is not None or kind._success_timing != "post":
+        simple = kind._teleport_info is None and kind._reward_task_id is None
+        if not simple or kind._success_timing != "post":
             raise SnapshotError(
-                f"{env} moves at random where it teleports, or judges the state before a step. "
-                "MujocoBatch steps the mazes medium, large and giant; SettableGymEnv all."
+                f"{env} moves at random where it teleports, judges the state before a step, or "
+                "pays for steps. MujocoBatch steps medium, large and giant mazes; SettableGymEnv "
+                "all."
             )
         self.frame_skip = int(kind.frame_skip)
         self.radius = float(kind._goal_tol)

@@ -47,7 +47,7 @@ def quick_step(env: gymnasium.Env) -> Step | None:
         return None
     if isinstance(known, RoboticsPointMaze):
         take = _robotics(known)
-    elif isinstance(known, OGBenchPointMaze) and layer._ob_type == "states":
+    elif isinstance(known, OGBenchPointMaze) and layer.observation_space.shape == (2,):
         take = _ogbench(known)
     else:
         return None
@@ -81,7 +81,7 @@ def _physics(task: Any) -> tuple[Any, Callable[[Any], tuple[float, float]]]:
 def _ogbench(task: OGBenchPointMaze) -> Step:
     maze = task.env
     arrays, move = _physics(task)
-    near, offset = (task.radius + _NEAR) ** 2, float(maze._reward_task_id is not None)
+    near = (task.radius + _NEAR) ** 2
 
     def take(action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         x, y = move(action)
@@ -90,7 +90,7 @@ def _ogbench(task: OGBenchPointMaze) -> Step:
         success = close and maze.compute_success()
         ended = bool(success and maze._terminate_at_goal)
         told = {"success": float(success)}
-        return arrays.qpos.copy(), float(success) - offset, ended, False, told
+        return arrays.qpos.copy(), float(success), ended, False, told
 
     return take
 
