@@ -273,7 +273,9 @@ class GymRun(OptionRun):
         observation = self.first_observation()
         self._paths = _paths(observation)
         self._single = self._paths == [()]
-        self._flat = [path[0] for path in self._paths] if all(map(_is_flat, self._paths)) else None
+        self._flat = (
+            [path[0] for path in self._paths] if all(len(p) == 1 for p in self._paths) else None
+        )
         leaves = [_leaf(observation, path) for path in self._paths]
         # A number, e.g. of a Discrete space, reaches the worker as a number.
         self._kinds = [None if isinstance(leaf, np.ndarray) else type(leaf) for leaf in leaves]
@@ -370,10 +372,6 @@ def _paths(observation: Any) -> list[tuple[str, ...]]:
     if not isinstance(observation, dict):
         return [()]
     return [(name, *path) for name, part in observation.items() for path in _paths(part)]
-
-
-def _is_flat(path: tuple[str, ...]) -> bool:
-    return len(path) == 1
 
 
 def _key(path: tuple[str, ...]) -> Any:
