@@ -28,7 +28,7 @@ from torchrl_hmcts.trainers import HMCTS
 ENVS = ["PointMaze_Large-v3", "pointmaze-medium-v0", "pointmaze-large-v0", "pointmaze-giant-v0"]
 SKILLS, STEPS, LIMIT = 4, 30_000, 30_000
 COMMAND = (
-    "python benchmarks/point_mazes.py --seeds 0 1 2 --starts 25 --ablation-starts 0 "
+    "python benchmarks/point_mazes.py --seeds 0 1 2 --starts 50 --ablation-starts 0 "
     "--out docs/results/settable/point_mazes.json"
 )
 

@@ -183,11 +183,20 @@ def test_rewards_are_collected_with_a_search_before_every_option() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "backup"), [("CartPole-v1", "mean"), ("Pendulum-v1", "max")], ids=str
+    ("keys", "backup", "depth"),
+    [
+        ({"env": "CartPole-v1"}, "mean", 30),
+        ({"env": "Pendulum-v1"}, "max", 10),
+        ({"env": "Pendulum-v1", "option_steps": 12}, "max", 5),  # 60 base steps
+    ],
+    ids=str,
 )
-def test_where_it_pays_to_live_on_the_mean_over_rollouts_counts(name: str, backup: str) -> None:
-    planner = HMCTS(name).planner
+def test_where_it_pays_to_live_on_the_mean_over_rollouts_counts(
+    keys: dict[str, Any], backup: str, depth: int
+) -> None:
+    planner = HMCTS(**keys).planner
     assert planner.backup == backup
+    assert planner.rollout.max_options == depth
     chooses = MostVisited if backup == "mean" else HighestValue
     assert isinstance(planner.final_choice, chooses)
 
@@ -318,6 +327,18 @@ def test_goals_are_found_on_features_that_actions_control() -> None:
     assert solution.base_steps == 9
     with pytest.raises(ValueError, match="are categories without an order. Use options=actions"):
         HMCTS("FrozenLake-v1", options="goals")
+
+
+def test_keys_and_skills_that_do_not_fit_are_told(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="no key 'option_step'. Nearest: option_steps"):
+        HMCTS("CartPole-v1", option_step=3)
+    given = HMCTS("MountainCar-v0", option_steps=14).save(tmp_path / "given")
+    with pytest.raises(ValueError, match=r"options are given \(options=directions\), not learned"):
+        HMCTS("MountainCar-v0", worker=given)
+    agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
+    learned = agent.save(tmp_path / "learned")
+    with pytest.raises(ValueError, match="learned in MountainCar-v0; CartPole-v1 has other obs"):
+        HMCTS("CartPole-v1", worker=learned)
 
 
 def test_no_skills_no_worker() -> None:

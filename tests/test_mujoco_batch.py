@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,11 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import MujocoBatch, SnapshotError
+from torchrl_hmcts.envs.gym.families import snapshot_of
+from torchrl_hmcts.envs.gym.mujoco import find_physics, repr_of
+from torchrl_hmcts.envs.gym.quick import quick_step
 from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.envs.gym.task import look_at
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.transforms import OptionTransform
 
@@ -55,6 +60,49 @@ def test_it_steps_observes_rewards_and_ends_as_the_gymnasium_env_to_the_bit(name
             if terminated:
                 break
     assert reached == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "keywords"),
+    [
+        ("PointMaze_UMaze-v3", {"continuing_task": False}),
+        ("PointMaze_UMaze-v3", {"reward_type": "dense"}),
+        ("pointmaze-medium-v0", {}),
+    ],
+)
+def test_a_quick_step_is_that_of_the_env_to_the_bit(name: str, keywords: dict[str, Any]) -> None:
+    env, other = (look_at(name, **keywords).task(make_gym(name, **keywords)) for _ in range(2))
+    snapshots, step = [snapshot_of(env), snapshot_of(other)], quick_step(other)
+    env.action_space.seed(0)
+    ended = touched = 0
+    for seed in range(2):
+        for each in (env, other):
+            each.reset(seed=seed)  # at first far from the goal, then beside it
+            place = find_physics(each)[1].qpos
+            _set_goal(each, place + (0.5 if seed else 50.0))
+        for number in range(120):
+            if number % 12 == 0:  # long enough to meet a wall
+                action = np.ones(2, np.float32) if seed else env.action_space.sample()
+            wanted, got = env.step(action), step(action)
+            assert repr_of(got) == repr_of(wanted)
+            ended += wanted[2]
+            touched += find_physics(env)[1].ncon > 1  # it stands on the floor
+            for snapshot in snapshots:
+                snapshot.note_step(action)
+            physics = [s.read()[: 8 * s._numbers] for s in snapshots]
+            assert np.array_equal(*physics)
+            if wanted[2]:
+                break
+    assert ended
+    assert touched
+
+
+def test_no_quick_step_where_a_wrapper_or_the_env_is_not_known() -> None:
+    for name in ("CartPole-v1", "AntMaze_UMaze-v5", "pointmaze-teleport-v0"):
+        assert quick_step(make_gym(name)) is None
+    known = make_gym("PointMaze_UMaze-v3")
+    assert quick_step(known) is not None
+    assert quick_step(gymnasium.wrappers.ClipAction(known)) is None
 
 
 def _set_goal(env: Any, goal: np.ndarray) -> None:

@@ -320,6 +320,16 @@ def test_an_error_of_the_worker_is_raised_and_costs_no_room() -> None:
     assert here.step(td)["next", "duration"].tolist() == [[5], [5]]
 
 
+class Tires(RepeatActions):
+    def act(self, observation: Any, option: int, generator: Any) -> int:
+        return option if abs(observation[1]) < 0.5 else 9  # once the cart is fast
+
+
+def test_a_wrong_action_in_the_middle_of_an_option_is_told_with_the_right_ones() -> None:
+    with pytest.raises(ValueError, match=r"Tires took the action 9 in option \d; .* Discrete\(2\)"):
+        local(Tires(2)).rollout(3)
+
+
 def test_threads_copies_and_forks_step_as_the_pool(pool: OptionPool) -> None:
     roots = every_option(pool)
     want = pool.step(roots.clone())["next", "observation"]

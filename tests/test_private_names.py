@@ -23,7 +23,7 @@ OTHERS = {  # of other packages
     *("_exit", "_replace"),  # os._exit; a NamedTuple's
     *("_max_episode_steps", "_destroy"),  # of Gymnasium's TimeLimit, and its Box2D envs
     *("_contact_force_range", "_goal_tol", "_success_timing"),  # of mazes: mujoco_tasks.py
-    *("_teleport_info", "_terminate_at_goal"),
+    *("_reward_task_id", "_teleport_info", "_terminate_at_goal"),
 }
 # What is there today: names go, and none comes.
 KNOWN = {

@@ -13,6 +13,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from torchrl_hmcts.trainers import HMCTS
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.registry import load_config
 from torchrl_hmcts.trainers.figures.comparison_page import group_runs
@@ -322,3 +323,25 @@ def test_a_page_opens_with_all_pictures_and_nothing_cut_off(tmp_path, kind, widt
     assert min(told["images"]) > 0  # all pictures have loaded
     assert told["width"] <= width  # no scrolling to the side
     assert told["font"] >= 14
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+def test_the_page_of_an_episode_opens_and_its_film_moves(tmp_path, monkeypatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    HMCTS("MountainCar-v0", option_steps=14, improve_expansions=1).save(tmp_path / "agent")
+    assert main(["play", f"run={tmp_path / 'agent'}"]) == 0
+    page = tmp_path / "agent/play/index.html"
+    told = rendered(page, tmp_path, 390)
+    assert told["errors"] == []
+    assert len(told["images"]) == 2  # film and search
+    assert min(told["images"]) > 0
+    assert told["width"] <= 390
+    shots = []
+    for milliseconds in (600, 2500):
+        shot = tmp_path / f"{milliseconds}.png"
+        words = [*BROWSER[:4], f"--virtual-time-budget={milliseconds}", f"--screenshot={shot}"]
+        words += [f"--user-data-dir={tmp_path}/profile", "--window-size=800,900", page.as_uri()]
+        subprocess.run(words, capture_output=True, timeout=120, check=True)
+        shots.append(iio.imread(shot)[100:500])  # the film
+    assert (shots[0] != shots[1]).any()

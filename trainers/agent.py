@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
 import logging
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
@@ -90,6 +91,7 @@ class HMCTS:
     Raises:
         ValueError: if the id is unknown (the nearest are named), or the state cannot be stored.
         ImportError: if a package is missing; the extra that has it is named.
+        TypeError: if there is no such key; the nearest are named.
 
     Reference:
         Dissertation, chapters 4 and 5.
@@ -121,6 +123,13 @@ class HMCTS:
             made = find_experiment(kit, KITS).config_class
             if not issubclass(made, GymConfig):
                 raise ValueError(f"kit={kit!r} is not a kit of Gymnasium envs. Use 'gym' or 'ant'.")
+            names = [field.name for field in dataclasses.fields(made)]
+            for key in keys:
+                if key not in names:
+                    near = ", ".join(difflib.get_close_matches(key, names, n=3)) or "none"
+                    raise TypeError(
+                        f"HMCTS has no key {key!r}. Nearest: {near}. hmcts list {kit} names all."
+                    )
             config = made(id=env if isinstance(env, str) else "", **keys)
         self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
         self.kit = self._make_kit(config)

@@ -21,6 +21,7 @@ from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
 from torchrl_hmcts.envs.gym.generators import generator_memory, set_generator_state
+from torchrl_hmcts.envs.gym.quick import quick_step
 from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
 from torchrl_hmcts.envs.gym.snapshots import (
     SNAPSHOT_KEY,
@@ -134,7 +135,12 @@ class OptionRun(ABC):
         with self.block:
             for step in range(1, self.max_steps + 1):
                 action = act(observation, option, generator)
-                observation, gained, terminated, truncated, _ = take(action)
+                try:
+                    observation, gained, terminated, truncated, _ = take(action)
+                except Exception as error:
+                    if wrong := self._wrong(action, option):
+                        raise ValueError(wrong) from error
+                    raise
                 work[0] += 1  # a step of Atari adds to it as well
                 reward += discount * float(gained)
                 discount *= gamma
@@ -195,11 +201,14 @@ class OptionRun(ABC):
             if self._begun is not None:
                 self._begun(observation, option)
             action = worker.act(observation, option, np.random.default_rng(0))
-            if wanted := self.check_action(action):
-                raise ValueError(
-                    f"The worker {type(worker).__name__} took the action {action!r} in option "
-                    f"{option}; {wanted}."
-                )
+            if wrong := self._wrong(action, option):
+                raise ValueError(wrong)
+
+    def _wrong(self, action: Any, option: int) -> str:
+        wanted = self.check_action(action)
+        kind = type(self.worker).__name__
+        told = f"The worker {kind} took the action {action!r} in option {option}; {wanted}."
+        return told if wanted else ""
 
     def first_observation(self) -> Any:
         """Return an observation of an episode's beginning."""
@@ -256,10 +265,17 @@ class GymRun(OptionRun):
         self.block = next((e for e in self._layers if isinstance(e, PrivateRandom)), self.block)
         self._take = inner.step
         self.step = self._noted_step if self._notes_actions else self._take
+        derived = getattr(self.snapshot, "derived", ())
+        quick = None if self._notes_actions or derived else quick_step(self.env)
+        if quick is not None and len(self._clocks) <= 1:
+            self.step, self.block = quick, nullcontext()
+            self.clock = self._clocks[0] if self._clocks else None
         observation = self.first_observation()
         self._paths = _paths(observation)
         self._single = self._paths == [()]
-        self._flat = [path[0] for path in self._paths] if all(map(_is_flat, self._paths)) else None
+        self._flat = (
+            [path[0] for path in self._paths] if all(len(p) == 1 for p in self._paths) else None
+        )
         leaves = [_leaf(observation, path) for path in self._paths]
         # A number, e.g. of a Discrete space, reaches the worker as a number.
         self._kinds = [None if isinstance(leaf, np.ndarray) else type(leaf) for leaf in leaves]
@@ -356,10 +372,6 @@ def _paths(observation: Any) -> list[tuple[str, ...]]:
     if not isinstance(observation, dict):
         return [()]
     return [(name, *path) for name, part in observation.items() for path in _paths(part)]
-
-
-def _is_flat(path: tuple[str, ...]) -> bool:
-    return len(path) == 1
 
 
 def _key(path: tuple[str, ...]) -> Any:

@@ -153,9 +153,9 @@ def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
         ) from None
     except gymnasium.error.DependencyNotInstalled as error:
         raise ImportError(
-            f"{name} needs a package that is not installed ({error}). Box2D's, MuJoCo's, "
-            "MiniGrid's and OGBench's come with pip install 'torchrl_hmcts[gym]', Atari's with "
-            "'torchrl_hmcts[atari]'."
+            f"{name} needs a package that is not installed: {' '.join(map(str, error.args))}. "
+            "Those of Box2D, MuJoCo from version 4 of its robots on, MiniGrid and OGBench come "
+            "with pip install 'torchrl_hmcts[gym]', Atari's with 'torchrl_hmcts[atari]'."
         ) from error
 
 

@@ -201,7 +201,8 @@ def look_at(
     for _ in range(_EPISODES):
         walk.episode(gamma)
     points = np.array(walk.points, np.float64)
-    discrete = np.array(walk.points).dtype.kind in "iu" or _counts(made.observation_space, chosen)
+    counts = chosen is whole_observation and not isinstance(made.observation_space, spaces.Box)
+    discrete = counts or np.array(walk.points).dtype.kind in "iu"
     span = np.ptp(points, 0)
     if chosen is whole_observation and discrete:
         chosen = partial(whole_observation, scale=None)
@@ -240,10 +241,6 @@ def look_at(
         1.0 / max(size, 1e-6),
         walk.steps,
     )
-
-
-def _counts(space: gymnasium.Space, features: Features) -> bool:
-    return features is whole_observation and not isinstance(space, spaces.Box)
 
 
 class _Walk:

@@ -49,6 +49,7 @@ from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
+from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 from torchrl_hmcts.trainers.skills.curves import Curves
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
@@ -240,10 +241,25 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
 
     Raises:
         FileNotFoundError: if it has no networks yet.
-        ValueError: if they are other ones.
+        ValueError: if they are other ones, or of another env.
     """
     loss = make_loss(kit)
-    path = load_networks(loss, folder)
+    try:
+        path = load_networks(loss, folder)
+    except (ValueError, FileNotFoundError) as error:
+        config = read_run(folder).config
+        if config.get("options", "learned") != "learned":
+            raise ValueError(
+                f"{folder} holds an agent whose options are given (options={config['options']}), "
+                "not learned: it has no skills. Pass the folder of one that has learned."
+            ) from None
+        theirs, ours = config.get("id"), getattr(kit.config, "id", None)
+        if isinstance(error, ValueError) and theirs != ours:
+            raise ValueError(
+                f"The skills of {folder} were learned in {theirs}; {ours} has other observations, "
+                "other actions, or other keys that shape the networks (num_skills, hidden)."
+            ) from error
+        raise
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     step = int("".join(filter(str.isdigit, path.stem)) or 0)
     return LearnedSkills(worker, loss, {}, RoundRecords(), step, step, 0, 0.0)

@@ -91,6 +91,7 @@ def load_networks(loss_module: LossModule, run: str | Path) -> Path:
     except CheckpointError as error:
         raise ValueError(
             f"The networks of {path} are not those of this configuration. Leave the keys that "
-            f"shape them (num_skills, hidden, ...) as they were. {error}"
+            "shape them (num_skills, hidden, ...) as they were. "
+            + str(error).partition(" in tensordict")[0]
         ) from None
     return path

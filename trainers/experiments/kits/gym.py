@@ -40,6 +40,7 @@ from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 _PLAYED = 1_000_003  # added to the seed of envs to act in
+_HORIZON = 50  # base steps of a random way, where rewards are collected
 _STILL = 0.05  # of the radius, within a fifth of an option: it no longer moves
 _GOALS = ("achieved_goal", "desired_goal")
 
@@ -325,7 +326,8 @@ class GymKit(Kit):
             most_visited = {"_component_": f"{planners}.MostVisited"}
             part |= {"tree_policy": uct | {"c": 1.0}, "final_choice": most_visited}
         elif self.look.kind == "return":
-            part["rollout"]["max_options"] = 10
+            # Longer random ways end badly whatever the next option is, as those of a lander do.
+            part["rollout"]["max_options"] = min(10, -(-_HORIZON // config.option_steps))
             part |= {
                 "tree_policy": uct | {"c": 0.3},
                 "backup": "max",
