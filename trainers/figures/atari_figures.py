@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from tensordict import TensorDict
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv
 from torchrl_hmcts.trainers.figures.animation import write_gif
-from torchrl_hmcts.trainers.figures.pictures import save_figure
+from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
+FRAMES_PER_STEP = 4
 _EVERY = 3  # base steps between two pictures
 
 
@@ -29,6 +31,31 @@ def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: s
     axes.set(title=title, xlabel="emulated frames, real and simulated", ylabel="score")
     axes.xaxis.set_major_formatter(EngFormatter())
     axes.margins(x=0.08)
+    axes.legend(frameon=False)
+    axes.grid(alpha=0.25)
+    save_figure(figure, path, dpi=120)
+
+
+def plot_learning(
+    curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path, *, title: str
+) -> None:
+    """Plot mean, least and largest score against training samples, a line for each worker.
+
+    The points of a curve have ``samples``, ``mean``, ``least`` and ``largest``; at a number of
+    samples there may be several, e.g. of other seeds.
+    """
+    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    for (name, rows), color in zip(curves.items(), itertools.cycle(COLORS)):
+        samples = sorted({row["samples"] for row in rows})
+        at = [[row for row in rows if row["samples"] == x] for x in samples]
+        low = [min(row["least"] for row in group) for group in at]
+        high = [max(row["largest"] for row in group) for group in at]
+        mean = [sum(row["mean"] for row in group) / len(group) for group in at]
+        axes.fill_between(samples, low, high, color=color, alpha=0.16, linewidth=0)
+        axes.plot(samples, mean, "o-", color=color, label=name)
+    axes.set(title=title, xlabel="training samples", ylabel="score, worker frozen")
+    axes.xaxis.set_major_formatter(EngFormatter())
     axes.legend(frameon=False)
     axes.grid(alpha=0.25)
     save_figure(figure, path, dpi=120)
@@ -53,7 +80,7 @@ def write_atari_gif(
         state = after.select("emulator_state", "ram", "observation", strict=False)
         if shown >= real_steps or bool(after["done"].any()):
             break
-    seconds = _EVERY * recorder.frame_skip / 60.0
+    seconds = _EVERY * FRAMES_PER_STEP / 60.0
     frames = [p.repeat(2, axis=1) for p in pictures]  # a console's pixels are wide
     write_gif(frames, path, milliseconds=1000.0 * seconds, last=None)
     return shown, score
