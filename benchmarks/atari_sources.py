@@ -12,11 +12,11 @@ what there is becomes ``learned.json`` and a figure of the learning curves for e
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import json
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
+
+from atari_results import read
 
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.run import run_atari
@@ -29,11 +29,6 @@ BUDGET = {
     "rounds": 4, "trial_steps": 500, "trial_ratio": 10.0, "num_processes": 0,
 }  # fmt: skip
 CURVE = {"curve_every": 10_000, "curve_steps": 300}
-KEPT = (
-    "game", "source", "acts", "seed", "score_mean", "score_min", "score_max", "options",
-    "option_steps", "frames", "frames_finding_options", "frames_tuning", "simulated_per_real",
-    "seconds",
-)  # fmt: skip
 
 
 def make_config(game: str, source: str, seed: int, args: argparse.Namespace) -> AtariConfig:
@@ -52,25 +47,17 @@ def make_config(game: str, source: str, seed: int, args: argparse.Namespace) -> 
     return AtariConfig(game=game, source=name, seed=seed, out=out, overwrite=True, **settings)
 
 
-def row_of(folder: Path) -> dict[str, Any]:
-    """What is kept of a run."""
-    metrics = json.loads((folder / "metrics.json").read_text())
-    row = {key: metrics[key] for key in KEPT}
-    row["source"] = folder.name.removeprefix(row["game"] + "_").rpartition("_")[0]
-    row["scores"] = [episode["score"] for episode in metrics["episodes"]]
-    row["learning"] = metrics["finding"].get("learning", {})
-    default = dataclasses.asdict(AtariConfig())
-    words = [
-        f"{k}={v}"
-        for k, v in metrics["config"].items()
-        if v != default[k] and k not in ("out", "overwrite")
-    ]
-    return {**row, "command": "hmcts train experiment=atari " + " ".join(words)}
-
-
 def collect(args: argparse.Namespace) -> None:
     """Write what there is, and draw the learning curves."""
-    rows = [row_of(path.parent) for path in sorted(args.runs.glob("*/metrics.json"))]
+    rows = []
+    for folder in sorted(args.runs.iterdir()):
+        if (row := read(folder)) is None:
+            continue
+        rows.append(row)
+        row["source"] = folder.name.removeprefix(row["game"] + "_").rpartition("_")[0]
+        row["learning"] = row.pop("finding").get("learning", {})
+        row["scores"] = [episode["score"] for episode in row.pop("episodes")]
+        del row["curves"], row["tuning"]
     command = "python benchmarks/atari_sources.py --games Pong Breakout SpaceInvaders"
     write_json(args.out / "learned.json", {"command": command, "budget": BUDGET, "rows": rows})
     curves: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))

@@ -22,7 +22,7 @@ from torchrl_hmcts.envs.atari.states import EmulatorStates
 NO_OP_STARTS = 30
 """Most frames of doing nothing at the beginning, where nothing else differs between episodes."""
 _NO_OP = 0
-_SKIP_BYTES = 37  # of the generator that draws the frames of a step
+_SKIP_BYTES = (16, 16, 4, 1)  # of the parts of the generator that draws the frames of a step
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ class AtariEmulator:
     @property
     def width_with_rng(self) -> int:
         """Bytes of a state with all random generators."""
-        return self.states.width_with_rng + (0 if self._skips is None else _SKIP_BYTES)
+        return self.states.width_with_rng + (0 if self._skips is None else sum(_SKIP_BYTES))
 
     def state(self, *, include_rng: bool = False) -> np.ndarray:
         """Return the state, uint8 ``[states.width]``, with the generators ``[width_with_rng]``.
@@ -262,9 +262,10 @@ class AtariEmulator:
         if self._skips is None:
             return row
         state = self._skips.bit_generator.state
-        words = [state["state"]["state"], state["state"]["inc"], state["uinteger"]]
-        sizes = zip([*words, state["has_uint32"]], (16, 16, 4, 1), strict=True)
-        text = b"".join(word.to_bytes(size, "little") for word, size in sizes)
+        words = (*state["state"].values(), state["uinteger"], state["has_uint32"])
+        text = b"".join(
+            n.to_bytes(size, "little") for n, size in zip(words, _SKIP_BYTES, strict=True)
+        )
         return np.concatenate([row, np.frombuffer(text, np.uint8)])
 
     def set_state(self, row: np.ndarray, seed: int | None = None) -> None:
@@ -286,14 +287,12 @@ class AtariEmulator:
     def _set_skips(self, row: np.ndarray, seed: int | None) -> np.ndarray:
         """Set what draws the frames of a step to a seed or a row; return the rest of the row."""
         if len(row) == self.width_with_rng:
-            row, own = row[:-_SKIP_BYTES], row[-_SKIP_BYTES:].tobytes()
-            cuts = ((0, 16), (16, 32), (32, 36), (36, 37))
-            state, inc, uinteger, has = (int.from_bytes(own[a:b], "little") for a, b in cuts)
-            bits = np.random.PCG64()
-            words: Any = {"has_uint32": has, "uinteger": uinteger}
-            pcg = {"state": state, "inc": inc}
-            bits.state = {"bit_generator": "PCG64", "state": pcg, **words}
-            self._skips = np.random.Generator(bits)
+            cuts = np.split(row[self.states.width_with_rng :], np.cumsum(_SKIP_BYTES[:-1]))
+            state, inc, uinteger, has = (int.from_bytes(cut.tobytes(), "little") for cut in cuts)
+            words: Any = {"state": {"state": state, "inc": inc}, "uinteger": uinteger}
+            self._skips = np.random.Generator(np.random.PCG64())
+            self._skips.bit_generator.state = {"bit_generator": "PCG64", "has_uint32": has} | words
+            row = row[: self.states.width_with_rng]
         if seed is not None:
             self._skips = np.random.default_rng(seed)
         return row
