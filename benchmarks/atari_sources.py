@@ -64,17 +64,9 @@ def collect(args: argparse.Namespace) -> None:
     for row in rows:
         if points := row["learning"].get("rows"):
             curves[row["game"]][row["source"]].append(points)
-    for game, sources in curves.items():
-        # Rounds simulate more or fewer samples: the points of the seeds meet by their number.
-        joined = {
-            f"{name}, {len(seeds)} seeds": [
-                {**row, "samples": sum(r["samples"] for r in same) / len(same)}
-                for same in zip(*seeds, strict=False)
-                for row in same
-            ]
-            for name, seeds in sources.items()
-        }
-        plot_learning(joined, args.out / f"learning_{game}.png", title=game)
+    for game, workers in curves.items():
+        named = {f"{name}, {len(seeds)} seeds": seeds for name, seeds in workers.items()}
+        plot_learning(named, args.out / f"learning_{game}.png", title=game)
 
 
 def main() -> None:

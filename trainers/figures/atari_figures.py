@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv
 from torchrl_hmcts.trainers.figures.animation import write_gif
+from torchrl_hmcts.trainers.figures.curves import draw_band, style
 from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
 FRAMES_PER_STEP = 4
@@ -37,27 +39,25 @@ def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: s
 
 
 def plot_learning(
-    curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path, *, title: str
+    workers: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]], path: Path, *, title: str
 ) -> None:
-    """Plot mean, least and largest score against training samples, a line for each worker.
+    """Plot mean, least and largest score against training samples.
 
-    The points of a curve have ``samples``, ``mean``, ``least`` and ``largest``; at a number of
-    samples there may be several, e.g. of other seeds.
+    Each worker has a curve for each seed, whose points have ``samples`` and the ``scores`` of the
+    test episodes.
     """
     figure = Figure(figsize=(7.0, 4.0), layout="constrained")
     axes = figure.add_subplot()
-    for (name, rows), color in zip(curves.items(), itertools.cycle(COLORS)):
-        samples = sorted({row["samples"] for row in rows})
-        at = [[row for row in rows if row["samples"] == x] for x in samples]
-        low = [min(row["least"] for row in group) for group in at]
-        high = [max(row["largest"] for row in group) for group in at]
-        mean = [sum(row["mean"] for row in group) / len(group) for group in at]
-        axes.fill_between(samples, low, high, color=color, alpha=0.16, linewidth=0)
-        axes.plot(samples, mean, "o-", color=color, label=name)
-    axes.set(title=title, xlabel="training samples", ylabel="score, worker frozen")
-    axes.xaxis.set_major_formatter(EngFormatter())
+    for (name, seeds), color in zip(workers.items(), itertools.cycle(COLORS)):
+        episodes = [
+            ([row["samples"] for row in rows], scores)
+            for rows in seeds
+            for scores in zip(*(row["scores"] for row in rows), strict=True)
+        ]
+        draw_band(axes, episodes, color=color, marker="o", label=name)
+    style(axes, title, short=True)
+    axes.set(xlabel="training samples", ylabel="score, worker frozen")
     axes.legend(frameon=False)
-    axes.grid(alpha=0.25)
     save_figure(figure, path, dpi=120)
 
 

@@ -146,7 +146,7 @@ def draw(run: AtariRun, pictures: Pictures) -> None:
         with pictures.one("learning.png", words) as path:
             from torchrl_hmcts.trainers.figures.atari_figures import plot_learning
 
-            plot_learning({run.config.source: learning}, path, title=run.config.game)
+            plot_learning({run.config.source: [learning]}, path, title=run.config.game)
     if not run.best:  # of a run that was begun by an older version
         return
     with left_out("episode.gif"):
