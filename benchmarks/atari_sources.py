@@ -42,7 +42,9 @@ def make_config(game: str, source: str, seed: int, args: argparse.Namespace) -> 
         settings |= CURVE
     if source not in ("untrained", "diayn", "diayn_retrained"):
         settings["fire"] = 0.05  # a rule of ours: the dissertation's worker has none
-    name = "diayn" if source == "untrained" else source
+    name = "diayn" if source == "untrained" else source.removesuffix("_game")
+    if source.endswith("_game"):  # rewarded by the game, too
+        settings |= {"game_weight": 10.0, "skill_base_steps": 60_000}
     out = str(args.runs / f"{game}_{source}_{seed}")
     return AtariConfig(game=game, source=name, seed=seed, out=out, overwrite=True, **settings)
 

@@ -167,8 +167,8 @@ def test_every_source_of_a_config_is_made_of_rules_and_trainings() -> None:
         return (source.training, *begin, *sorted(source.settings.items()))
 
     def skills(objective, seen="state"):
-        rest = {"discriminator": seen, "fire": 0.1, "num_skills": 4, "objective": objective}
-        return ("diayn", ("base_steps", 90), *rest.items())
+        rest = {"discriminator": seen, "fire": 0.1, "game_weight": 0.5, "num_skills": 4}
+        return ("diayn", ("base_steps", 90), *rest.items(), ("objective", objective))
 
     def retrained(source, weight):
         settings = {"intrinsic_weight": weight, "option_steps": 20, "round_steps": 50, "rounds": 2}
@@ -188,7 +188,7 @@ def test_every_source_of_a_config_is_made_of_rules_and_trainings() -> None:
         expected[f"diayn_{kind}"] = skills("diayn", kind)
         expected[f"diayn_{kind}_retrained"] = retrained(skills("diayn", kind), 0.1)
     sizes = {"trial_steps": 50, "trial_ratio": 3.0, "num_skills": 4, "skill_base_steps": 90}
-    sizes |= {"rounds": 2, "fire": 0.1, "option_steps": 20}
+    sizes |= {"rounds": 2, "fire": 0.1, "option_steps": 20, "game_weight": 0.5}
     for name, parts in expected.items():
         assert described(make_source(AtariConfig(source=name, **sizes), AtariSearch())) == parts
     with pytest.raises(ValueError, match="best, goals, goals_network.*got 'luck'"):
@@ -313,7 +313,9 @@ def test_trials_of_other_settings_or_a_damaged_file_are_played_again(tmp_path, c
 
 
 @pytest.mark.parametrize(
-    "how", [{}, {"discriminator": "displacement"}, {"objective": "metra"}], ids=str
+    "how",
+    [{}, {"discriminator": "displacement", "game_weight": 1.0}, {"objective": "metra"}],
+    ids=str,
 )
 def test_skills_learned_on_the_ram_become_options(how) -> None:
     sizes = {"num_skills": 2, "base_steps": 128, "hidden": (16,), **SMALL_SKILLS}

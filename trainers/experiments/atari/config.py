@@ -66,6 +66,9 @@ class AtariConfig(RunConfig):
     """Base steps of a learned worker's training before the manager plans."""
     rounds: int = 3
     """Rounds of planning and retraining, of `trial_steps` real base steps at `trial_ratio`."""
+    game_weight: float = 0.0
+    """Weight of the sign of the game's reward in the training of skills before the manager
+    plans."""
     fire: float = 0.0
     """Share of a learned skill's steps in which FIRE is taken, where the game has it."""
     curve_every: int = 0

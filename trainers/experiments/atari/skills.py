@@ -39,6 +39,7 @@ def learn_skills(
     skill_steps: int = 40,
     discriminator: str = "state",
     objective: str = "diayn",
+    game_weight: float = 0.0,
     fire: float = 0.0,
     num_envs: int = 8,
     hidden: Sequence[int] = (128, 128, 128),
@@ -63,7 +64,11 @@ def learn_skills(
                 f"discriminator has nothing to see. Use discriminator='displacement'."
             )
     env, count = kit.make_training_env(
-        num_skills, option_steps=skill_steps, num_envs=num_envs, bytes_seen=bytes_seen
+        num_skills,
+        option_steps=skill_steps,
+        num_envs=num_envs,
+        bytes_seen=bytes_seen,
+        clip_reward=True,
     )
     encoded: SkillObjective | None = None
     if objective == "metra":
@@ -101,7 +106,11 @@ def learn_skills(
         updates_per_batch=8,
         actor_lr=3e-4,
         **SLOW,
-        reward=None if encoded is None else SkillReward(encoded, intrinsic_coeff=_METRA_SCALE),
+        reward=SkillReward(
+            loss.objective,
+            intrinsic_coeff=1.0 if encoded is None else _METRA_SCALE,
+            extrinsic_coeff=game_weight,
+        ),
         seed=kit.seed,
     )
     if kit.curve is not None:

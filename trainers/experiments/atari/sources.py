@@ -61,6 +61,8 @@ class TrainedSource:
             its controllable bytes did.
         objective (str): of ``"diayn"``, ``"metra"`` for METRA's on the RAM instead. Default
             ``"diayn"``.
+        game_weight (float): of ``"diayn"``, weight of the sign of the game's reward beside the
+            objective's. Default 0: none.
         fire (float): of ``"diayn"``, share of the steps in which FIRE is taken, where a game has
             it. Default 0.
         base_steps (int): of training. Default 40,000 for ``"diayn"``, 20,000 for ``"fine_tuned"``.
@@ -139,7 +141,8 @@ def make_source(config: AtariConfig, search: AtariSearch) -> OptionSource:
     else:
         objective, _, seen = name.partition("_")
         skills = {"objective": objective, "discriminator": seen or "state", "fire": config.fire}
-        source = TrainedSource("diayn", num_skills=config.num_skills, **skills, **steps)
+        skills |= {"game_weight": config.game_weight, "num_skills": config.num_skills}
+        source = TrainedSource("diayn", **skills, **steps)
         weight = 0.1
     if not retrained:
         return source
