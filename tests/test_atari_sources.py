@@ -191,7 +191,7 @@ def test_every_source_of_a_config_is_made_of_rules_and_trainings() -> None:
     sizes |= {"rounds": 2, "fire": 0.1, "option_steps": 20, "game_weight": 0.5}
     for name, parts in expected.items():
         assert described(make_source(AtariConfig(source=name, **sizes), AtariSearch())) == parts
-    with pytest.raises(ValueError, match="best, goals, goals_network.*got 'luck'"):
+    with pytest.raises(ValueError, match="best, goals, actions.*got 'luck'"):
         AtariConfig(source="luck")
 
 
