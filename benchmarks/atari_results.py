@@ -1,4 +1,4 @@
-"""Results of Atari runs: Table 5.1 with ours beside it, and scores normalised by humans'.
+"""Results of Atari runs: what is kept of each, and their scores normalised by humans'.
 
     python benchmarks/atari_results.py runs/* --out docs/results/atari
 
@@ -23,7 +23,6 @@ from torchrl_hmcts.trainers.figures.atari_scores import (
     RUNNING,
     TABLE_5_1,
     aggregate,
-    best_baseline,
     best_source,
     human_normalised,
 )
@@ -32,9 +31,10 @@ from torchrl_hmcts.trainers.saving.run_folder import read_curves
 UCT_SOURCE = "primitive actions, UCT"
 BEST = "the best of each game"
 KEPT = (
-    "game", "protocol", "source", "seed", "score_max", "score_final", "score_mean", "episodes",
-    "frames", "base_steps", "options", "option_steps", "c", "frames_finding_options",
-    "frames_tuning", "frames_per_decision", "seconds", "finding", "tuning",
+    "game", "protocol", "source", "acts", "seed", "score_mean", "score_min", "score_max",
+    "score_final", "episodes", "simulated_per_real", "frames", "base_steps", "options",
+    "option_steps", "c", "frames_finding_options", "frames_tuning",
+    "frames_per_decision", "seconds", "finding", "tuning",
 )  # fmt: skip
 SETTINGS = (
     "ratio", "tree_policy", "rollout_options", "gamma", "width_novelty", "leaves_per_wave",
@@ -95,16 +95,6 @@ def add_known(rows: list[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
     return sorted(every, key=lambda row: tuple(map(str, key_of(row))))
 
 
-def print_game(protocol: str, source: str, game: str, runs: list[dict[str, Any]]) -> None:
-    """A row of the table: the runs of a game with one protocol and one source."""
-    best, last = ("/".join(f"{r[k]:g}" for r in runs) for k in ("score_max", "score_final"))
-    frames = "/".join(f"{r['frames'] / 1e6:.2f}M" for r in runs)
-    theirs = f"{TABLE_5_1[game].score} | {best_baseline(game)[1]:g}"
-    print(
-        f"| {protocol} | {source} | {game} | {len(runs)} | {best} | {last} | {frames} | {theirs} |"
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="*")
@@ -125,17 +115,10 @@ def main() -> None:
         for game in TABLE_5_1:
             of = [row for row in ours if (row["game"], row["protocol"]) == (game, protocol)]
             groups[protocol, BEST] += best_source(of)
-    print(
-        "| protocol | options | game | seeds | best episode | last episode | frames, all kinds | "
-        "Table 5.1 | best of Table A.1 |\n|---|---|---|---|---|---|---|---|---|"
-    )
     summary = []
     for (protocol, source), members in sorted(groups.items()):
-        for game in TABLE_5_1:
-            if runs := [row for row in members if row["game"] == game]:
-                print_game(protocol, source, game, runs)
         games = sorted({row["game"] for row in members})
-        for key in ("score_max", "score_final"):
+        for key in ("score_mean", "score_max"):
             scores = [[human_normalised(r, key) for r in members if r["game"] == g] for g in games]
             middle, *interval = (round(value, 3) for value in aggregate(scores))
             row = {"protocol": protocol, "source": source, "of": key, "games": games}

@@ -1,157 +1,97 @@
-"""Where options come from, compared: every source and guide under the same short planned episode.
+"""Learned workers and rules compared: the same budget, search and scored episodes for all.
 
-    python benchmarks/atari_sources.py --games Breakout Pong --out sources.json
+    python benchmarks/atari_sources.py --games Pong Breakout --sources diayn_retrained repeat
 
-A row is a game, a source and a protocol: the score of one episode of at most ``--real-steps`` base
-steps (4 frames each), the frames spent on finding the options and on the episode. Goals are found
-once per game and shared by the sources that begin with them. Rows that the file has already are not
-run again, so that it can be stopped.
+Each game, source and seed is a run of ``hmcts train experiment=atari`` in a folder of its own
+under ``--runs``; one that is finished is not run again, so that it can be stopped. Options are as
+many and as long as in the dissertation's Table 5.1; no setting is chosen by a score. Episodes are
+cut short to make it cheap: compare rows with each other only. With ``--collect`` nothing is run:
+what there is becomes ``learned.json`` and a figure of the learning curves for each game.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import time
-from dataclasses import dataclass, replace
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import torch
+from atari_results import read
 
-from torchrl_hmcts.trainers import (
-    AtariAgent,
-    AtariKit,
-    AtariSearch,
-    Options,
-    RuleSource,
-    SearchGuide,
-    TrainedSource,
-)
+from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
+from torchrl_hmcts.trainers.experiments.atari.run import run_atari
+from torchrl_hmcts.trainers.figures.atari_figures import plot_learning
+from torchrl_hmcts.trainers.figures.atari_scores import TABLE_5_1
 from torchrl_hmcts.trainers.saving.files import write_json
 
-SETTINGS = ("seed", "real_steps", "ratio", "option_steps", "base_steps")
-GUIDES = ("prior", "prior_value")
-PROTOCOLS = ("deterministic", "sticky")
+BUDGET = {
+    "ratio": 10.0, "episodes": 10, "max_episode_frames": 2_000, "skill_base_steps": 20_000,
+    "rounds": 4, "trial_steps": 500, "trial_ratio": 10.0, "num_processes": 0,
+}  # fmt: skip
+CURVE = {"curve_every": 10_000, "curve_steps": 300}
 
 
-@dataclass
-class Once:
-    """A source that is asked once, and gives copies of what it found: weights are not shared."""
-
-    source: Any
-    found: Options | None = None
-    seconds: float = 0.0
-
-    def find(self, kit: AtariKit) -> Options:
-        if self.found is None:
-            begin = time.process_time()
-            self.found = self.source.find(kit)
-            self.seconds = time.process_time() - begin
-        copy = Options.from_plain(self.found.plain())
-        return replace(copy, teacher=self.found.teacher, training=self.found.training)
-
-
-def seconds_spent(source: Any) -> float:
-    """What was spent before on a source and those that it begins with."""
-    if source is None:
-        return 0.0
-    return getattr(source, "seconds", 0.0) + seconds_spent(getattr(source, "source", None))
+def make_config(game: str, source: str, seed: int, args: argparse.Namespace) -> AtariConfig:
+    """The run of a row; "untrained" is a network as it was made."""
+    theirs = TABLE_5_1[game]
+    settings: dict[str, Any] = {**BUDGET, "option_steps": theirs.option_steps}
+    settings["num_skills"] = theirs.num_skills
+    if source == "untrained":
+        settings["skill_base_steps"] = 1
+    elif source in args.curves:
+        settings |= CURVE
+    if source not in ("untrained", "diayn", "diayn_retrained"):
+        settings["fire"] = 0.05  # a rule of ours: the dissertation's worker has none
+    name = "diayn" if source == "untrained" else source.removesuffix("_game")
+    if source.endswith("_game"):  # rewarded by the game, too
+        settings |= {"game_weight": 10.0, "skill_base_steps": 60_000}
+    out = str(args.runs / f"{game}_{source}_{seed}")
+    return AtariConfig(game=game, source=name, seed=seed, out=out, overwrite=True, **settings)
 
 
-def make_sources(steps: int) -> dict[str, Any]:
-    """All sources by name; those of goals share what was found."""
-    goals = Once(RuleSource("goals", trial_steps=300, trial_ratio=5.0))
-    network = Once(TrainedSource("distilled", goals))
-    skills = {"num_skills": 3, "base_steps": steps}
-    diayn = TrainedSource("diayn", **skills)
-    return {
-        "repeat": RuleSource("repeat"),
-        "action_sets": RuleSource("action_sets", trial_steps=300, trial_ratio=5.0),
-        "goals": goals,
-        "goals_network": network,
-        "goals_fine_tuned": TrainedSource("fine_tuned", network, base_steps=steps),
-        "goals_retrained": TrainedSource("retrained", network),
-        "diayn": diayn,
-        "diayn_displacement": TrainedSource("diayn", discriminator="displacement", **skills),
-        "diayn_controllable": TrainedSource("diayn", discriminator="controllable", **skills),
-        "diayn_retrained": TrainedSource("retrained", diayn, intrinsic_weight=0.1),
-        **{f"goals, guide={kind}": goals for kind in GUIDES},
-    }
-
-
-def play(
-    kit: AtariKit, name: str, options: Options, protocol: str, args: argparse.Namespace
-) -> dict[str, Any]:
-    kind = name.partition("guide=")[2]
-    guide = None
-    if kind:
-        values = kind == "prior_value"
-        guide = SearchGuide(options.worker.num_options, values=values, seed=kit.seed)
-    begin = time.process_time()
-    steps, sticky = args.option_steps, protocol == "sticky"
-    agent = AtariAgent(
-        kit.make_pool(options.worker, steps),
-        AtariSearch(ratio=args.ratio),
-        play_in=kit.make_pool(options.worker, steps, sticky=True) if sticky else None,
-        guide=guide,
-        seed=kit.seed,
-    ).play(max_steps=args.real_steps)
-    return {
-        "game": kit.game,
-        "source": name,
-        "protocol": protocol,
-        "seed": kit.seed,
-        "score": agent.score,
-        "real_steps": agent.real_steps,
-        "ended": agent.done,
-        "frames": agent.num_frames,
-        "options_taken": agent.options_taken,
-        "options": options.names,
-        "frames_finding_options": options.num_frames,
-        "cpu_seconds": round(time.process_time() - begin, 1),
-    }
-
-
-def save(args: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
-    settings = {key: getattr(args, key) for key in SETTINGS}
-    words = " ".join(f"--{k.replace('_', '-')} {v}" for k, v in settings.items())
-    games = " ".join(sorted({row["game"] for row in rows}))
-    command = f"python benchmarks/atari_sources.py --games {games} {words}"
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(args.out, {"command": command, **settings, "rows": rows})
+def collect(args: argparse.Namespace) -> None:
+    """Write what there is, and draw the learning curves."""
+    rows = []
+    for folder in sorted(args.runs.iterdir()):
+        if (row := read(folder)) is None:
+            continue
+        rows.append(row)
+        row["source"] = folder.name.removeprefix(row["game"] + "_").rpartition("_")[0]
+        row["learning"] = row.pop("finding").get("learning", {})
+        row["scores"] = [episode["score"] for episode in row.pop("episodes")]
+        del row["curves"], row["tuning"]
+    command = "python benchmarks/atari_sources.py --games Pong Breakout SpaceInvaders"
+    write_json(args.out / "learned.json", {"command": command, "budget": BUDGET, "rows": rows})
+    curves: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        if points := row["learning"].get("rows"):
+            curves[row["game"]][row["source"]].append(points)
+    for game, workers in curves.items():
+        named = {f"{name}, {len(seeds)} seeds": seeds for name, seeds in workers.items()}
+        plot_learning(named, args.out / f"learning_{game}.png", title=game)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--games", nargs="+", default=["Breakout", "Pong"])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--real-steps", type=int, default=900)
-    parser.add_argument("--ratio", type=float, default=25.0)
-    parser.add_argument("--option-steps", type=int, default=10)
-    parser.add_argument("--base-steps", type=int, default=20_000, help="of a worker's training")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--games", nargs="+", default=["Pong", "Breakout", "SpaceInvaders"])
+    parser.add_argument(
+        "--sources", nargs="+",
+        default=["diayn_retrained", "diayn_displacement_retrained",
+                 "diayn_controllable_retrained", "metra_retrained", "untrained", "repeat"],
+    )  # fmt: skip
+    parser.add_argument("--curves", nargs="*", default=["diayn_retrained"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--runs", type=Path, default=Path("runs/atari_sources"))
+    parser.add_argument("--out", type=Path, default=Path("docs/results/atari"))
+    parser.add_argument("--collect", action="store_true")
     args = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = []
-    if args.out is not None and args.out.is_file():
-        rows = json.loads(args.out.read_text())["rows"]
-    for game in args.games:
-        kit = AtariKit(game, num_processes=0, seed=args.seed)
-        for name, source in make_sources(args.base_steps).items():
-            done = {(row["game"], row["source"], row["protocol"]) for row in rows}
-            missing = [p for p in PROTOCOLS if (game, name, p) not in done]
-            if not missing:
-                continue
-            before, begin = seconds_spent(source), time.process_time()
-            options = source.find(kit)
-            seconds = before + time.process_time() - begin
-            for protocol in missing:
-                row = play(kit, name, options, protocol, args)
-                rows.append({**row, "cpu_seconds_finding": round(seconds, 1)})
-                print(rows[-1], flush=True)
-                if args.out is not None:
-                    save(args, rows)
+    for seed in [] if args.collect else args.seeds:
+        for source in args.sources:
+            for game in args.games:
+                config = make_config(game, source, seed, args)
+                if not (Path(config.out) / "metrics.json").is_file():
+                    run_atari(config)
+    collect(args)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from torchrl_hmcts.envs import AtariOptionPool, RepeatActions, SharedMLP
-from torchrl_hmcts.envs.atari.emulator import AtariEmulator
+from torchrl_hmcts.envs.atari.emulator import AtariEmulator, EmulatorSettings
 from torchrl_hmcts.modules import SkillMLP
 from torchrl_hmcts.planners.tree import TreeArrays
 from torchrl_hmcts.trainers import AtariAgent, AtariSearch
@@ -96,7 +96,7 @@ class Agent:
     """Decision after decision: search, take the chosen option, go on from there."""
 
     def __init__(self, game: str, args: argparse.Namespace) -> None:
-        num_actions = AtariEmulator(game).num_actions
+        num_actions = AtariEmulator(EmulatorSettings(game)).num_actions
         worker = SharedMLP(args.options, num_actions)
         network = SkillMLP(128, num_actions, args.options, hidden=(128, 128, 128))
         worker.load(network.parameters())

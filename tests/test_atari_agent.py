@@ -101,6 +101,18 @@ def test_trackers_under_a_small_search_keep_the_ball_in_play() -> None:
     assert player.play(max_steps=300).score >= 8.0  # a random player has 1 or 2
 
 
+def test_the_backup_is_a_setting_of_its_own() -> None:
+    def backup(*words):
+        return AtariSearch(**dict(words)).settings().backup
+
+    assert backup() == "max"
+    assert backup(("tree_policy", "uct")) == "mean"
+    assert backup(("backup", "mean")) == "mean"
+    assert agent(search=AtariSearch(ratio=4.0, backup="mean")).planner.settings.backup == "mean"
+    with pytest.raises(ValueError, match="'max' or 'mean'; got 'sum'"):
+        AtariSearch(backup="sum")
+
+
 def test_uct_explores_in_units_of_the_greatest_reward_from_a_new_tree_on() -> None:
     player = agent(RepeatActions(4), AtariSearch(ratio=4.0, tree_policy="uct", c=2.0)).play(1)
     kept = player.planner.last_search
@@ -113,6 +125,72 @@ def test_uct_explores_in_units_of_the_greatest_reward_from_a_new_tree_on() -> No
 
 
 # ------------------------------------------------------------------------------------ experiment
+
+
+GAMES = ["Breakout", "Qbert", "SpaceInvaders"]
+OTHERS = [
+    pytest.param(g, marks=pytest.mark.slow) for g in ("BeamRider", "Enduro", "Pong", "Seaquest")
+]
+
+
+@pytest.mark.parametrize("game", [*GAMES, *OTHERS])
+def test_no_start_that_is_scored_is_one_that_chooses_and_there_are_a_hundred_of_each(game) -> None:
+    kit = AtariKit(game, num_processes=0)
+    seen = {}
+    for split in ("train", "test"):
+        starts = kit.starts(split, 200)
+        assert kit.starts(split, 3)["emulator_state"].equal(starts["emulator_state"][:3])
+        for key in ("emulator_state", "ram"):
+            seen[split, key] = {row.numpy().tobytes() for row in starts[key]}
+            assert len(seen[split, key]) >= 100  # behaviour too: the RAM differs
+    assert not seen["train", "emulator_state"] & seen["test", "emulator_state"]
+    assert not seen["train", "ram"] & seen["test", "ram"]
+
+
+@pytest.mark.parametrize("protocol", ["deterministic", "sticky"])
+def test_trials_and_training_begin_in_one_split_and_scored_episodes_in_the_other(
+    tmp_path, monkeypatch, protocol
+) -> None:
+    config = AtariConfig(
+        game="Pong", frames=1_000, episodes=1, max_episode_frames=400, source="diayn_retrained",
+        tune_trials=1, trial_steps=6, trial_ratio=1.0, rounds=1, skill_base_steps=64, ratio=1.0,
+        num_processes=0, out=str(tmp_path), seed=4, protocol=protocol, curve_every=64,
+        curve_steps=10, curve_episodes=2,
+    )  # fmt: skip
+    splits: list[tuple[str, int]] = []
+    real = AtariOptionPool._reset
+
+    def reset(self, tensordict=None, **kwargs):
+        out = real(self, tensordict, **kwargs)
+        if not kwargs.get("set_state"):
+            frames = int(out["episode_frame"].flatten()[0])
+            splits.append(("train" if frames % 2 else "test", frames))
+        return out
+
+    monkeypatch.setattr(AtariOptionPool, "_reset", reset)
+    run = played(config)
+    # curve: untrained, trained, retrained (two episodes each); the round; a trial; the episode
+    found = "".join(split[1] for split, _ in splits)
+    assert found == "eeeereere"
+    assert [row["samples"] for row in run.learning][:2] == [0, 64]
+    assert run.learning[-1]["samples"] > 64
+    assert run.figures()["acts"] == "network"
+    assert run.figures()["score_min"] == run.figures()["score_mean"] == run.scores[0]["score"]
+
+
+def test_the_number_of_skills_is_searched_for_as_in_the_dissertation(tmp_path, monkeypatch) -> None:
+    config = AtariConfig(
+        game="Pong", frames=1_000, source="diayn", num_skills=0, trial_steps=3, trial_ratio=1.0,
+        skill_base_steps=64, ratio=1.0, num_processes=0, out=str(tmp_path), max_episode_frames=400,
+    )  # fmt: skip
+    run = AtariRun(config)
+    run._find_options()
+    tried = sorted((row["num_skills"], row["option_steps"]) for row in run.tuned.trials)
+    assert tried == [(k, n) for k in (3, 4, 5) for n in (10, 20, 30)]
+    best = max(run.tuned.trials, key=lambda row: (row["score"], row["real_steps"]))
+    assert len(run.options.names) == best["num_skills"]
+    assert run.tuned.option_steps == best["option_steps"]
+    assert run.num_frames == run.options.num_frames + run.tuned.num_frames > 3 * 4 * 64
 
 
 def test_a_short_run_of_two_processes_leaves_its_figures(tmp_path) -> None:
@@ -164,8 +242,7 @@ def test_the_gif_is_the_episode_that_scored(tmp_path, protocol) -> None:
     best = run.best["episode"]
     assert run.scores[best]["score"] == run.best["score"] == max(r["score"] for r in run.scores)
     assert len(run.best["decisions"]) == run.scores[best]["decisions"]
-    sticky, steps = protocol == "sticky", run.tuned.option_steps
-    recorder = run.kit.make_pool(run.options.worker, steps, record=True, sticky=sticky)
+    sticky, recorder = protocol == "sticky", run.make_player(record=True)
     recorder.set_seed(run.kit.start_seed(best, sticky=sticky))
     shown, score = write_atari_gif(
         recorder, run.best["decisions"], tmp_path / "episode.gif", real_steps=10**6

@@ -15,7 +15,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv  # noqa: E402
 from torchrl.envs.utils import check_env_specs  # noqa: E402
 
 from torchrl_hmcts.envs import AtariRAMEnv  # noqa: E402
-from torchrl_hmcts.envs.atari.emulator import AtariEmulator, find_game  # noqa: E402
+from torchrl_hmcts.envs.atari.emulator import AtariEmulator, EmulatorSettings, find_game  # noqa: E402
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget  # noqa: E402
 from torchrl_hmcts.transforms import OptionTransform  # noqa: E402
 
@@ -35,15 +35,17 @@ def played(env, steps, seed=0):
     return taken
 
 
-@pytest.mark.parametrize("sticky", [0.0, 0.25])
+@pytest.mark.parametrize(("sticky", "skip"), [(0.0, 4), (0.25, 4), (0.25, (2, 5))])
 @pytest.mark.parametrize("game", ["Breakout", "SpaceInvaders", "Qbert"])
-def test_the_same_seed_gives_the_trajectory_of_gymnasiums_env(game, sticky):
+def test_the_same_seed_gives_the_trajectory_of_gymnasiums_env(game, sticky, skip):
     import ale_py
     import gymnasium
 
     gymnasium.register_envs(ale_py)
-    theirs = gymnasium.make(f"ALE/{game}-v5", obs_type="ram", repeat_action_probability=sticky)
-    ours = AtariRAMEnv(game, repeat_action_probability=sticky, noop_max=0)
+    theirs = gymnasium.make(
+        f"ALE/{game}-v5", obs_type="ram", repeat_action_probability=sticky, frameskip=skip
+    )
+    ours = AtariRAMEnv(game, repeat_action_probability=sticky, frame_skip=skip, noop_max=0)
     assert ours.action_names == theirs.unwrapped.get_action_meanings()
     ours.set_seed(7)
     seen, _ = theirs.reset(seed=7)
@@ -80,7 +82,7 @@ def test_without_sticky_actions_episodes_begin_with_random_no_ops():
     assert len(frames) > 3
     assert min(frames) >= 1
     assert max(frames) <= 30
-    assert AtariRAMEnv("Breakout").noop_max == 0
+    assert not AtariRAMEnv("Breakout").settings.noops
 
 
 @pytest.mark.parametrize("game", GAMES)
@@ -106,7 +108,8 @@ def test_a_plain_restore_of_qbert_goes_on_differently():
     truth.setFloat("repeat_action_probability", 0.0)
     truth.loadROM(ale_py.roms.get_rom_path("qbert"))
     truth.reset_game()
-    bare, cured = (AtariEmulator("Qbert", repeat_action_probability=0.0) for _ in range(2))
+    settings = EmulatorSettings("Qbert", repeat_action_probability=0.0)
+    bare, cured = AtariEmulator(settings), AtariEmulator(settings)
     for emulator in (bare, cured):  # play, so that they are in another condition
         for _ in range(3):
             emulator.act(1)
@@ -127,9 +130,17 @@ def test_a_plain_restore_of_qbert_goes_on_differently():
         assert wrong_bare > 0
 
 
-def test_with_the_random_generator_sticky_actions_repeat_too():
-    env = AtariRAMEnv("Seaquest", repeat_action_probability=0.5, include_rng=True, seed=0)
-    other = AtariRAMEnv("Seaquest", repeat_action_probability=0.5, include_rng=True, seed=5)
+@pytest.mark.parametrize(
+    "drawn",
+    [
+        {"repeat_action_probability": 0.5},
+        {"repeat_action_probability": 0.0, "frame_skip": (2, 5)},
+        {"repeat_action_probability": 0.5, "frame_skip": (2, 5)},
+    ],
+)
+def test_with_the_random_generators_what_is_drawn_repeats_too(drawn):
+    env = AtariRAMEnv("Seaquest", include_rng=True, seed=0, **drawn)
+    other = AtariRAMEnv("Seaquest", include_rng=True, seed=5, **drawn)
     taken = played(env, 60)
     for begin in range(0, len(taken) - 10, 5):
         td = other.reset(taken[begin].exclude("next"), set_state=True)
@@ -138,8 +149,10 @@ def test_with_the_random_generator_sticky_actions_repeat_too():
         assert td["emulator_state"].equal(step["next", "emulator_state"])
 
 
-def test_without_the_random_generator_the_coming_draws_are_others():
-    env = AtariRAMEnv("Seaquest", repeat_action_probability=0.5, seed=0)
+@pytest.mark.parametrize("drawn", [(0.5, 4), (0.0, (2, 5))])
+def test_without_the_random_generators_the_coming_draws_are_others(drawn):
+    sticky, skip = drawn
+    env = AtariRAMEnv("Seaquest", repeat_action_probability=sticky, frame_skip=skip, seed=0)
     taken = played(env, 40)
     ends = set()
     for _ in range(6):
@@ -150,9 +163,18 @@ def test_without_the_random_generator_the_coming_draws_are_others():
     assert len(ends) > 1
 
 
-def test_specs_hold_and_batches_of_envs_work():
+def test_a_drawn_frame_skip_is_uniform_without_its_end() -> None:
+    env = AtariRAMEnv("Pong", frame_skip=(2, 5), seed=0)
+    frames = [t["next", "episode_frame"] - t["episode_frame"] for t in played(env, 300)]
+    counts = torch.cat(frames).bincount()
+    assert counts.sum() == counts[2:5].sum() == 300
+    assert counts[2:5].min() > 70  # 100 each expected
+
+
+@pytest.mark.parametrize("skip", [4, (2, 5)])
+def test_specs_hold_and_batches_of_envs_work(skip):
     def make():
-        return AtariRAMEnv("Pong", include_rng=True, seed=0)
+        return AtariRAMEnv("Pong", include_rng=True, frame_skip=skip, seed=0)
 
     check_env_specs(make(), seed=0)
     serial = SerialEnv(2, make)
@@ -246,6 +268,9 @@ def test_an_unknown_game_names_the_nearest_ones():
     ("keywords", "message"),
     [
         ({"frame_skip": 0}, "frame_skip >= 1; got 0"),
+        ({"frame_skip": (5, 2)}, r"the second, which is excluded; got \(5, 2\)"),
+        ({"noop_max": range(0)}, r"numbers from 0 on; got range\(0, 0\)"),
+        ({"start_actions": -1}, "start_actions >= 0; got -1"),
         ({"repeat_action_probability": 1.0}, "repeat_action_probability .*<= 0.999.*got 1.0"),
         ({"mode": 99}, "mode is one of"),
         ({"reward_clip": 0.0}, "reward_clip"),
@@ -292,9 +317,11 @@ def test_more_frames_than_the_emulator_can_count_are_no_limit() -> None:
     assert not env.rollout(3)["next", "truncated"].any()
 
 
-@pytest.mark.parametrize("sticky", [0.0, 0.25])
-def test_a_pickled_env_plays_on_as_the_env(sticky: float) -> None:
-    env = AtariRAMEnv("Breakout", repeat_action_probability=sticky, noop_max=0, seed=0)
+@pytest.mark.parametrize(("sticky", "skip"), [(0.0, 4), (0.25, 4), (0.25, (2, 5))])
+def test_a_pickled_env_plays_on_as_the_env(sticky: float, skip: int | tuple[int, int]) -> None:
+    env = AtariRAMEnv(
+        "Breakout", repeat_action_probability=sticky, frame_skip=skip, noop_max=0, seed=0
+    )
     td = env.rollout(10)["next"][-1]
     other = pickle.loads(pickle.dumps(env))
     for _ in range(20):

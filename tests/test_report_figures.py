@@ -33,7 +33,7 @@ def write_json(path: Path, content: object) -> None:
 def write_atari(path: Path, game: str, seed: int, protocol: str = "deterministic") -> str:
     config = {"seed": seed, "out": "x"}
     write_json(path / "run.json", {"experiment": "atari", "config": config})
-    scores = {"score_max": 100.0 + seed, "score_final": 50.0 + 10 * seed, "frames": 4_000}
+    scores = {"score_max": 100.0 + seed, "score_mean": 50.0 + 10 * seed, "frames": 4_000}
     write_json(path / "metrics.json", {"game": game, "protocol": protocol, "seed": seed, **scores})
     rows = [f"{t},{n},{t / 100 + seed}" for t in (0, 500, 1_000) for n in ("score", "score_max")]
     (path / "curves.csv").write_text("step,name,value\n" + "\n".join(rows) + "\n")
@@ -129,7 +129,7 @@ def test_scores_of_a_game_are_drawn_from_runs_and_from_results(tmp_path, capsys)
     assert main(["report", "figure=5.2", *runs, f"out={tmp_path}/a"]) == 0
     assert main(["report", "figure=5.4", *runs, f"out={tmp_path}/a"]) == 1
     curve = {"step": [0, 1_000], "value": [0.0, 3.0]}
-    row = {"game": "Pong", "protocol": "sticky", "seed": 0, "score_max": 3.0, "score_final": 1.0}
+    row = {"game": "Pong", "protocol": "sticky", "seed": 0, "score_max": 3.0, "score_mean": 1.0}
     row["curves"] = {"score": curve, "score_max": curve}
     write_json(tmp_path / "results" / "atari" / "pong.json", [row])
     words = [f"results={tmp_path}/results", f"out={tmp_path}/b"]
@@ -143,21 +143,21 @@ def test_table_5_1_has_ours_beside_the_sources_and_the_baselines(tmp_path) -> No
     runs.append(write_atari(tmp_path / "sticky", "Breakout", 0, "sticky"))
     assert main(["report", "figure=table5.1", *runs, f"out={tmp_path}"]) == 0
     lines = (tmp_path / "table5.1.md").read_text().splitlines()
-    assert "ours, deterministic: highest" in lines[0]
-    assert "ours, sticky: highest" in lines[0]
+    assert "ours, deterministic: mean" in lines[0]
+    assert "ours, sticky: mean" in lines[0]
     (breakout,) = (line for line in lines if line.startswith("| Breakout"))
     cells = [cell.strip() for cell in breakout.strip("|").split("|")]
-    assert cells[:5] == ["Breakout", "464", "3, 30", "131.5 deepq", "102"]
-    assert cells[5].startswith("60 50 to 70")  # 50, 60, 70
-    assert cells[6] == "3"
+    assert cells[:4] == ["Breakout", "464", "3, 30", "131.5 deepq"]
+    assert cells[4].startswith("60 50 to 70")  # 50, 60, 70
+    assert cells[5:8] == ["100 to 102", "rules", "3"]
     page = (tmp_path / "table5.1.html").read_text()
     assert "Table A.1" in page
     assert "trpo_mpi" in page
     # (60 - 1.7) / (30.5 - 1.7), the mean of three seeds, beside one seed under sticky actions
     rows = [re.sub("<[^>]+>", " ", row).split() for row in page.split("</tr>")]
-    assert [row for row in rows if "final" in row] == [
-        ["deterministic", "final", "2.02", "1.68", "to", "2.37", "1"],
-        ["sticky", "final", "1.68", "a", "game", "has", "one", "seed", "1"],
+    assert [row for row in rows if row[1:2] == ["mean"]] == [
+        ["deterministic", "mean", "2.02", "1.68", "to", "2.37", "1"],
+        ["sticky", "mean", "1.68", "a", "game", "has", "one", "seed", "1"],
     ]
 
 

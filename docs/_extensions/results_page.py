@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from results_atari import ATARI, atari, best, sources
+from results_atari import ATARI, atari, best, learned
 from results_reliability import RELIABILITY
 from results_tables import SECTIONS, Section, table
 
@@ -66,7 +66,7 @@ def commands(readme: str) -> dict[str, str]:
 _ATARI = {
     "Atari": (
         Section("Seven games", "atari/runs.json", atari),
-        Section("Where options come from", "atari/sources.json", sources),
+        Section("Learned workers", "atari/learned.json", learned),
     )
 }
 

@@ -10,6 +10,8 @@ action that is held where actions are sticky: it is sent, in a frame of its own,
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,76 +19,109 @@ import numpy as np
 from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.envs.atari.states import EmulatorStates
 
+NO_OP_STARTS = 30
+"""Most frames of doing nothing at the beginning, where nothing else differs between episodes."""
 _NO_OP = 0
+_SKIP_BYTES = (16, 16, 4, 1)  # of the parts of the generator that draws the frames of a step
+
+
+@dataclass(frozen=True)
+class EmulatorSettings:
+    """What an emulator is set to: checked once, taken whole by all that have one.
+
+    Args:
+        game (str): as in Gymnasium, ``"SpaceInvaders"``; ``"space_invaders"`` and
+            ``"ALE/SpaceInvaders-v5"`` are understood.
+        noop_max, start_actions and all others: as in :class:`AtariRAMEnv`.
+
+    Raises:
+        ValueError: if there is no such game, or an argument is out of range.
+    """
+
+    game: str
+    frame_skip: int | tuple[int, int] = 4
+    repeat_action_probability: float = 0.25
+    full_action_space: bool = False
+    noop_max: int | range | None = None
+    start_actions: int = 0
+    max_frames: int = 108_000
+    mode: int | None = None
+    difficulty: int | None = None
+
+    def __post_init__(self) -> None:
+        name, skip = find_game(self.game)[0], self.frame_skip
+        if isinstance(skip, Sequence) and not isinstance(skip, str):
+            if len(skip) != 2 or not 1 <= skip[0] < skip[1]:
+                raise ValueError(
+                    f"{name}: a frame_skip of two numbers is drawn from the first, at least 1, up "
+                    f"to the second, which is excluded; got {tuple(skip)}. E.g. (2, 5)."
+                )
+            for number in skip:
+                whole_number(name, "frame_skip", number, least=1)
+            object.__setattr__(self, "frame_skip", tuple(skip))
+        else:
+            whole_number(name, "frame_skip", skip, least=1)
+        if isinstance(self.noop_max, range):
+            if not self.noop_max or min(self.noop_max) < 0:
+                raise ValueError(f"{name}: noop_max has numbers from 0 on; got {self.noop_max}.")
+        elif self.noop_max is not None:
+            whole_number(name, "noop_max", self.noop_max)
+        whole_number(name, "start_actions", self.start_actions)
+        whole_number(name, "max_frames", self.max_frames, least=1)
+        probability = "repeat_action_probability"
+        real_number(name, probability, self.repeat_action_probability, least=0.0, most=0.999)
+
+    @property
+    def sticky(self) -> bool:
+        """Whether actions stick."""
+        return self.repeat_action_probability > 0.0
+
+    @property
+    def noops(self) -> range:
+        """Numbers of frames of doing nothing, of which an episode's is drawn; empty for none."""
+        if isinstance(self.noop_max, range):
+            return self.noop_max
+        most = self.noop_max
+        if most is None:
+            most = 0 if self.sticky else NO_OP_STARTS
+        return range(1, most + 1)
 
 
 class AtariEmulator:
     """One emulator, stepped by action indices, whose state can be read and set.
 
     Args:
-        game (str): as in Gymnasium, ``"SpaceInvaders"``; ``"space_invaders"`` and
-            ``"ALE/SpaceInvaders-v5"`` are understood.
-        frame_skip (int): frames per step, all with the same action. Default 4.
-        repeat_action_probability (float): of each frame, to repeat the action held before instead
-            of the one that was sent. Default 0.25.
-        full_action_space (bool): all 18 actions instead of those that the game has. Default False.
-        max_frames (int): frames of an episode, after which it is truncated. Default 108,000, half
-            an hour.
-        mode, difficulty (int, optional): the console's switches. Default: the game's.
-        noop_max (int): most frames of doing nothing at the beginning of an episode. Default 0.
+        settings (EmulatorSettings): the game, and how it is played.
 
     Raises:
         ImportError: if ale-py is not installed.
-        ValueError: if there is no such game, or an argument is out of range.
+        ValueError: if the game has not such a mode or difficulty.
         OSError: if the game's file is missing or damaged.
     """
 
-    def __init__(
-        self,
-        game: str,
-        *,
-        frame_skip: int = 4,
-        repeat_action_probability: float = 0.25,
-        full_action_space: bool = False,
-        max_frames: int = 108_000,
-        mode: int | None = None,
-        difficulty: int | None = None,
-        noop_max: int = 0,
-    ) -> None:
+    def __init__(self, settings: EmulatorSettings) -> None:
         ale_py = _import_ale()
-        self._config = {
-            "game": game,
-            "frame_skip": frame_skip,
-            "repeat_action_probability": repeat_action_probability,
-            "full_action_space": full_action_space,
-            "max_frames": max_frames,
-            "mode": mode,
-            "difficulty": difficulty,
-            "noop_max": noop_max,
-        }
-        self.game, rom = find_game(game)
-        self.frame_skip = whole_number(self.game, "frame_skip", frame_skip, least=1)
-        self.noop_max = whole_number(self.game, "noop_max", noop_max)
-        max_frames = min(whole_number(self.game, "max_frames", max_frames, least=1), 2**31 - 1)
-        name = "repeat_action_probability"
-        sticky = real_number(self.game, name, repeat_action_probability, least=0.0, most=0.999)
-        self.sticky = sticky > 0.0
+        self.settings = settings
+        self.game, rom = find_game(settings.game)
+        self.frame_skip, self.noops = settings.frame_skip, settings.noops
+        self.sticky, full = settings.sticky, settings.full_action_space
         # ALE keeps the probability in single precision, and compares it with a double.
-        self._probability = float(np.float32(sticky))
+        self._probability = float(np.float32(settings.repeat_action_probability))
+        self._skips: np.random.Generator | None = None  # draws the frames of a step
+        if isinstance(self.frame_skip, tuple):
+            self._skips = np.random.default_rng(0)
         self._state_type = ale_py.ALEState
         ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
         self.ale = ale_py.ALEInterface()
-        self.ale.setFloat("repeat_action_probability", repeat_action_probability)
-        self.ale.setInt("max_num_frames_per_episode", max_frames)
+        self.ale.setFloat("repeat_action_probability", settings.repeat_action_probability)
+        self.ale.setInt("max_num_frames_per_episode", min(settings.max_frames, 2**31 - 1))
         self.num_frames = 0
         """Frames emulated since construction, also those that set a state."""
         self.ale.setInt("random_seed", 0)
         self.ale.loadROM(_rom_path(rom))
-        self._set_switches(mode, difficulty)
+        self._set_switches(settings.mode, settings.difficulty)
         self.ale.reset_game()
-        actions = (
-            self.ale.getLegalActionSet() if full_action_space else self.ale.getMinimalActionSet()
-        )
+        actions = self.ale.getLegalActionSet() if full else self.ale.getMinimalActionSet()
         self._actions = [int(action.value) for action in actions]
         self.action_names = [str(action.name) for action in actions]
         """Names of the actions, e.g. ``"RIGHTFIRE"``."""
@@ -112,10 +147,10 @@ class AtariEmulator:
 
     def __getstate__(self) -> dict[str, Any]:
         row = self.state(include_rng=True)
-        return {"config": self._config, "row": row, "num_frames": self.num_frames}
+        return {"settings": self.settings, "row": row, "num_frames": self.num_frames}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state["config"])  # type: ignore[misc]
+        self.__init__(state["settings"])  # type: ignore[misc]
         self.set_state(state["row"])
         self.num_frames = state["num_frames"]
 
@@ -134,13 +169,14 @@ class AtariEmulator:
     # ---------------------------------------------------------------- playing
 
     def reset(self, generator: np.random.Generator, seed: int | None = None) -> None:
-        """Begin an episode, with up to ``noop_max`` frames of doing nothing.
+        """Begin an episode, with some frames of doing nothing and some random actions.
 
         The state is that of a console just switched on, which later resets of ALE do not give in
         all games.
 
         Args:
-            generator: draws the seed, and the number of frames.
+            generator: draws the seed, the number of frames and the actions, and from then on the
+                frames of a step where these vary.
             seed: of the emulator, 32 bits. Default: drawn.
         """
         while True:
@@ -149,16 +185,19 @@ class AtariEmulator:
             key = np.random.RandomState(seed & 0xFFFFFFFF).get_state(legacy=False)["state"]
             rng = np.append(key["key"], np.uint32(key["pos"])).astype(np.uint32)
             self._restore(self._first, rng if self.sticky else None)
-            if not self.noop_max:
-                return
-            for _ in range(int(generator.integers(1, self.noop_max + 1))):
-                self._frame(_NO_OP)
+            if self._skips is not None:
+                self._skips = generator
+            if self.noops:
+                for _ in range(self.noops[int(generator.integers(len(self.noops)))]):
+                    self._frame(_NO_OP)
+            for _ in range(self.settings.start_actions):
+                self.act(int(generator.integers(self.num_actions)))
             if not self.ale.game_over():
                 return
             seed = None
 
     def act(self, action: int) -> tuple[int, int]:
-        """Take an action, by its index, for ``frame_skip`` frames.
+        """Take an action, by its index, for ``frame_skip`` frames, or as many as are drawn.
 
         Returns:
             The game's reward, and the lives that were lost.
@@ -169,7 +208,7 @@ class AtariEmulator:
             )
         ale, code = self.ale, self._actions[action]
         lives, reward, frames = ale.lives(), 0, 0
-        for _ in range(self.frame_skip):
+        for _ in range(self._frames_of_step()):
             if self.sticky:
                 self._stick(code)
             reward += ale.act(code)
@@ -179,6 +218,10 @@ class AtariEmulator:
         self._moved(code, frames)
         lost = lives - ale.lives()
         return reward, lost if lost > 0 else 0
+
+    def _frames_of_step(self) -> int:
+        skip = self.frame_skip
+        return skip if isinstance(skip, int) else int(self._skips.integers(*skip))  # type: ignore[union-attr]
 
     def _frame(self, code: int) -> None:
         if self.sticky:
@@ -199,10 +242,15 @@ class AtariEmulator:
 
     # ---------------------------------------------------------------- state
 
-    def state(self, *, include_rng: bool = False) -> np.ndarray:
-        """Return the state, uint8 ``[states.width]``, with the generator ``[width_with_rng]``.
+    @property
+    def width_with_rng(self) -> int:
+        """Bytes of a state with all random generators."""
+        return self.states.width_with_rng + (0 if self._skips is None else sum(_SKIP_BYTES))
 
-        With the generator, the held action is the true one; without, the one that was sent last,
+    def state(self, *, include_rng: bool = False) -> np.ndarray:
+        """Return the state, uint8 ``[states.width]``, with the generators ``[width_with_rng]``.
+
+        With the generators, the held action is the true one; without, the one that was sent last,
         which is all that an agent can know.
         """
         raw = self._serialize()
@@ -210,21 +258,44 @@ class AtariEmulator:
         if not include_rng:
             return self.states.encode(raw, self._sent)
         rng = EmulatorStates.rng_of(self._serialize(include_rng=True))
-        return self.states.encode(raw, self._held if self.sticky else self._sent, rng)
+        row = self.states.encode(raw, self._held if self.sticky else self._sent, rng)
+        if self._skips is None:
+            return row
+        state = self._skips.bit_generator.state
+        words = (*state["state"].values(), state["uinteger"], state["has_uint32"])
+        text = b"".join(
+            n.to_bytes(size, "little") for n, size in zip(words, _SKIP_BYTES, strict=True)
+        )
+        return np.concatenate([row, np.frombuffer(text, np.uint8)])
 
     def set_state(self, row: np.ndarray, seed: int | None = None) -> None:
         """Continue from a state.
 
         Args:
             row: as :meth:`state` returned it, of this or another emulator of the game.
-            seed: of ALE's generator from here on. Default: what is in the row, or else the
-                generator continues where it stands.
+            seed: of the generators from here on. Default: what is in the row, or else the
+                generators continue where they stand.
         """
+        if self._skips is not None:
+            row = self._set_skips(row, seed)
         rng = self.states.rng(row)
         if self.sticky and seed is not None:
             key: Any = np.random.MT19937(seed).state["state"]
             rng = np.append(key["key"], np.uint32(key["pos"])).astype(np.uint32)
         self._restore(row, rng)
+
+    def _set_skips(self, row: np.ndarray, seed: int | None) -> np.ndarray:
+        """Set what draws the frames of a step to a seed or a row; return the rest of the row."""
+        if len(row) == self.width_with_rng:
+            cuts = np.split(row[self.states.width_with_rng :], np.cumsum(_SKIP_BYTES[:-1]))
+            state, inc, uinteger, has = (int.from_bytes(cut.tobytes(), "little") for cut in cuts)
+            words: Any = {"state": {"state": state, "inc": inc}, "uinteger": uinteger}
+            self._skips = np.random.Generator(np.random.PCG64())
+            self._skips.bit_generator.state = {"bit_generator": "PCG64", "has_uint32": has} | words
+            row = row[: self.states.width_with_rng]
+        if seed is not None:
+            self._skips = np.random.default_rng(seed)
+        return row
 
     def _restore(self, row: np.ndarray, rng: np.ndarray | None) -> None:
         raw, held = self.states.decode(row), self.states.held(row)
@@ -290,8 +361,8 @@ class AtariEmulator:
         A state has no picture: it is that of one frame later, in which nothing is done.
         """
         if self._drawing is None:
-            config: Any = {**self._config, "frame_skip": 1, "repeat_action_probability": 0.0}
-            self._drawing = AtariEmulator(**config)
+            plain = replace(self.settings, frame_skip=1, repeat_action_probability=0.0)
+            self._drawing = AtariEmulator(plain)
         self._drawing.set_state(row)
         self._drawing.act(0)
         return self._drawing.screen()

@@ -13,8 +13,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_hmcts.checks import real_number, whole_number
-from torchrl_hmcts.envs.atari.emulator import AtariEmulator
-from torchrl_hmcts.envs.atari.ram import no_op_starts
+from torchrl_hmcts.envs.atari.emulator import AtariEmulator, EmulatorSettings
 from torchrl_hmcts.envs.gym.option_run import OptionRun, OptionWorker
 from torchrl_hmcts.envs.gym.process_pool import ProcessPool
 
@@ -25,13 +24,13 @@ class AtariRun(OptionRun):
     """Runs options on an emulator.
 
     Args:
-        config: keywords of :class:`AtariEmulator`.
+        settings: of the emulator.
         worker, max_steps, gamma, end_on_life_loss, record: as in :class:`AtariOptionPool`.
     """
 
     def __init__(
         self,
-        config: dict[str, Any],
+        settings: EmulatorSettings,
         worker: OptionWorker,
         max_steps: int,
         gamma: float,
@@ -39,8 +38,8 @@ class AtariRun(OptionRun):
         record: bool,
     ) -> None:
         super().__init__(worker, max_steps, gamma)
-        self.arguments = (config, worker, max_steps, gamma, end_on_life_loss, record)
-        self.emulator = AtariEmulator(**config)
+        self.arguments = (settings, worker, max_steps, gamma, end_on_life_loss, record)
+        self.emulator = AtariEmulator(settings)
         self.record = record
         if end_on_life_loss:
             self.ends = self._ends_with_a_life
@@ -178,13 +177,15 @@ class AtariOptionPool(ProcessPool):
             128]``, before each action), ``"inner_action"`` (int64 ``[*B, T]``) and
             ``"inner_reward"`` (float32 ``[*B, T]``); of them the first ``duration`` have a meaning.
             Default False.
-        frame_skip, full_action_space, max_frames, mode, difficulty, noop_max, read_outs: as in
-            :class:`AtariRAMEnv`.
-        repeat_action_probability (float): Default 0, for planning. To play under sticky actions
-            make another pool with 0.25 and a seed that the planner does not know.
+        read_outs: as in :class:`AtariRAMEnv`.
         start_method, step_seconds: as in :class:`OptionPool`.
         batch_size (sequence of int): of ``reset()`` without a tensordict. Default none.
         seed (int, optional): of starts and of the draws inside options.
+        **emulator: ``frame_skip``, ``repeat_action_probability``, ``full_action_space``,
+            ``noop_max``, ``start_actions``, ``max_frames``, ``mode`` and ``difficulty``, as in
+            :class:`AtariRAMEnv`. Here ``repeat_action_probability`` is 0 by default, for planning.
+            To play under sticky actions make another pool with 0.25 and a seed that the planner
+            does not know.
 
     Raises:
         ImportError: if ale-py is not installed.
@@ -225,33 +226,18 @@ class AtariOptionPool(ProcessPool):
         end_on_life_loss: bool = False,
         determinised: bool = True,
         record: bool = False,
-        frame_skip: int = 4,
-        repeat_action_probability: float = 0.0,
-        full_action_space: bool = False,
-        noop_max: int | None = None,
-        max_frames: int = 108_000,
-        mode: int | None = None,
-        difficulty: int | None = None,
         read_outs: Sequence[str] = ("ram", "observation"),
         start_method: Literal["forkserver", "spawn"] = "forkserver",
         step_seconds: float = 60.0,
         batch_size: Sequence[int] = (),
         seed: int | None = None,
+        **emulator: Any,
     ) -> None:
         name = "AtariOptionPool"
         max_steps = whole_number(name, "max_steps", max_steps, least=1)
-        config = {
-            "game": game,
-            "frame_skip": frame_skip,
-            "repeat_action_probability": repeat_action_probability,
-            "full_action_space": full_action_space,
-            "max_frames": max_frames,
-            "mode": mode,
-            "difficulty": difficulty,
-            "noop_max": no_op_starts(noop_max, repeat_action_probability),
-        }
+        settings = EmulatorSettings(game, **{"repeat_action_probability": 0.0, **emulator})
         gamma = real_number(name, "gamma", gamma, above=0.0, most=1.0)
-        run = AtariRun(config, worker, max_steps, gamma, bool(end_on_life_loss), bool(record))
+        run = AtariRun(settings, worker, max_steps, gamma, bool(end_on_life_loss), bool(record))
         self._read_outs = tuple(read_outs)
         self.life_loss_penalty = real_number(name, "life_loss_penalty", life_loss_penalty)
         super().__init__(
@@ -264,7 +250,12 @@ class AtariOptionPool(ProcessPool):
             seed=seed,
         )
         self.game, self.action_names = run.emulator.game, run.emulator.action_names
-        self.frame_skip = frame_skip
+
+    @property
+    def frame_skip(self) -> int | tuple[int, int]:
+        """Frames per step."""
+        run: Any = self._run
+        return run.emulator.settings.frame_skip  # type: ignore[no-any-return]
 
     @property
     def num_frames(self) -> int:

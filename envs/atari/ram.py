@@ -12,17 +12,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.checks import real_number
-from torchrl_hmcts.envs.atari.emulator import AtariEmulator
-
-NO_OP_STARTS = 30
-"""Most frames of doing nothing at the beginning, where nothing else differs between episodes."""
-
-
-def no_op_starts(noop_max: int | None, repeat_action_probability: float) -> int:
-    """Return ``noop_max``, by default none where actions are sticky, as in Gymnasium."""
-    if noop_max is not None:
-        return noop_max
-    return 0 if repeat_action_probability > 0.0 else NO_OP_STARTS
+from torchrl_hmcts.envs.atari.emulator import AtariEmulator, EmulatorSettings
 
 
 class AtariRAMEnv(EnvBase):
@@ -36,23 +26,29 @@ class AtariRAMEnv(EnvBase):
     one before.
 
     ``reset(td, set_state=True)`` continues from the state in ``td``, also of another env of
-    the same game: exactly, where ``repeat_action_probability`` is 0 or the state has the random
-    generator (``include_rng=True``). Without it, which is what a planner may be given of a
+    the same game: exactly, where nothing is drawn or the state has the random generators
+    (``include_rng=True``). Without it, which is what a planner may be given of a
     game with sticky actions, the coming draws are others.
 
     Writes ``"ram"`` (uint8 ``[128]``), ``"observation"`` (float32 ``[128]``, RAM / 255),
     ``"lives"`` and ``"episode_frame"`` (int64 ``[1]``), and ``"emulator_state"`` (uint8 ``[about
-    530]``, 2,498 more with the generator). Attributes: ``num_frames``, all frames emulated so far;
-    ``action_names``.
+    530]``, 2,498 more with the generator, and 37 where ``frame_skip`` is drawn).
+    Attributes: ``num_frames``, all frames emulated so far; ``action_names``; ``settings``.
 
     Args:
         game (str): e.g. ``"Breakout"`` or ``"SpaceInvaders"``.
-        frame_skip (int): frames per step. Default 4, as in Gymnasium; planning papers use 5.
+        frame_skip (int or pair of int): frames per step. Default 4, as in Gymnasium; planning
+            papers use 5. Of a pair ``(low, high)`` each step's number is drawn, ``high``
+            excluded, as in Gymnasium: then a state is continued exactly only with
+            ``include_rng=True``.
         repeat_action_probability (float): Default 0.25, as in Gymnasium and recommended by
             Machado et al.; 0 is the deterministic protocol.
         full_action_space (bool): all 18 actions instead of those that the game has. Default False.
-        noop_max (int, optional): an episode begins with 1 to ``noop_max`` frames of doing nothing;
-            0 for none. Default: none where actions are sticky, as in Gymnasium, else 30.
+        noop_max (int or range, optional): an episode begins with 1 to ``noop_max`` frames of doing
+            nothing; 0 for none. Of a range one of its numbers is drawn. Default: none where actions
+            are sticky, as in Gymnasium, else 30.
+        start_actions (int): random actions after these, which are no part of the episode's reward.
+            Default 0.
         terminal_on_life_loss (bool): whether a lost life ends the episode. Default False, as
             Machado et al. recommend.
         life_loss_penalty (float): taken off the reward for every life lost, e.g. in the env in
@@ -66,8 +62,8 @@ class AtariRAMEnv(EnvBase):
             both.
         include_state (bool): whether ``"emulator_state"`` is written. Default True; it takes a
             tenth of a step's time.
-        include_rng (bool): whether it has the random generator. Default False.
-        seed (int, optional): of starts and sticky actions.
+        include_rng (bool): whether it has the random generators. Default False.
+        seed (int, optional): of starts, sticky actions and frames per step.
         device (torch.device, optional): of all tensors; the emulator runs on the CPU.
 
     Raises:
@@ -99,10 +95,11 @@ class AtariRAMEnv(EnvBase):
         self,
         game: str,
         *,
-        frame_skip: int = 4,
+        frame_skip: int | tuple[int, int] = 4,
         repeat_action_probability: float = 0.25,
         full_action_space: bool = False,
-        noop_max: int | None = None,
+        noop_max: int | range | None = None,
+        start_actions: int = 0,
         terminal_on_life_loss: bool = False,
         life_loss_penalty: float = 0.0,
         reward_clip: float | None = None,
@@ -115,7 +112,6 @@ class AtariRAMEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        noop_max = no_op_starts(noop_max, repeat_action_probability)
         name = "AtariRAMEnv"
         self.life_loss_penalty = real_number(name, "life_loss_penalty", life_loss_penalty, least=0)
         if reward_clip is not None:
@@ -125,25 +121,23 @@ class AtariRAMEnv(EnvBase):
             raise ValueError(
                 f'AtariRAMEnv has the read_outs ("ram", "observation"); got {read_outs!r}.'
             )
-        self._config: dict[str, Any] = {
-            "game": game,
-            "frame_skip": frame_skip,
-            "repeat_action_probability": repeat_action_probability,
-            "full_action_space": full_action_space,
-            "max_frames": max_frames,
-            "mode": mode,
-            "difficulty": difficulty,
-            "noop_max": noop_max,
-        }
-        emulator = AtariEmulator(**self._config)
+        self.settings = EmulatorSettings(
+            game,
+            frame_skip,
+            repeat_action_probability,
+            full_action_space,
+            noop_max,
+            start_actions,
+            max_frames,
+            mode,
+            difficulty,
+        )
+        emulator = AtariEmulator(self.settings)
         super().__init__(device=device, batch_size=torch.Size(()))
         self.game = emulator.game
-        self.frame_skip = frame_skip
         self.repeat_action_probability = float(repeat_action_probability)
-        self.noop_max = noop_max
         self.terminal_on_life_loss = bool(terminal_on_life_loss)
         self.reward_clip = reward_clip
-        self.max_frames = max_frames
         self.action_names = emulator.action_names
         self.include_state, self.include_rng = bool(include_state), bool(include_rng)
         self._read_outs = tuple(read_outs)
@@ -156,8 +150,8 @@ class AtariRAMEnv(EnvBase):
         def numbers(width: int, dtype: torch.dtype, high: float) -> Bounded:
             return Bounded(0, high, shape=(width,), dtype=dtype, device=self.device)
 
-        states = self._emulator.states
-        width = states.width_with_rng if self.include_rng else states.width
+        emulator = self._emulator
+        width = emulator.width_with_rng if self.include_rng else emulator.states.width
         observed = {
             "lives": numbers(1, torch.int64, 255),
             "episode_frame": numbers(1, torch.int64, 2**31),
@@ -176,6 +170,11 @@ class AtariRAMEnv(EnvBase):
         self.reward_spec = Unbounded((1,), dtype=torch.float32, device=self.device)
         done = {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(done, device=self.device)
+
+    @property
+    def frame_skip(self) -> int | tuple[int, int]:
+        """Frames per step."""
+        return self.settings.frame_skip
 
     @property
     def num_frames(self) -> int:

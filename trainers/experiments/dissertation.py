@@ -83,7 +83,8 @@ def _game(number: int, game: str) -> SourceFigure:
     command = f"hmcts train experiment=atari game={game} seed={{seed}} out=runs/{game}_{{seed}}"
     return SourceFigure(
         f"5.{number}",
-        f"scores of the hierarchical agent in {game} while it learns: mean, least and largest",
+        f"running score of the episodes that the agent plays in {game}: mean, least and largest "
+        "over the seeds; no worker learns here, the learning curve is learning.png of a run",
         "draw_scores",
         "docs/results/atari, or runs of atari",
         (command, f"hmcts report figure=5.{number} runs/{game}_*"),

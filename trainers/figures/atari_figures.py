@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +15,10 @@ from tensordict import TensorDict
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv
 from torchrl_hmcts.trainers.figures.animation import write_gif
-from torchrl_hmcts.trainers.figures.pictures import save_figure
+from torchrl_hmcts.trainers.figures.curves import draw_band, style
+from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
+FRAMES_PER_STEP = 4
 _EVERY = 3  # base steps between two pictures
 
 
@@ -31,6 +35,29 @@ def plot_scores(episodes: Sequence[Mapping[str, float]], path: Path, *, title: s
     axes.margins(x=0.08)
     axes.legend(frameon=False)
     axes.grid(alpha=0.25)
+    save_figure(figure, path, dpi=120)
+
+
+def plot_learning(
+    workers: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]], path: Path, *, title: str
+) -> None:
+    """Plot mean, least and largest score against training samples.
+
+    Each worker has a curve for each seed, whose points have ``samples`` and the ``scores`` of the
+    test episodes.
+    """
+    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    for (name, seeds), color in zip(workers.items(), itertools.cycle(COLORS)):
+        episodes = [
+            ([row["samples"] for row in rows], scores)
+            for rows in seeds
+            for scores in zip(*(row["scores"] for row in rows), strict=True)
+        ]
+        draw_band(axes, episodes, color=color, marker="o", label=name)
+    style(axes, title, short=True)
+    axes.set(xlabel="training samples", ylabel="score, worker frozen")
+    axes.legend(frameon=False)
     save_figure(figure, path, dpi=120)
 
 
@@ -53,7 +80,7 @@ def write_atari_gif(
         state = after.select("emulator_state", "ram", "observation", strict=False)
         if shown >= real_steps or bool(after["done"].any()):
             break
-    seconds = _EVERY * recorder.frame_skip / 60.0
+    seconds = _EVERY * FRAMES_PER_STEP / 60.0
     frames = [p.repeat(2, axis=1) for p in pictures]  # a console's pixels are wide
     write_gif(frames, path, milliseconds=1000.0 * seconds, last=None)
     return shown, score

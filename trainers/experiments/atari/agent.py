@@ -35,8 +35,9 @@ class AtariSearch:
         ratio: simulated base steps per base step of an option, after which no new leaf is selected;
             ρ. The leaves and rollouts under way are finished: with 4 leaves and 25, about 38
             in Breakout.
-        tree_policy: ``"puct"`` with a max backup over values scaled to [0, 1], or ``"uct"`` with a
-            mean backup, its c times the greatest reward seen.
+        tree_policy: ``"puct"`` over values scaled to [0, 1], or ``"uct"``, its c times the greatest
+            reward seen.
+        backup: ``"max"``, ``"mean"`` or ``"default"``: the max for PUCT, the mean for UCT.
         c: weight of exploration.
         rollout_options: options of the rollouts that stay in the tree; 0 for none.
         leaves_per_wave: leaves that are simulated together.
@@ -55,6 +56,7 @@ class AtariSearch:
 
     ratio: float = 25.0
     tree_policy: str = "puct"
+    backup: str = "default"
     c: float = 2.0
     rollout_options: int = 5
     leaves_per_wave: int = 4
@@ -67,6 +69,10 @@ class AtariSearch:
         if not isinstance(self.tree_policy, str) or self.tree_policy not in ("puct", "uct"):
             raise ValueError(
                 f"AtariSearch: tree_policy is 'puct' or 'uct'; got {self.tree_policy!r}."
+            )
+        if self.backup not in ("default", "max", "mean"):
+            raise ValueError(
+                f"AtariSearch: backup is 'default', 'max' or 'mean'; got {self.backup!r}."
             )
         self.settings()  # which checks the rest
 
@@ -81,9 +87,10 @@ class AtariSearch:
             reward_scale: what there is to gain, in units of which UCT explores.
         """
         puct = self.tree_policy == "puct"
+        backup: Any = ("max" if puct else "mean") if self.backup == "default" else self.backup
         return SearchSettings(
             tree_policy=PUCT(c=self.c, normalize="tree") if puct else UCT(c=self.c * reward_scale),
-            backup="max" if puct else "mean",
+            backup=backup,
             expand="one",
             rollout=TreeRollout(self.rollout_options) if self.rollout_options else None,
             leaves_per_wave=self.leaves_per_wave,

@@ -7,6 +7,11 @@ from dataclasses import dataclass, fields
 
 from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
+RULES = ("best", "goals", "actions", "action_sets", "repeat")
+SKILLS = ("diayn", "diayn_displacement", "diayn_controllable", "metra")
+_RETRAINED = ("goals_retrained", *(f"{name}_retrained" for name in SKILLS))
+NETWORKS = (*SKILLS, *_RETRAINED)
+
 
 @dataclass
 class AtariConfig(RunConfig):
@@ -28,17 +33,21 @@ class AtariConfig(RunConfig):
     """"deterministic" (comparable with the dissertation and the planning papers) or "sticky"
     (actions stick with probability 0.25, and the planner is given no random generator)."""
     source: str = "best"
-    """Where options come from; `options=` is the same key. Rules: "best" ("action_sets",
-    "actions" or "goals", with which a planner's trials score best), "goals" (found by a probe
-    and trials), "repeat" (one for each action), "actions" (some of these, chosen by trials),
-    "action_sets" (all of these, those that fire or those that do not, chosen by trials).
-    Networks: "goals_network" (has learned the goals), "goals_fine_tuned" (that network, trained
-    further by SAC on its goals and the game), "goals_retrained" (the same on what searches
-    simulated, Algorithm 3), "diayn" (the dissertation's worker), "diayn_displacement",
-    "diayn_controllable" (with other discriminators), "diayn_retrained" (Algorithm 3)."""
+    """Where options come from; `options=` and `worker=` are the same key. Rules: "best"
+    ("action_sets", "actions" or "goals", with which a planner's trials score best), "goals"
+    (found by a probe and trials), "repeat" (one for each action), "actions" (some of these,
+    chosen by trials), "action_sets" (all of these, those that fire or those that do not, chosen
+    by trials). Networks: "goals_network" (has learned the goals), "goals_fine_tuned" (that
+    network, trained further by SAC on its goals and the game), "diayn" (the dissertation's
+    worker), "diayn_displacement", "diayn_controllable" (with other discriminators), "metra".
+    With "_retrained" behind its name ("goals_retrained" for "goals_network") a network is
+    retrained on what the manager's searches simulate, Algorithm 3."""
+    episodes: int = 10
+    """Scored episodes, whose mean, least and largest score are the result; none of their starts
+    is used to choose anything."""
     frames: int = 40_000_000
-    """Emulated frames in all, 10 million base steps as in the dissertation; the last episode is
-    finished."""
+    """Emulated frames in all, 10 million base steps as in the dissertation, after which no further
+    episode begins."""
     max_episode_frames: int = 108_000
     """Real frames after which an episode ends, the community's half an hour."""
     options_from: str = ""
@@ -51,15 +60,32 @@ class AtariConfig(RunConfig):
     tune_with: str = "grid"
     """"grid" tries the lengths one by one; "optuna" draws lengths and PUCT's c (needs optuna)."""
     num_skills: int = 3
-    """Skills of a DIAYN worker (the dissertation's N_policies)."""
+    """Skills of a learned worker (the dissertation's N_policies); 0: those of 3, 4 and 5 with
+    which, at the best of 10, 20 and 30 base steps, a trial scores best (its grid search)."""
     skill_base_steps: int = 40_000
-    """Base steps of a DIAYN worker's training."""
+    """Base steps of a learned worker's training before the manager plans."""
+    rounds: int = 3
+    """Rounds of planning and retraining, of `trial_steps` real base steps at `trial_ratio`."""
+    game_weight: float = 0.0
+    """Weight of the sign of the game's reward in the training of skills before the manager
+    plans."""
+    fire: float = 0.0
+    """Share of a learned skill's steps in which FIRE is taken, where the game has it."""
+    curve_every: int = 0
+    """Training samples between two points of the learning curve, at which the worker is frozen
+    and the agent plays test episodes; 0: no curve."""
+    curve_episodes: int = 3
+    """Test episodes of such a point."""
+    curve_steps: int = 0
+    """Base steps after which such an episode is ended; 0: it is played to its end."""
     ratio: float = 25.0
     """Simulated base steps per real one, after which a search selects no new leaves."""
     rollout_options: int = 5
     """Options of the rollouts that stay in the tree."""
     tree_policy: str = "puct"
-    """"puct" (max backup, values scaled to [0, 1]) or "uct" (mean backup), e.g. to compare with."""
+    """"puct" (values scaled to [0, 1]) or "uct", e.g. to compare with."""
+    backup: str = "default"
+    """"max", "mean" or "default": the max for PUCT, the mean for UCT."""
     guide: str = "none"
     """Whether a network learns from the searches and guides those after them: "none", "prior" or
     "prior_value"."""
@@ -86,21 +112,21 @@ class AtariConfig(RunConfig):
     """A run of seconds, to see that everything works."""
 
     EXPERIMENT = "atari"
-    FREE = ("out", "resume", "overwrite", "frames", "options_from", "num_processes")
+    FREE = ("out", "resume", "overwrite", "episodes", "frames", "options_from", "num_processes")
     PATHS = ("out", "options_from")
-    ALIASES = {"options": "source"}
+    ALIASES = {"options": "source", "worker": "source"}
     CHOICES = {
         "protocol": ("deterministic", "sticky"),
-        "source": (
-            "best", "goals", "goals_network", "goals_fine_tuned", "goals_retrained", "actions",
-            "action_sets", "repeat", "diayn", "diayn_displacement", "diayn_controllable",
-            "diayn_retrained",
-        ),
+        "source": (*RULES, "goals_network", "goals_fine_tuned", *NETWORKS),
         "tune_with": ("grid", "optuna"),
         "tree_policy": ("puct", "uct"),
+        "backup": ("default", "max", "mean"),
         "guide": ("none", "prior", "prior_value"),
     }  # fmt: skip
-    LEAST = {"option_steps": 0, "rollout_options": 0, "num_processes": -1}
+    LEAST = {
+        "option_steps": 0, "rollout_options": 0, "num_processes": -1, "num_skills": 0,
+        "curve_every": 0, "curve_steps": 0,
+    }  # fmt: skip
     ABOVE_ZERO = ("ratio", "c", "trial_ratio")
     TOY = {
         "frames": 20_000,
@@ -124,6 +150,8 @@ class AtariConfig(RunConfig):
             ExperimentError: if there is no such game, or no run of it in ``options_from``.
         """
         super().check_inputs()
+        if not 0.0 <= self.fire < 1.0:
+            raise ExperimentError(f"fire is a share of steps, 0 to below 1; got {self.fire}.")
         need_package("ale_py")
         if self.tune_with == "optuna":
             need_package("optuna")

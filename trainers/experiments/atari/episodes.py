@@ -14,14 +14,16 @@ from typing import Any
 import torch
 from torchrl.checkpoint import CheckpointError
 
+from torchrl_hmcts.envs import AtariOptionPool
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
 from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP, AtariKit
+from torchrl_hmcts.trainers.experiments.atari.learning import LearningCurve
 from torchrl_hmcts.trainers.experiments.atari.memory import TrialMemory
-from torchrl_hmcts.trainers.experiments.atari.options import Options
+from torchrl_hmcts.trainers.experiments.atari.options import Options, has_network
 from torchrl_hmcts.trainers.experiments.atari.sources import make_source
-from torchrl_hmcts.trainers.experiments.atari.trials import Tuned, tune_search
+from torchrl_hmcts.trainers.experiments.atari.trials import GRID_SKILLS, Tuned, tune_search
 from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, read_state
@@ -89,10 +91,36 @@ class AtariRun:
             return
         memory = TrialMemory(trials_file(Path(config.out)), self.settings())
         kit = dataclasses.replace(self.kit, memory=memory)
-        self.options = make_source(config, self.search).find(kit)
-        self.tuned = tune_search(self.options.worker, kit, self.search, config)
+        if config.curve_every:
+            kit = dataclasses.replace(kit, curve=self._learning_curve())
+        tried = []
+        for number in (config.num_skills,) if config.num_skills else GRID_SKILLS:
+            source = make_source(dataclasses.replace(config, num_skills=number), self.search)
+            options = source.find(kit)
+            tuned = tune_search(options.worker, kit, self.search, config)
+            tried.append((options, tuned))
+        self.options, self.tuned = max(tried, key=lambda pair: pair[1].best)
+        for options, tuned in tried:
+            if options is not self.options:  # what lost has cost frames, too
+                self.options.num_frames += options.num_frames
+                self.tuned.num_frames += tuned.num_frames
+                self.tuned.trials += tuned.trials
+        if isinstance(kit.curve, LearningCurve):
+            learning = {"rows": kit.curve.rows, "test_frames": kit.curve.num_frames}
+            self.options.report["learning"] = learning
         self._frames_before += self.options.num_frames + self.tuned.num_frames
         self._found = True
+
+    def _learning_curve(self) -> LearningCurve:
+        config = self.config
+        return LearningCurve(
+            self.kit,
+            self.search,
+            option_steps=config.option_steps or 10,
+            every=config.curve_every,
+            episodes=config.curve_episodes,
+            max_steps=config.curve_steps,
+        )
 
     def take_over(self, folder: Path, key: str) -> Path:
         """Take options, their length and what a guide has learned from another run's checkpoint,
@@ -136,7 +164,7 @@ class AtariRun:
             self._saved = len(self.scores), agent.decisions
         self._frames_before -= agent.num_frames  # a console's start is no part of the run
         if agent.done:  # nothing is under way
-            if resumed is not None and self.num_frames >= self.config.frames:
+            if resumed is not None and self._played_enough:
                 return
             self._begin_episode(agent)
         due = resumed is None
@@ -151,9 +179,16 @@ class AtariRun:
             self._note(agent)
             if not agent.done:
                 tick()
-            elif self._end_episode(agent) < self.config.frames:
-                self._begin_episode(agent)
+            else:
+                self._end_episode(agent)
+                if not self._played_enough:
+                    self._begin_episode(agent)
             due = agent.done or agent.decisions % self.config.replant_every == 0
+
+    @property
+    def _played_enough(self) -> bool:
+        config = self.config
+        return len(self.scores) >= config.episodes or self.num_frames >= config.frames
 
     def kept(self) -> str:
         """Return a sentence on what the latest checkpoint holds, and what is to be played again."""
@@ -175,14 +210,19 @@ class AtariRun:
             if self._learned is not None:
                 guide.load_state_dict(self._learned)
         self.agent = AtariAgent(
-            self.kit.make_pool(worker, steps),
+            self.kit.make_pool(worker, steps, split="test"),
             dataclasses.replace(self.search, c=self.tuned.c),
-            play_in=self.kit.make_pool(worker, steps, sticky=True) if self.sticky else None,
+            play_in=self.make_player() if self.sticky else None,
             guide=guide,
             replant_every=config.replant_every,
             seed=config.seed,
         )
         return self.agent
+
+    def make_player(self, *, record: bool = False) -> AtariOptionPool:
+        """Make a pool in which the scored episodes begin."""
+        worker, steps = self.options.worker, self.tuned.option_steps
+        return self.kit.make_pool(worker, steps, split="test", sticky=self.sticky, record=record)
 
     def close(self) -> None:
         """Stop the processes."""
@@ -210,8 +250,8 @@ class AtariRun:
         if agent.done or frames // _FRAMES_PER_POINT > before // _FRAMES_PER_POINT:
             self.points.append((frames, agent.score))
 
-    def _end_episode(self, agent: AtariAgent) -> int:
-        """Note an episode that is over; return the frames emulated so far."""
+    def _end_episode(self, agent: AtariAgent) -> None:
+        """Note an episode that is over."""
         whole = len(self.decisions) == agent.decisions  # not in one of an older version
         if whole and agent.score > self.best.get("score", -math.inf):
             episode = {"episode": len(self.scores), "score": agent.score}
@@ -228,7 +268,6 @@ class AtariRun:
             f"Episode {len(self.scores)}: score {agent.score:g} in {row['real_frames']:,} frames, "
             f"{row['frames']:,} emulated so far"
         )
-        return self.num_frames
 
     # ---------------------------------------------------------------- results
 
@@ -238,13 +277,16 @@ class AtariRun:
         scores = [row["score"] for row in self.scores]
         decisions = max(1, sum(int(row["decisions"]) for row in self.scores))
         spent = self.num_frames - options.num_frames - tuned.num_frames
+        real = sum(int(row["real_frames"]) for row in self.scores)
         guided = "" if config.guide == "none" else f", guide={config.guide}"
         return {
             "game": config.game,
             "protocol": config.protocol,
             "source": config.source + guided,
+            "acts": "network" if has_network(options.worker) else "rules",
             "seed": config.seed,
             "score_max": max(scores),
+            "score_min": min(scores),
             "score_final": scores[-1],
             "score_mean": sum(scores) / len(scores),
             "episodes": self.scores,
@@ -256,10 +298,17 @@ class AtariRun:
             "frames_finding_options": options.num_frames,
             "frames_tuning": tuned.num_frames,
             "frames_per_decision": round(spent / decisions, 1),
+            "simulated_per_real": round((spent - real) / max(1, real), 1),
             "seconds": round(self.seconds, 1),
             "finding": options.report,
             "tuning": tuned.trials,
         }
+
+    @property
+    def learning(self) -> list[dict[str, Any]]:
+        """Points of the learning curve, see :class:`LearningCurve`."""
+        rows: list[dict[str, Any]] = self.options.report.get("learning", {}).get("rows", [])
+        return rows
 
     def curves(self) -> Iterator[tuple[int, str, float]]:
         """Yield base steps of all kinds, name and value of each point of the curves."""

@@ -22,7 +22,7 @@ from torchrl_hmcts.modules import SkillMLP
 from torchrl_hmcts.objectives import DiscreteSkillSACLoss, SkillObjective
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariAgent, AtariSearch
-from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP, AtariKit
+from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 from torchrl_hmcts.trainers.experiments.atari.options import (
     Options,
     Training,
@@ -112,7 +112,7 @@ def _goal_training(found: Options, kit: AtariKit) -> Training:
     distilled = SkillMLP(128, network.num_actions, network.num_options, hidden=hidden)
     distilled.requires_grad_(False)
     network.store(distilled.parameters())
-    env = kit.make_training_env(network.num_options, option_steps=1, num_envs=1)
+    env, _ = kit.make_training_env(network.num_options, option_steps=1, num_envs=1)
     loss = DIAYNTrainer.make_loss(
         env,
         network.num_options,
@@ -147,7 +147,7 @@ def fine_tune(
     loss = training.loss
     batch = 8 * num_envs
     batches = max(1, round(base_steps / batch))
-    env = kit.make_training_env(
+    env, count = kit.make_training_env(
         len(found.names), option_steps=skill_steps, num_envs=num_envs, clip_reward=True
     )
     trainer = DIAYNTrainer(
@@ -170,11 +170,12 @@ def fine_tune(
     trainer.register_op("pre_optim_steps", begin_with_the_critics)
     trainer.train()
     training.data = data = trainer.replay_buffer.storage.get(slice(None))
+    training.samples += trainer.collected_frames
     share = loss.objective.reward(data).mean().item()
     kit.log(f"fine-tuned: goals' reward {share:.2f} per base step, over the last {len(data):,}")
     network_of(found.worker).load(loss.actor_network_params.parameters())
     report = {**found.report, "fine_tuned_goal_reward": share}
-    num_frames = found.num_frames + FRAMES_PER_STEP * batch * batches
+    num_frames = found.num_frames + count()
     return replace(found, num_frames=num_frames, report=report, training=training)
 
 
@@ -228,6 +229,9 @@ def retrain(
                 _update(loss, buffer.sample(), optimizer)
                 updater.step()
         network_of(found.worker).load(loss.actor_network_params.parameters())
+        training.samples += len(samples)
+        if kit.curve is not None:
+            kit.curve(found.worker, training.samples, num_frames)
         row = {"score": agent.score, "real_steps": agent.real_steps, "samples": len(samples)}
         rows.append(row)
         kit.log(f"round {number + 1} of planning and retraining: {row}")

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, SerialEnv, SignTransform, TransformedEnv, UnaryTransform
 
-from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv, OptionWorker
-from torchrl_hmcts.envs.atari.emulator import AtariEmulator
+from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv, OptionWorker, RepeatActions
+from torchrl_hmcts.envs.atari.emulator import AtariEmulator, EmulatorSettings
 from torchrl_hmcts.trainers.experiments.atari.memory import TrialMemory
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 FRAMES_PER_STEP = 4
+SPLITS = {"train": range(1, 240, 2), "test": range(2, 241, 2)}  # frames of doing nothing
+_START_ACTIONS = 5  # random ones after these
+Curve = Callable[[OptionWorker, int, int], object]
 _STICKY_SEED = 7_654_321  # of emulators to play in, which the planner must not know
 
 
 @dataclass(frozen=True)
 class AtariKit:
     """An Atari game: what a search for options, a training and an agent make of it.
+
+    An episode begins with some frames of doing nothing, up to four seconds, and five random
+    actions. The frames are an odd number in the split ``"train"``, where options are probed,
+    learned, tried and chosen, and an even one in ``"test"``, whose episodes are scored: no start is
+    in both.
 
     Args:
         game: e.g. ``"Breakout"``.
@@ -30,6 +38,8 @@ class AtariKit:
         seed: of starts, searches and networks.
         log: told what was found, a line at a time.
         memory: of trials that are not played again. Default: none.
+        curve: called with a worker that learns, the samples it has learned from and the frames
+            that these took, e.g. to measure it. Default: nothing is.
 
     Example:
         >>> from torchrl_hmcts.envs import RepeatActions
@@ -48,20 +58,39 @@ class AtariKit:
     seed: int = 0
     log: Callable[[str], object] = field(default=print, repr=False, compare=False)
     memory: TrialMemory | None = field(default=None, repr=False, compare=False)
+    curve: Curve | None = field(default=None, repr=False, compare=False)
 
     @property
     def action_names(self) -> list[str]:
         """Names of the game's own actions, by their index."""
-        return list(AtariEmulator(self.game).action_names)
+        return list(AtariEmulator(EmulatorSettings(self.game)).action_names)
+
+    def starts(self, split: str, num_starts: int) -> TensorDictBase:
+        """Return states in which episodes begin, ``[num_starts]``, the first that a pool draws.
+
+        Args:
+            split: ``"train"`` or ``"test"``.
+            num_starts: how many.
+        """
+        pool = replace(self, num_processes=0).make_pool(RepeatActions(1), 1, split=split)
+        states = pool.reset(TensorDict(batch_size=[num_starts]))
+        return states.select("emulator_state", "ram", "episode_frame")
 
     def make_pool(
-        self, worker: OptionWorker, max_steps: int, *, sticky: bool = False, record: bool = False
+        self,
+        worker: OptionWorker,
+        max_steps: int,
+        *,
+        split: str = "train",
+        sticky: bool = False,
+        record: bool = False,
     ) -> AtariOptionPool:
         """Make a pool of emulators.
 
         Args:
             worker: executes the options.
             max_steps: base steps of an option at most.
+            split: of the starts.
             sticky: whether actions stick, with probability 0.25: to play in, not to plan.
             record: whether the steps inside an option are written, too.
         """
@@ -73,7 +102,7 @@ class AtariKit:
             record=record,
             gamma=self.gamma,
             repeat_action_probability=0.25 if sticky else 0.0,
-            max_frames=self.max_frames,
+            **self._episode(split),
             seed=self.start_seed(sticky=sticky) if sticky else self.seed,
         )
 
@@ -85,8 +114,10 @@ class AtariKit:
         num_envs: int = 8,
         bytes_seen: Sequence[int] | None = None,
         clip_reward: bool = False,
-    ) -> TransformedEnv:
+    ) -> tuple[TransformedEnv, Callable[[], int]]:
         """Make deterministic emulators in which a network learns options.
+
+        Returns the env, and a function that counts the frames which it has emulated.
 
         Args:
             num_options: one is drawn for each mini-episode.
@@ -102,8 +133,33 @@ class AtariKit:
             seen = list(bytes_seen)
             parts.append(UnaryTransform(["observation"], ["seen"], fn=lambda x: x[..., seen]))
             parts.append(DisplacementTransform("seen"))
-        one = partial(AtariRAMEnv, self.game, repeat_action_probability=0.0, seed=self.seed)
-        return TransformedEnv(SerialEnv(num_envs, one), Compose(*parts))
+        made: list[AtariRAMEnv] = []
+
+        def one() -> AtariRAMEnv:
+            made.append(
+                AtariRAMEnv(
+                    self.game,
+                    repeat_action_probability=0.0,
+                    read_outs=("observation",),
+                    include_state=False,
+                    seed=self.seed,
+                    **self._episode("train"),
+                )
+            )
+            return made[-1]
+
+        env = TransformedEnv(SerialEnv(num_envs, one), Compose(*parts))
+        return env, lambda: sum(one.num_frames for one in made)
+
+    def _episode(self, split: str) -> dict[str, Any]:
+        """Return an emulator's settings of how an episode begins and how long it is."""
+        if split not in SPLITS:
+            raise ValueError(f"AtariKit has the splits {', '.join(SPLITS)}; got {split!r}.")
+        return {
+            "noop_max": SPLITS[split],
+            "start_actions": _START_ACTIONS,
+            "max_frames": self.max_frames,
+        }
 
     def start_seed(self, episode: int | None = None, *, sticky: bool = False) -> int:
         """Return the seed of the pool in which an episode is played.

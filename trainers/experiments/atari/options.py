@@ -22,12 +22,14 @@ from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 
 @dataclass
 class Training:
-    """What a network worker was trained with: the live loss, transitions ``[n]`` of its data, and
-    the bytes whose displacement its objective reads (None if it reads the state)."""
+    """What a network worker was trained with: the live loss, transitions ``[n]`` of its data, the
+    bytes whose displacement its objective reads (None if it reads the state), and how many samples
+    it has learned from."""
 
     loss: DiscreteSkillSACLoss
     data: TensorDictBase
     bytes_seen: list[int] | None = None
+    samples: int = 0
 
 
 @dataclass
@@ -130,6 +132,12 @@ def load_worker(part: dict[str, Any]) -> OptionWorker:
     if kind == "joined":
         return JoinedWorkers([load_worker(p) for p in part["parts"]])
     raise ValueError(f"Unknown kind of options: {kind!r}.")
+
+
+def has_network(worker: Any) -> bool:
+    """Whether a network executes one of a worker's options, or rules do all of them."""
+    parts = getattr(worker, "workers", [getattr(worker, "worker", None)])
+    return isinstance(worker, SharedMLP) or any(has_network(p) for p in parts if p is not None)
 
 
 def network_of(worker: OptionWorker) -> SharedMLP:

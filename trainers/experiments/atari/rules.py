@@ -23,6 +23,7 @@ from torchrl_hmcts.envs import (
     RepeatActions,
 )
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariSearch
+from torchrl_hmcts.trainers.experiments.atari.config import RULES
 from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 from torchrl_hmcts.trainers.experiments.atari.options import Options
 from torchrl_hmcts.trainers.experiments.atari.trials import play_trial
@@ -32,7 +33,6 @@ from torchrl_hmcts.trainers.skills.controllability import (
     random_states,
 )
 
-CANDIDATES = ("best", "goals", "actions", "action_sets", "repeat")
 _HOLD_STEPS = 3  # for which an action is held in a probe
 _OFFSETS = (-12, 0, 12)  # o of the goals "bring c to b + o"
 _SHORTLIST = 6  # candidates that are left after screening, and actions beside them
@@ -124,10 +124,9 @@ class RuleSource:
     repetitions: int = 2
 
     def __post_init__(self) -> None:
-        if self.candidates not in CANDIDATES:
+        if self.candidates not in RULES:
             raise ValueError(
-                f"RuleSource: candidates are one of {', '.join(CANDIDATES)}; got "
-                f"{self.candidates!r}."
+                f"RuleSource: candidates are one of {', '.join(RULES)}; got {self.candidates!r}."
             )
         for name in (
             "probe_states", "max_goals", "screen_steps", "min_options", "options", "trial_steps",

@@ -14,6 +14,7 @@ import torch
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun, load_run, trials_file
 from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP
+from torchrl_hmcts.trainers.experiments.atari.learning import CURVE
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.run import Run, open_run
@@ -33,7 +34,8 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
         config: see :class:`~torchrl_hmcts.trainers.experiments.atari.config.AtariConfig`.
 
     Returns:
-        The figures; ``score_max`` is the best episode, ``score_final`` the last.
+        The figures; ``score_mean`` is the result, the mean of the ``episodes``, ``score_min`` and
+        ``score_max`` the worst and the best of them.
 
     Raises:
         ExperimentError: if there is no such game, or a checkpoint is of a run with other settings.
@@ -55,14 +57,19 @@ def run_atari(config: AtariConfig) -> dict[str, Any]:
         with left_out("curves.csv"):
             values = ((name, step, value) for step, name, value in run.curves())
             write_csv(folder.path / "curves.csv", ("name", "base_steps", "value"), values)
+        if learning := run.learning:
+            with left_out("learning.csv"):
+                points = ([row[name] for name in CURVE] for row in learning)
+                write_csv(folder.path / "learning.csv", CURVE, points)
         title = f"{config.game} by planning over options, {config.protocol}"
         with folder.finish(metrics, title=title) as pictures:
             draw(run, pictures)
     rows = [
         ("game", config.game),
+        ("who acts", metrics["acts"]),
         ("episodes", str(len(run.scores))),
-        ("best score", f"{metrics['score_max']:g}"),
-        ("last score", f"{metrics['score_final']:g}"),
+        ("mean score", f"{metrics['score_mean']:g}"),
+        ("least, largest", f"{metrics['score_min']:g}, {metrics['score_max']:g}"),
         ("emulated frames", f"{run.num_frames:,}"),
     ]
     print(console.table(rows))
@@ -132,13 +139,20 @@ def draw(run: AtariRun, pictures: Pictures) -> None:
         from torchrl_hmcts.trainers.figures.atari_figures import plot_scores
 
         plot_scores(run.scores, path, title=run.config.game)
+    if learning := run.learning:
+        words = (
+            "Score of the agent with its worker frozen, against the samples it has learned from."
+        )
+        with pictures.one("learning.png", words) as path:
+            from torchrl_hmcts.trainers.figures.atari_figures import plot_learning
+
+            plot_learning({run.config.source: [learning]}, path, title=run.config.game)
     if not run.best:  # of a run that was begun by an older version
         return
     with left_out("episode.gif"):
         from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif
 
-        steps = run.tuned.option_steps
-        recorder = run.kit.make_pool(run.options.worker, steps, record=True, sticky=run.sticky)
+        recorder = run.make_player(record=True)
         recorder.set_seed(run.kit.start_seed(run.best["episode"], sticky=run.sticky))
         path = pictures.folder / "episode.gif"
         try:

@@ -1,4 +1,4 @@
-"""Networks that learn a game's options: DIAYN's skills, or what rules do.
+"""Networks that learn a game's options: skills by DIAYN or METRA, or what rules do.
 
 Letters: Z options, S states. :class:`TrainedSource` tells what the settings are.
 """
@@ -13,12 +13,14 @@ import torch
 from torch import Tensor
 
 from torchrl_hmcts.envs import OccasionalAction, OptionWorker, SharedMLP
-from torchrl_hmcts.modules import SkillMLP
+from torchrl_hmcts.modules import SkillEncoder, SkillMLP
+from torchrl_hmcts.objectives import METRAEncoderLoss, SkillObjective
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP, AtariKit
+from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 from torchrl_hmcts.trainers.experiments.atari.options import Options, Training
 from torchrl_hmcts.trainers.experiments.atari.rules import RuleSearch, RuleSource
 from torchrl_hmcts.trainers.skills.controllability import random_states
+from torchrl_hmcts.transforms import SkillReward
 
 SLOW: dict[str, Any] = {
     "critic_lr": 3e-4,
@@ -26,6 +28,7 @@ SLOW: dict[str, Any] = {
     "target_tau": 0.01,
 }  # than in a maze
 _DISCRIMINATORS = ("state", "displacement", "controllable")
+_METRA_SCALE = 3.0  # of its reward, whose steps have at most length 1
 
 
 def learn_skills(
@@ -35,10 +38,15 @@ def learn_skills(
     base_steps: int = 40_000,
     skill_steps: int = 40,
     discriminator: str = "state",
+    objective: str = "diayn",
+    game_weight: float = 0.0,
+    fire: float = 0.0,
     num_envs: int = 8,
     hidden: Sequence[int] = (128, 128, 128),
 ) -> Options:
-    """Learn skills by DIAYN on the RAM."""
+    """Learn skills by DIAYN or METRA on the RAM."""
+    if objective not in ("diayn", "metra"):
+        raise ValueError(f"objective is 'diayn' or 'metra'; got {objective!r}.")
     if discriminator not in _DISCRIMINATORS:
         raise ValueError(f"discriminator is one of {_DISCRIMINATORS}; got {discriminator!r}.")
     report: dict[str, Any] = {}
@@ -55,12 +63,22 @@ def learn_skills(
                 f"No byte of {kit.game} was found that actions raise and lower, so the "
                 "discriminator has no input. Use discriminator='displacement'."
             )
-    env = kit.make_training_env(
-        num_skills, option_steps=skill_steps, num_envs=num_envs, bytes_seen=bytes_seen
+    env, count = kit.make_training_env(
+        num_skills,
+        option_steps=skill_steps,
+        num_envs=num_envs,
+        bytes_seen=bytes_seen,
+        clip_reward=True,
     )
+    encoded: SkillObjective | None = None
+    if objective == "metra":
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(kit.seed)
+            encoded = METRAEncoderLoss(SkillEncoder(128, num_skills, in_keys=["observation"]))
     loss = DIAYNTrainer.make_loss(
         env,
         num_skills,
+        objective=encoded,
         in_keys=["observation"],
         critic_keys=["observation"],
         discriminator_keys=["observation" if bytes_seen is None else "displacement"],
@@ -70,6 +88,17 @@ def learn_skills(
         gamma=0.97,
         seed=kit.seed,
     )
+    names = kit.action_names
+    student = SharedMLP(num_skills, len(names), hidden=hidden)
+    worker: OptionWorker = student
+    if fire and "FIRE" in names:
+        worker = OccasionalAction(student, names.index("FIRE"), fire)
+
+    def show() -> None:
+        student.load(loss.actor_network_params.parameters())
+        if kit.curve is not None:
+            kit.curve(worker, trainer.collected_frames, num_frames + count())
+
     trainer = DIAYNTrainer(
         env,
         loss,
@@ -77,20 +106,28 @@ def learn_skills(
         updates_per_batch=8,
         actor_lr=3e-4,
         **SLOW,
+        reward=SkillReward(
+            loss.objective,
+            intrinsic_coeff=1.0 if encoded is None else _METRA_SCALE,
+            extrinsic_coeff=game_weight,
+        ),
         seed=kit.seed,
     )
+    if kit.curve is not None:
+        show()
+        trainer.register_op("post_steps", show)
     trainer.train()
+    show()
     last = {name: values[-20:] for name, values in trainer.history.items() if len(values)}
     report["last"] = means = {name: sum(values) / len(values) for name, values in last.items()}
-    kit.log(f"DIAYN: accuracy {means.get('discriminator_accuracy', float('nan')):.2f}")
-    worker = SharedMLP(num_skills, env.action_spec.space.n, hidden=hidden)
-    worker.load(loss.actor_network_params.parameters())
+    kit.log(f"{objective}: accuracy {means.get('discriminator_accuracy', float('nan')):.2f}")
+    data = trainer.replay_buffer.storage.get(slice(None))
     return Options(
         worker,
         [f"skill {z}" for z in range(num_skills)],
-        num_frames + FRAMES_PER_STEP * base_steps,
+        num_frames + count(),
         report,
-        training=Training(loss, trainer.replay_buffer.storage.get(slice(None)), bytes_seen),
+        training=Training(loss, data, bytes_seen, trainer.collected_frames),
     )
 
 

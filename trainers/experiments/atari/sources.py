@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from torchrl_hmcts.trainers.experiments.atari.agent import AtariSearch
-from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig
+from torchrl_hmcts.trainers.experiments.atari.config import RULES, AtariConfig
 from torchrl_hmcts.trainers.experiments.atari.fine_tuning import fine_tune, retrain
 from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 from torchrl_hmcts.trainers.experiments.atari.options import Options, OptionSource
-from torchrl_hmcts.trainers.experiments.atari.rules import CANDIDATES, RuleSource
+from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
 from torchrl_hmcts.trainers.experiments.atari.skills import distil, learn_skills
 
 _TRAININGS: dict[str, Any] = {
@@ -58,6 +59,12 @@ class TrainedSource:
         discriminator (str): of ``"diayn"``. ``"state"`` (default) tells skills by the RAM,
             ``"displacement"`` by how it changed since the option began, ``"controllable"`` by how
             its controllable bytes did.
+        objective (str): of ``"diayn"``, ``"metra"`` for METRA's on the RAM instead. Default
+            ``"diayn"``.
+        game_weight (float): of ``"diayn"``, weight of the sign of the game's reward beside the
+            objective's. Default 0: none.
+        fire (float): of ``"diayn"``, share of the steps in which FIRE is taken, where a game has
+            it. Default 0.
         base_steps (int): of training. Default 40,000 for ``"diayn"``, 20,000 for ``"fine_tuned"``.
         skill_steps, num_envs (int): in both, base steps for which an option is kept, and emulators
             that play at a time. Default 40 and 8.
@@ -122,19 +129,29 @@ def make_source(config: AtariConfig, search: AtariSearch) -> OptionSource:
         trial_steps=config.trial_steps,
         trial_ratio=config.trial_ratio,
     )
-    if config.source in CANDIDATES:
+    if config.source in RULES:
         return rules(candidates=config.source)
     steps: dict[str, Any] = {"base_steps": config.skill_base_steps}
-    rounds: dict[str, Any] = {"round_steps": config.trial_steps}
-    network = TrainedSource("distilled", rules(candidates="goals"))
-    skills = partial(TrainedSource, "diayn", num_skills=config.num_skills, **steps)
-    networks = {
-        "goals_network": network,
-        "goals_fine_tuned": TrainedSource("fine_tuned", network, **steps),
-        "goals_retrained": TrainedSource("retrained", network, **rounds),
-        "diayn": skills(),
-        "diayn_displacement": skills(discriminator="displacement"),
-        "diayn_controllable": skills(discriminator="controllable"),
-        "diayn_retrained": TrainedSource("retrained", skills(), intrinsic_weight=0.1, **rounds),
-    }
-    return networks[config.source]
+    name, retrained = config.source.removesuffix("_retrained"), "_retrained" in config.source
+    weight = 1.0
+    if name.startswith("goals"):
+        source = TrainedSource("distilled", rules(candidates="goals"))
+        if name == "goals_fine_tuned":
+            source = TrainedSource("fine_tuned", source, **steps)
+    else:
+        objective, _, seen = name.partition("_")
+        skills = {"objective": objective, "discriminator": seen or "state", "fire": config.fire}
+        skills |= {"game_weight": config.game_weight, "num_skills": config.num_skills}
+        source = TrainedSource("diayn", **skills, **steps)
+        weight = 0.1
+    if not retrained:
+        return source
+    return TrainedSource(
+        "retrained",
+        source,
+        intrinsic_weight=weight,
+        rounds=config.rounds,
+        round_steps=config.trial_steps,
+        search=replace(search, ratio=config.trial_ratio),
+        option_steps=config.option_steps or 10,
+    )

@@ -15,6 +15,7 @@ from torchrl_hmcts.trainers.experiments.atari.memory import Trial
 from torchrl_hmcts.trainers.experiments.atari.options import plain_worker
 
 _OPTION_STEPS = (10, 5, 20, 30)
+GRID_SKILLS, _GRID_STEPS = (3, 4, 5), (10, 20, 30)  # the dissertation's grid
 
 
 def play_trial(
@@ -64,6 +65,11 @@ class Tuned:
     num_frames: int = 0
     trials: list[dict[str, float]] = field(default_factory=list)
 
+    @property
+    def best(self) -> tuple[float, float]:
+        """Score of the best trial, and how long it lived."""
+        return max(((t["score"], t["real_steps"]) for t in self.trials), default=(0.0, 0.0))
+
 
 def tune_search(
     worker: OptionWorker,
@@ -74,12 +80,16 @@ def tune_search(
     """Try settings in short episodes and return the best by the game's score.
 
     A trial has twice the config's ``trial_steps`` and its ``ratio``, at most 10, and plans by PUCT.
-    The lengths 10, 5, 20 and 30 are tried, or lengths from 4 to 40 and c from 0.5 to 4 as Optuna's
-    TPE draws them; nothing where the config names a length.
+    The lengths 10, 5, 20 and 30 are tried (10, 20 and 30 where the number of skills is searched
+    for, too), or lengths from 4 to 40 and c from 0.5 to 4 as Optuna's TPE draws them; nothing where
+    the config names both.
     """
     tuned = Tuned(config.option_steps or _OPTION_STEPS[0], config.c)
+    lengths = _GRID_STEPS if config.num_skills == 0 else _OPTION_STEPS[: config.tune_trials]
     if config.option_steps:
-        return tuned
+        if config.num_skills:
+            return tuned
+        lengths = (config.option_steps,)
     short = dataclasses.replace(search, ratio=min(config.ratio, 10.0), tree_policy="puct")
 
     def trial(option_steps: int, c: float) -> float:
@@ -93,12 +103,14 @@ def tune_search(
         )
         tuned.num_frames += played.num_frames
         row = {"option_steps": option_steps, "c": c, "score": played.score}
+        if config.num_skills == 0:
+            row["num_skills"] = worker.num_options
         tuned.trials.append({**row, "real_steps": played.real_steps})
         kit.log(f"trial: {tuned.trials[-1]}")
         return played.rank
 
     if config.tune_with == "grid":
-        for option_steps in _OPTION_STEPS[: config.tune_trials]:
+        for option_steps in lengths:
             trial(option_steps, config.c)
     else:
         import optuna
