@@ -186,7 +186,7 @@ def test_an_agent_learns_plans_and_lends_its_skills(tmp_path: Path) -> None:
     solution = other.solve(seed=1)
     assert solution == other.solve(seed=1)
     assert solution.simulated_steps > 0
-    with pytest.raises(ValueError, match="networks of .* are not those"):
+    with pytest.raises(ValueError, match="were learned in antmaze-medium-v0"):
         HMCTS("antmaze-large-v0", kit="ant", worker=str(tmp_path))
 
 

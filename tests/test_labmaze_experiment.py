@@ -18,12 +18,11 @@ from torch import Tensor
 
 from torchrl_hmcts.envs import LabMazeEnv, draw_first_person, lab_maze
 from torchrl_hmcts.trainers.evaluation import Results
-from torchrl_hmcts.trainers.experiments import skills
+from torchrl_hmcts.trainers.experiments import curve_tests
 from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.lab import (
     TRAINING_MAZES,
     LabMazeKit,
-    frames_curve,
     held_out_seeds,
     make_lab_env,
     make_starts,
@@ -39,7 +38,7 @@ from torchrl_hmcts.trainers.experiments.skills import (
     solve,
     with_second_search,
 )
-from torchrl_hmcts.trainers.skills.rounds import RoundRecords
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords, frames_curve
 from torchrl_hmcts.transforms import OptionTransform
 
 ROOM = ["*" * 9, "*P      *", *["*       *"] * 6, "*" * 9]
@@ -146,7 +145,7 @@ def test_the_worker_that_solved_the_most_mazes_is_kept_of_several_the_latest(
         two = np.full(2, 7)
         return Results(yes, yes, two, two, two, two, two)
 
-    monkeypatch.setattr(skills, "plan_and_execute", scripted)
+    monkeypatch.setattr(curve_tests, "plan_and_execute", scripted)
     config = LabMazeConfig(
         algorithm="diayn", train_frames=600, curve_mazes=2, curve_points=2, keep="best"
     )

@@ -6,16 +6,18 @@ Letters: M starts, L options of the longest plan, T base steps of an episode.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_hmcts.planners import MCTSPlanner, Plan, extract_plans
 from torchrl_hmcts.planners.simulator import Simulator
@@ -251,3 +253,54 @@ def plan_and_execute(
             )
         )
     return Results.concatenate(parts)
+
+
+@torch.no_grad()
+def act_by_policy(
+    policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase, *, limit: int
+) -> Results:
+    """Act in one episode by a policy over the options, without a search.
+
+    Args:
+        policy: reads the states of ``real``, writes the option.
+        real: the macro env to act in.
+        start: state ``[1]``.
+        limit: options that are taken at most.
+    """
+    begin = time.perf_counter()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        episode = real.rollout(limit, policy, auto_reset=False, tensordict=start[0].clone())
+    none = np.zeros(1, np.int64)
+    return Results(
+        found=np.array([True]),
+        solved=episode[-1]["next", "terminated"].numpy().reshape(1),
+        simulated_steps=none,
+        expansions=none,
+        simulations=none,
+        plan_options=np.array([len(episode)]),
+        episode_steps=np.array([int(episode["next", "duration"].sum())]),
+        rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
+        plan_seconds=np.array([time.perf_counter() - begin]),
+    )
+
+
+@torch.no_grad()
+def option_reach(
+    simulator: EnvBase,
+    starts: TensorDictBase,
+    features: Callable[[TensorDictBase], np.ndarray],
+    num_options: int,
+) -> float:
+    """Return how far options move the features of states; a quarter of them move these farther.
+
+    Args:
+        simulator: the macro env, in which each option is taken from each start.
+        starts: states ``[M]``.
+        features: of states ``[m]``, ``[m, F]``.
+        num_options: of the macro env.
+    """
+    before = starts.repeat(num_options)
+    options = torch.arange(num_options).repeat_interleave(len(starts))
+    after = simulator.step(before.clone().set("option", options))["next"]
+    moved = np.linalg.norm(features(after) - features(before), axis=-1)
+    return float(np.quantile(moved, 0.75))

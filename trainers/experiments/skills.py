@@ -28,7 +28,8 @@ from torchrl_hmcts.objectives import SkillObjective
 from torchrl_hmcts.planners import MCTSPlanner
 from torchrl_hmcts.trainers.collectors import make_ray_collector
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
-from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
+from torchrl_hmcts.trainers.evaluation import Results
+from torchrl_hmcts.trainers.experiments.curve_tests import CurveTests, curve_budget
 from torchrl_hmcts.trainers.experiments.kits import (
     OBJECTIVE,
     Kit,
@@ -52,11 +53,10 @@ from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 from torchrl_hmcts.trainers.skills.curves import Curves
-from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
 
 _REWARD_SCALES = {"METRAEncoderLoss": 3.0, "LSDEncoderLoss": 10.0, "SkillDynamicsLoss": 0.5}
-_CURVE_EXPANSIONS = 300  # of a search while the worker learns
 
 
 def run_skills(config: SkillsConfig) -> dict[str, Any]:
@@ -374,89 +374,13 @@ def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTr
         own |= {
             "make_test_env": partial(kit.make_env, "curve"),
             "make_test_planner": lambda simulator, **_: kit.make_planner(
-                simulator, **_curve_budget(config)
+                simulator, **curve_budget(config)
             ),
             "test_rounds": config.curve_mazes,
             "test_interval": max(1, round(expected / config.curve_points)),
         }
     make_env = partial(kit.make_env, "train")
     return HMCTSTrainer(make_env, loss, **{**own, **keywords})
-
-
-def _curve_budget(config: SkillsConfig) -> dict[str, int]:
-    return {"expansions": min(_CURVE_EXPANSIONS, config.expansions)}
-
-
-class CurveTests:
-    """Tries the worker in held-out mazes while a ``DIAYNTrainer`` trains it, for Figure 4.10.
-
-    Random numbers of the training are not touched. The networks that solved the most mazes are
-    kept, of several the latest: skills keep changing, and the last ones need not be the best. Those
-    of the test before the training are never kept: they are no learned skills.
-
-    Args:
-        trainer: whose loss has the actor.
-        kit: of the experiment.
-        interval: base steps between two tests; there is one before and one after the training.
-    """
-
-    def __init__(self, trainer: DIAYNTrainer, kit: Kit, interval: int) -> None:
-        self.trainer, self.kit, self.interval = trainer, kit, interval
-        self.records = RoundRecords()
-        self._at = -1  # base steps at the latest test
-        self._best: dict[str, Any] = {}  # "solved", how many, the "loss" that did, and its "step"
-        worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
-        self.model = kit.make_simulator(worker, "curve")
-        self.real = kit.make_options(kit.make_env("curve"), worker)
-        with torch.random.fork_rng(devices=[]):  # a new env draws its seed
-            self.starts = kit.starts("curve", kit.config.curve_mazes)
-        trainer.register_op("setup", self)
-        trainer.register_op("post_steps_log", self)
-        trainer.register_module("curve_tests", self)
-
-    def __call__(self, batch: TensorDictBase | None = None) -> None:
-        config, steps = self.kit.config, self.trainer.collected_frames
-        due = self._at < 0 or steps - self._at >= self.interval
-        if not due and not self._at < steps >= self.trainer.total_frames:
-            return
-        self._at = steps
-        with seeded(config.seed, "test", 0):
-            planner = self.kit.make_planner(self.model, **_curve_budget(config))
-            results = plan_and_execute(planner, self.real, self.starts)
-        self.records.add(results, np.arange(len(results.solved)), steps)
-        solved = int(results.solved.sum())
-        if steps > 0 and solved >= self._best.get("solved", 0):
-            state = self.trainer.loss_module.state_dict()
-            self._best = {
-                "solved": solved,
-                "step": steps,
-                "loss": {name: value.clone() for name, value in state.items()},
-            }
-        logger = self.trainer.logger
-        if logger is not None:
-            frames = results.episode_steps * config.frames_per_step
-            frames = np.where(results.solved, frames, config.max_frames)
-            logger.log_scalar("test_solved", float(results.solved.mean()), step=steps)
-            logger.log_scalar("test_frames", float(frames.mean()), step=steps)
-
-    def restore_best(self) -> int:
-        """Give the loss back the networks that solved the most mazes; return their base steps.
-
-        Those of the end stay where nothing is known of others, in a run of an older version.
-        """
-        if not self._best:
-            return self.trainer.collected_frames
-        self.trainer.loss_module.load_state_dict(self._best["loss"])
-        return int(self._best["step"])
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"at": self._at, "records": self.records.state_dict(), "best": self._best}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        self._at = int(state_dict["at"])
-        self.records.load_state_dict(state_dict["records"])
-        best = dict(state_dict.get("best", {}))
-        self._best = best if "step" in best else {}  # an older version may have kept the untrained
 
 
 # ---------------------------------------------------------------- planning and acting

@@ -9,7 +9,6 @@ own is a subclass of :class:`Kit` with the first four methods.
 from __future__ import annotations
 
 import importlib
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +20,23 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
-from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import PUCT, MCTSPlanner, PolicyValueEvaluator
 from torchrl_hmcts.trainers.diayn import worker_losses
-from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
+from torchrl_hmcts.trainers.evaluation import (
+    Results,
+    act_by_policy,
+    option_reach,
+    plan_and_execute,
+)
+from torchrl_hmcts.trainers.experiments.kits.four_stages import four_stages
+from torchrl_hmcts.trainers.experiments.kits.showing import (
+    CAPTIONS,
+    draw_run,
+    start_to_show,
+    write_film,
+)
 from torchrl_hmcts.trainers.experiments.kits.trial import LearnedSkills, Trial
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
@@ -91,16 +100,7 @@ class Kit:
     place_key: NestedKey = "position"
     worker_keys: Sequence[NestedKey] = ("observation",)
     state_keys: Sequence[NestedKey] = ("position",)
-    captions: Mapping[str, str] = {
-        "episode.gif": "A test maze as it was solved: the plan (pale; colours are skills) and the "
-        "worker's way.",
-        "unsolved": "A test maze that was NOT solved: the plan, if one was found (pale; colours "
-        "are skills), and how far the worker came.",
-        "search.png": "The search for that plan: every place an option led to (grey: refused by "
-        "the novelty test), and the tree.",
-        "skills.png": "The skills: 10 mini-episodes for each, in an open room and in a maze.",
-        "losses.png": "Training of the worker: actor, both critics, discriminator.",
-    }
+    captions: Mapping[str, str] = CAPTIONS
     start_name = "mazes that the worker has never seen"
     unit = "base steps"
     curve_steps = "base_steps"
@@ -210,18 +210,9 @@ class Kit:
             self.config = replace(self.config, novelty_radius=RADIUS_SHARE * reach)
 
     def reach(self, simulator: EnvBase, starts: TensorDictBase) -> float:
-        """Return how far options move what the novelty test compares; a quarter move it farther.
-
-        Args:
-            simulator: the macro env, whose options are all taken.
-            starts: states ``[M]``.
-        """
-        options = torch.arange(self.config.num_skills).repeat_interleave(len(starts))
-        before = starts.repeat(self.config.num_skills)
-        after = simulator.step(before.clone().set("option", options))["next"]
-        compare: Any = self.make_planner(simulator).novelty
-        moved = compare.features(after) - compare.features(before)
-        return float(np.quantile(np.linalg.norm(moved, axis=-1), 0.75))
+        """Return how far options move what the novelty test compares, see :func:`option_reach`."""
+        novelty: Any = self.make_planner(simulator).novelty
+        return option_reach(simulator, starts, novelty.features, self.config.num_skills)
 
     def note(self, loss: LossModule) -> None:
         """Take note of the networks that are learned: what ``features="learned"`` compares."""
@@ -263,7 +254,7 @@ class Kit:
         """Return the entries of the planner at the kit's defaults, by keyword."""
         config = self.config
         if config.manager == "source":
-            return self._source_part()
+            return four_stages(config.expansions)
         return {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
             "novelty": self.novelty_part(),
@@ -272,20 +263,6 @@ class Kit:
                 "expansions": config.expansions,
             },
             "leaves_per_wave": config.leaves_per_wave,
-        }
-
-    def _source_part(self) -> dict[str, Any]:
-        """Selection by UCT, expansion of one option, a random simulation, backup of the mean."""
-        planners = "torchrl_hmcts.planners"
-        return {
-            "_component_": f"{planners}.MCTSPlanner",
-            "tree_policy": {"_component_": f"{planners}.UCT"},
-            "leaf_evaluator": {"_component_": f"{planners}.RolloutEvaluator"},
-            "expand": "one",
-            "budget": {
-                "_component_": f"{planners}.SearchBudget",
-                "expansions": self.config.expansions,
-            },
         }
 
     def parts(self) -> dict[str, dict[str, Any]]:
@@ -393,29 +370,8 @@ class Kit:
         return ""
 
     def act_by(self, policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase) -> Results:
-        """Act in one episode by a policy over the options, without a search.
-
-        Args:
-            policy: reads the states of ``real``, writes the option.
-            real: the macro env to act in.
-            start: state ``[1]``.
-        """
-        begin = time.perf_counter()
-        limit = self.config.max_frames
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            episode = real.rollout(limit, policy, auto_reset=False, tensordict=start[0].clone())
-        none = np.zeros(1, np.int64)
-        return Results(
-            found=np.array([True]),
-            solved=episode[-1]["next", "terminated"].numpy().reshape(1),
-            simulated_steps=none,
-            expansions=none,
-            simulations=none,
-            plan_options=np.array([len(episode)]),
-            episode_steps=np.array([int(episode["next", "duration"].sum())]),
-            rewards=np.array([float(episode["next", "reward"].sum())], np.float32),
-            plan_seconds=np.array([time.perf_counter() - begin]),
-        )
+        """Act in one episode without a search, see :func:`act_by_policy`."""
+        return act_by_policy(policy, real, start, limit=self.config.max_frames)
 
     def act(
         self,
@@ -474,48 +430,11 @@ class Kit:
 
     def draw(self, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
         """Draw the pictures of a run: an episode, its search, the skills, their training."""
-        config, captions = self.config, self.captions
-        shown, episode, search = self.replay(learned.worker, trial)
-        drawing = self.map(self.make_env("test"))
-        if drawing is not None:
-            words = captions["episode.gif" if episode.solved[0] else "unsolved"]
-            with pictures.one("episode.gif", words) as path:
-                self.write_film(episode, path)
-            with pictures.one("search.png", captions["search.png"]) as path:
-                from torchrl_hmcts.trainers.figures.maps import plot_search
-
-                plot_search(drawing, search, path)
-        if learned.loss is None:
-            return
-        if drawing is not None:
-            steps = learned.worker_step * config.frames_per_step
-            seen = f" The worker of all pictures is that after {steps:,} {self.unit}."
-            with pictures.one("skills.png", captions["skills.png"] + seen) as path:
-                from torchrl_hmcts.trainers.figures.maps import plot_skill_fan
-
-                generator = torch.Generator().manual_seed(config.seed)
-                sampling = SkillPolicy(learned.loss.actor_network, generator=generator)
-                maze = int(trial.starts[shown].get("maze_index", torch.zeros(())))
-                rooms = drawing.rooms(10 * config.num_skills, maze)
-                steps = 100 // config.frames_per_step
-                plot_skill_fan(sampling, rooms, path, num_skills=config.num_skills, steps=steps)
-        if not learned.history:
-            return
-        with pictures.one("losses.png", captions["losses.png"]) as path:
-            from torchrl_hmcts.trainers.figures.curves import plot_losses
-
-            plot_losses(learned.history, learned.steps, path)
+        draw_run(self, pictures, learned, trial)
 
     def replay(self, worker: TensorDictModuleBase, trial: Trial) -> tuple[int, Results, Any]:
-        """Play an episode again to show it: one that was solved, if any, with a rather long way.
-
-        Returns:
-            Which of the starts, the episode with its states, and its search.
-        """
-        solved = np.flatnonzero(trial.results.solved)
-        among = solved if len(solved) else np.arange(len(trial.starts))
-        by_length = among[np.argsort(self.path_lengths(trial.starts)[among], kind="stable")]
-        shown = int(by_length[int(0.85 * (len(by_length) - 1))])
+        """Play an episode again to show it; return which start, the episode, and its search."""
+        shown = start_to_show(trial, self.path_lengths(trial.starts))
         episode = self.film(worker, trial.planner, trial.starts[shown : shown + 1])
         return shown, episode, trial.planner.last_search
 
@@ -549,15 +468,7 @@ class Kit:
             episode: of :meth:`film`.
             path: of the GIF.
         """
-        from torchrl_hmcts.trainers.figures import animation, maps
-
-        drawing = None if episode.frames else self.map(self.make_env("test"))
-        if drawing is None:
-            animation.write_gif(episode.frames, path, milliseconds=40.0)
-            return
-        options = episode.options[0].tolist()
-        states = list(episode.states[0].unbind(0))
-        maps.write_episode_gif(drawing, states, options, episode.plans[0], path)
+        write_film(self.map(self.make_env("test")), episode, path)
 
     def rows(self) -> list[tuple[str, str]]:
         """Return names and formats of the figures in the table that ends a run."""

@@ -31,7 +31,7 @@ from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.saving.files import replacing
-from torchrl_hmcts.trainers.skills.rounds import RoundRecords
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords, frames_curve
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
     OptionTransform,
@@ -468,44 +468,3 @@ def wrong_models(error: float) -> dict[str, dict[str, Any]]:
         "slower clock, less friction": {"fps": low, "friction": less},
         "faster clock, more friction": {"fps": high, "friction": more},
     }
-
-
-def frames_curve(
-    records: RoundRecords, frames_per_step: int, max_frames: int
-) -> dict[str, list[float]]:
-    """Return the mean frames of an episode against the frames of training; Figure 4.10's curve.
-
-    An episode without a plan, or whose plan fails, counts with its whole length.
-
-    Args:
-        records: of test rounds.
-        frames_per_step: frames of a base step.
-        max_frames: of an episode.
-
-    Returns:
-        ``"training_steps"`` and ``"frames"`` (both in frames), ``"solved"`` (share) and
-        ``"solved_frames"``, the mean over those that were solved (NaN if none was).
-
-    Example:
-        >>> import numpy as np
-        >>> columns = dict.fromkeys(RoundRecords().columns, np.array([0, 1]))
-        >>> columns = {**columns, "training_steps": np.array([8, 8])}
-        >>> columns = {**columns, "executed_steps": np.array([0, 50])}
-        >>> frames_curve(RoundRecords(columns), 4, 10_000)
-        {'training_steps': [32.0], 'frames': [5100.0], 'solved': [0.5], 'solved_frames': [200.0]}
-    """
-    columns = records.columns
-    out: dict[str, list[float]] = {}
-    for steps in np.unique(columns["training_steps"]):
-        here = columns["training_steps"] == steps
-        solved = columns["solved"][here].astype(bool)
-        frames = columns["executed_steps"][here] * frames_per_step
-        point = {
-            "training_steps": float(steps * frames_per_step),
-            "frames": float(np.where(solved, frames, max_frames).mean()),
-            "solved": float(solved.mean()),
-            "solved_frames": float(frames[solved].mean()) if solved.any() else float("nan"),
-        }
-        for name, value in point.items():
-            out.setdefault(name, []).append(value)
-    return out
