@@ -10,10 +10,10 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import plan_and_execute
 from torchrl_hmcts.trainers.experiments.kits import Kit
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
+from torchrl_hmcts.trainers.off_policy import OffPolicyTrainer
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
 
 _EXPANSIONS = 300  # of a search while the worker learns
@@ -25,7 +25,7 @@ def curve_budget(config: SkillsConfig) -> dict[str, int]:
 
 
 class CurveTests:
-    """Tries the worker in held-out mazes while a ``DIAYNTrainer`` trains it, for Figure 4.10.
+    """Tries the worker in held-out mazes while a trainer trains it, for Figure 4.10.
 
     Random numbers of the training are not touched. The networks that solved the most mazes are
     kept, of several the latest: skills keep changing, and the last ones need not be the best. Those
@@ -37,7 +37,7 @@ class CurveTests:
         interval: base steps between two tests; there is one before and one after the training.
     """
 
-    def __init__(self, trainer: DIAYNTrainer, kit: Kit, interval: int) -> None:
+    def __init__(self, trainer: OffPolicyTrainer, kit: Kit, interval: int) -> None:
         self.trainer, self.kit, self.interval = trainer, kit, interval
         self.records = RoundRecords()
         self._at = -1  # base steps at the latest test

@@ -94,8 +94,8 @@ class SkillsConfig(RunConfig):
     curve_points: int = 0
     """How often it is tried; 0: never."""
     keep: str = "best"
-    """Which worker of DIAYN's training to keep: "best", that which solved the most of those mazes
-    (of several the latest), or "last". Algorithm 3 keeps its last."""
+    """Which worker of a training to keep: "best", that which solved the most of those mazes
+    (of several the latest), or "last"."""
     logger: str = "csv"
     """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
     collector: str = "local"
@@ -198,6 +198,8 @@ class DemoConfig(SkillsConfig):
     }
 
     def __post_init__(self) -> None:
+        if self.algorithm == "hmcts" and self.curve_points == 0 and self.keep == "best":
+            self.curve_points = 10
         for name, own in self.OWN.items():
             if getattr(self, name) == 0:
                 setattr(self, name, own[self.task == "boat"])

@@ -29,7 +29,7 @@ from torchrl_hmcts.planners import MCTSPlanner
 from torchrl_hmcts.trainers.collectors import make_ray_collector
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results
-from torchrl_hmcts.trainers.experiments.curve_tests import CurveTests, curve_budget
+from torchrl_hmcts.trainers.experiments.curve_tests import CurveTests
 from torchrl_hmcts.trainers.experiments.kits import (
     OBJECTIVE,
     Kit,
@@ -49,7 +49,6 @@ from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
-from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 from torchrl_hmcts.trainers.skills.curves import Curves
@@ -202,14 +201,9 @@ def learn(
     loss = make_loss(kit)
     common = {"save_dir": save_dir, "progress": progress, "logger": logger, "seed": config.seed}
     common |= {"total_frames": config.train_steps, **config.trainer}
-    trainer: ResumableTrainer
-    tests: CurveTests | None = None
-    if config.algorithm == "hmcts":
-        trainer = _make_hmcts(kit, loss, common)
-    else:
-        trainer = _make_diayn(kit, loss, common)
-        if config.curve_points:
-            tests = CurveTests(trainer, kit, _curve_interval(config))
+    make_trainer = _make_hmcts if config.algorithm == "hmcts" else _make_diayn
+    trainer: Any = make_trainer(kit, loss, common)
+    tests = CurveTests(trainer, kit, _curve_interval(config)) if config.curve_points else None
     kept = [key for key in config.KEPT if key != "toy"]
     trainer.run_settings.update({name: getattr(config, name) for name in kept})
     if resume and save_dir is not None:
@@ -218,16 +212,14 @@ def learn(
     step = trainer.collected_frames
     if tests is not None and config.keep == "best":
         step = tests.restore_best()
-    rounds = isinstance(trainer, HMCTSTrainer)
-    records = trainer.test_records if isinstance(trainer, HMCTSTrainer) else RoundRecords()
     return LearnedSkills(
         SkillPolicy(loss.actor_network, deterministic=True),
         loss,
         Curves(trainer.history),
-        records if tests is None else tests.records,
+        RoundRecords() if tests is None else tests.records,
         trainer.collected_frames,
         step,
-        len(trainer.records) if rounds else 0,
+        len(trainer.records) if isinstance(trainer, HMCTSTrainer) else 0,
         round(time.process_time() - begin, 1),
     )
 
@@ -355,9 +347,6 @@ def _make_diayn(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> DIAYNTr
 
 def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTrainer:
     config = kit.config
-    options = config.num_skills * config.option_steps
-    batch = config.retrain_interval * config.round_expansions * options
-    expected = max(1, (config.train_steps - config.init_options * config.option_steps) // batch)
     own: dict[str, Any] = {
         "rounds": config.rounds or 2**31,  # or ended by total_frames
         "c_p": config.c_p,
@@ -370,15 +359,6 @@ def _make_hmcts(kit: Kit, loss: LossModule, keywords: dict[str, Any]) -> HMCTSTr
         "make_planner": kit.make_round_planner,
         "updates_per_step": config.updates_per_step,
     }
-    if config.curve_points:
-        own |= {
-            "make_test_env": partial(kit.make_env, "curve"),
-            "make_test_planner": lambda simulator, **_: kit.make_planner(
-                simulator, **curve_budget(config)
-            ),
-            "test_rounds": config.curve_mazes,
-            "test_interval": max(1, round(expected / config.curve_points)),
-        }
     make_env = partial(kit.make_env, "train")
     return HMCTSTrainer(make_env, loss, **{**own, **keywords})
 
