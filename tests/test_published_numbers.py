@@ -216,3 +216,11 @@ def test_every_number_of_a_table_is_in_its_data(name: str, heading: str, file: s
         assert not wrong, f"{first}: {wrong} in {name} are not in {file}"
         checked += 1
     assert checked >= 5
+
+
+def test_the_tables_of_each_parts_worth_are_those_of_the_data() -> None:
+    import ablations
+
+    found = ablations.tables(data("ablations.json")["rows"])
+    assert ablations.fill(page("docs/ablations.md"), found) == page("docs/ablations.md")
+    assert set(found) <= set(re.findall(r"<!-- (.*?) -->", page("docs/ablations.md")))
