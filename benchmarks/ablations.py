@@ -35,6 +35,7 @@ from torchrl_hmcts.trainers.experiments.managers import learn_manager
 from torchrl_hmcts.trainers.experiments.registry import DEMO, EXPERIMENTS
 from torchrl_hmcts.trainers.experiments.skills import learn, make_loss
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, wilson
+from torchrl_hmcts.trainers.skills.rounds import frames_curve
 
 COMMAND = "python benchmarks/ablations.py --seeds 0 1 2 --out docs/results/ablations.json"
 TASKS: dict[str, tuple[str, ...]] = {  # kit, then words
@@ -45,6 +46,7 @@ TASKS: dict[str, tuple[str, ...]] = {  # kit, then words
     "key 15": ("waterworld", "mazes=30", "task=key", "size=15", "search_steps=60000"),
     "apples 15": ("waterworld", "mazes=50", "task=apples", "size=15"),
     "lab": ("labmaze", "mazes=50", "curve_points=0"),
+    "lab, tested": ("labmaze", "mazes=50"),
     "lab turn": ("labmaze", "mazes=50", "task=turn", "curve_points=0", "search_frames=80000"),
     "lab apples 15": (
         *("labmaze", "mazes=50", "task=apples", "size=15", "curve_points=0"),
@@ -81,6 +83,9 @@ def arms(seeds: Sequence[int]) -> Iterator[Arm]:
             yield from workers(task, seed)
         for task in ("maze", "lab"):
             yield from features(task, seed)
+        for task in ("maze", "lab, tested"):
+            words = ("algorithm=hmcts",)
+            yield Arm("algorithm 3", task, "Algorithm 3 from scratch", words, seed=seed)
     for seed in seeds:
         for task in ("maze", "lab"):
             yield from workers(task, seed)
@@ -170,11 +175,16 @@ def hand_written(task: str) -> TensorDictModule:
 
 
 @lru_cache(maxsize=4)
-def trained(kit_name: str, words: tuple[str, ...]) -> tuple[Any, float]:
-    """Return a learned worker's loss and the CPU seconds that it took."""
+def trained(kit_name: str, words: tuple[str, ...]) -> tuple[Any, float, dict[str, Any]]:
+    """Return a worker's loss, its CPU seconds, and how it did while it learned."""
     kit = configured(kit_name, words)
     learned = learn(kit)
-    return learned.loss, learned.seconds
+    config, columns = kit.config, frames_curve(learned.tests, 1, kit.config.max_frames)
+    if not columns:
+        return learned.loss, learned.seconds, {}
+    steps = [int(x) for x in columns["training_steps"]]
+    curve = {"base_steps": steps, "solved": columns["solved"], "mazes": config.curve_mazes}
+    return learned.loss, learned.seconds, {"curve": curve}
 
 
 def configured(kit_name: str, words: Sequence[str]) -> Kit:
@@ -202,7 +212,7 @@ def measure(arm: Arm) -> dict[str, Any]:
     words += [*arm.words, f"seed={arm.seed}"]
     kit = configured(kit_name, words)
     kit.second_try = lambda: None  # type: ignore[method-assign]
-    seconds = 0.0
+    seconds, curve = 0.0, {}
     if arm.worker == "hand-written":
         worker: Any = hand_written(arm.task)
     elif arm.worker == "untrained":
@@ -210,7 +220,7 @@ def measure(arm: Arm) -> dict[str, Any]:
         worker = SkillPolicy(make_loss(made).actor_network, deterministic=True)
     else:
         learning = [word for word in words if not word.startswith(_PLANNING)]
-        loss, seconds = trained(kit_name, tuple(learning))
+        loss, seconds, curve = trained(kit_name, tuple(learning))
         kit.note(loss)
         worker = SkillPolicy(loss.actor_network, deterministic=True)
     if kit.config.manager == "learned":
@@ -230,6 +240,7 @@ def measure(arm: Arm) -> dict[str, Any]:
         "simulated": results.simulated_steps.tolist(),
         "executed": results.episode_steps.tolist(),
         "rewards": [round(float(reward), 3) for reward in results.rewards],
+        **curve,
         "training_cpu_seconds": round(seconds, 1),
         "cpu_seconds": round(time.process_time() - begin, 1),
     }

@@ -23,6 +23,7 @@ from torchrl_hmcts.planners import (
 )
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers import DemoConfig, make_kit
+from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.managers import learn_manager, load_manager, save_manager
 from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.skills import make_loss, solve
@@ -36,6 +37,12 @@ RIGHT = torch.tensor(3)
 
 def fixed_worker() -> TensorDictModule:
     return TensorDictModule(lambda skill: skill, ["skill"], ["action"])
+
+
+def plan_with_features(features: str) -> MCTSPlanner:
+    kit = make_kit(DemoConfig(features=features))
+    make_loss(kit)
+    return kit.make_planner(kit.make_options(kit.make_env("test"), fixed_worker()))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +134,7 @@ def test_items_are_drawn_from_their_seed_on_free_tiles() -> None:
         (lambda: maze_pool("test", 11), "9, 15 and 31"),
         (lambda: DemoConfig(size=11), "size is 9, 15 or 31"),
         (lambda: DemoConfig(task="sail"), "task is one of maze, boat"),
-        (lambda: make_kit(DemoConfig(features="learned")).planner_part(), "objective=metra"),
+        (lambda: plan_with_features("learned"), "objective=metra"),
     ],
 )
 def test_what_does_not_exist_is_refused_with_what_does(build, words) -> None:
@@ -205,6 +212,12 @@ def test_learned_features_have_a_radius_found_from_the_options() -> None:
     assert novelty.radius == pytest.approx(
         0.75 * kit.reach(kit.make_simulator(worker, "train"), kit.starts("train", 8))
     )
+
+
+def test_learned_features_are_a_key_of_the_command_line(tmp_path) -> None:
+    words = ["objective=metra", "objective_key=observation", "features=learned", "toy=true"]
+    assert main(["train", "kit=waterworld", *words, f"out={tmp_path}"]) == 0
+    assert main(["evaluate", f"run={tmp_path}", "features=none"]) == 0
 
 
 def test_the_dissertations_manager_has_four_stages() -> None:

@@ -229,14 +229,8 @@ class Kit:
         part |= {"key": self.place_key, "radius": config.novelty_radius}
         if self.shorter_paths:
             part["shorter_paths"] = True
-        if config.features == "learned":
-            encoder = self._encoder
-            if encoder is None or "displacement" in encoder.in_keys:
-                raise ExperimentError(
-                    "features=learned compares what the objective's network says of a state; "
-                    "this one reads none. Add objective=metra, or objective_key=observation."
-                )
-            part |= {"key": encoder.out_keys[0], "encoder": encoder}
+        if config.features == "learned" and self._encoder is not None:
+            part |= {"key": self._encoder.out_keys[0], "encoder": self._encoder}
         return part
 
     def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
@@ -287,6 +281,14 @@ class Kit:
             simulator: the macro env to plan in.
             **budget: changes of its :class:`~torchrl_hmcts.planners.SearchBudget`.
         """
+        encoder = self._encoder
+        if self.config.features == "learned" and (
+            encoder is None or "displacement" in encoder.in_keys
+        ):
+            raise ExperimentError(
+                "features=learned compares what the objective's network says of a state; this one "
+                "reads none. Add objective=metra, or objective_key=observation."
+            )
         part = merged(self.planner_part(), self.config.planner)
         part["budget"] = {**part["budget"], **budget}
         planner: MCTSPlanner = build(**part, env=simulator)
