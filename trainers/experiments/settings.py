@@ -74,10 +74,11 @@ class SkillsConfig(RunConfig):
     """Constant of UCT in Algorithm 3's rounds."""
     rounds: int = 0
     """Rounds of Algorithm 3; 0: as many as the base steps of training allow."""
-    retrain_interval: int = 4
+    retrain_interval: int = 1
     """Rounds of Algorithm 3 between two trainings of the worker (the dissertation's N_retrain)."""
-    round_expansions: int = 2
-    """Nodes that the search of a training round may expand; an untrained worker finds few plans."""
+    round_expansions: int = 30
+    """Nodes that the search of a training round may expand: enough for a trained worker to find the
+    goal in most rounds."""
     expansions: int = 1_000
     """Nodes that a search in a test maze may expand before it gives up."""
     leaves_per_wave: int = 4
@@ -92,7 +93,7 @@ class SkillsConfig(RunConfig):
     curve_mazes: int = 20
     """Mazes, other than the test mazes, in which the worker is tried while it learns."""
     curve_points: int = 0
-    """How often it is tried; 0: never."""
+    """How often it is tried; 0: never (with algorithm=hmcts and keep=best 10 times)."""
     keep: str = "best"
     """Which worker of a training to keep: "best", that which solved the most of those mazes
     (of several the latest), or "last"."""
