@@ -75,7 +75,7 @@ def test_planner_keys_hold_in_algorithm_3s_rounds() -> None:
     planner = kit.make_round_planner(simulator, tree_policy=UCT(2.0), seed=5)
     assert planner.tree_policy == PUCT()
     assert planner.novelty.radius == 0.4
-    assert (planner.budget.expansions, planner.budget.until_plan) == (2, False)
+    assert (planner.budget.expansions, planner.budget.until_plan) == (30, False)
     bare = make_kit(DemoConfig()).make_round_planner(simulator, tree_policy=UCT(2.0), seed=5)
     expected = MCTSPlanner(
         simulator,
