@@ -60,7 +60,7 @@ def collect(args: argparse.Namespace) -> None:
         row["learning"] = row.pop("finding").get("learning", {})
         row["scores"] = [episode["score"] for episode in row.pop("episodes")]
         del row["curves"], row["tuning"]
-    command = "python benchmarks/atari_sources.py --games Pong Breakout SpaceInvaders"
+    command = "python benchmarks/atari_sources.py"
     write_json(args.out / "learned.json", {"command": command, "budget": BUDGET, "rows": rows})
     curves: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:

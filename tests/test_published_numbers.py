@@ -154,6 +154,18 @@ def test_figures_beside_the_dissertation_are_those_of_the_data() -> None:
         assert claim in text, f"docs/results/README.md should say: {claim}"
 
 
+@pytest.mark.parametrize(("ratio", "claim"), [(25.0, "{} to {} base steps"), (50.0, "{} to {} at")])
+def test_simulated_steps_for_a_real_one_are_those_of_the_runs(
+    ratio: float, claim: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_extensions"))
+    from results_atari import simulated_per_real
+
+    runs = [run for run in data("atari/runs.json") if run["settings"]["ratio"] == ratio]
+    found = [simulated_per_real(run) for run in runs]
+    assert claim.format(round(min(found)), round(max(found))) in page("docs/atari.md")
+
+
 # Tables that people wrote: page, heading, and the file whose records their rows show.
 TABLES = [
     ("docs/results/README.md", "## Classic envs at the defaults", "settable/classic.json"),

@@ -62,7 +62,7 @@ class LearningCurve:
                 scores.append(agent.play(max_steps=self.max_steps or None).score)
             self.num_frames += pool.num_frames
             pool.close()
-        row = {"samples": samples, "frames": frames, "scores": scores}
+        row: dict[str, Any] = {"samples": samples, "frames": frames, "scores": scores}
         row |= {"mean": sum(scores) / len(scores), "least": min(scores), "largest": max(scores)}
         self.rows.append(row)
         self.kit.log(f"after {samples:,} training samples: scores {scores}")

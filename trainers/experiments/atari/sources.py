@@ -140,7 +140,8 @@ def make_source(config: AtariConfig, search: AtariSearch) -> OptionSource:
             source = TrainedSource("fine_tuned", source, **steps)
     else:
         objective, _, seen = name.partition("_")
-        skills = {"objective": objective, "discriminator": seen or "state", "fire": config.fire}
+        skills: dict[str, Any] = {"objective": objective, "discriminator": seen or "state"}
+        skills["fire"] = config.fire
         skills |= {"game_weight": config.game_weight, "num_skills": config.num_skills}
         source = TrainedSource("diayn", **skills, **steps)
         weight = 0.1
