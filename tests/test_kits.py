@@ -81,7 +81,7 @@ def test_planner_keys_hold_in_algorithm_3s_rounds() -> None:
         simulator,
         tree_policy=UCT(2.0),
         novelty=RadiusNovelty("position", 1.0),
-        budget=SearchBudget(expansions=2),
+        budget=SearchBudget(expansions=30),
         seed=5,
     )
     assert repr(bare) == repr(expected)

@@ -248,9 +248,9 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
         theirs, ours = config.get("id"), getattr(kit.config, "id", None)
         if isinstance(error, ValueError) and theirs != ours:
             raise ValueError(
-                f"The skills of {folder} were learned in {theirs}; {ours} has other observations, "
-                "other actions, or other keys that shape the networks (num_skills, hidden)."
-            ) from error
+                f"{error} They were learned in {theirs}; {ours} may have other observations or "
+                "actions."
+            ) from None
         raise
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     step = int("".join(filter(str.isdigit, path.stem)) or 0)
