@@ -35,10 +35,10 @@ class SkillsConfig(RunConfig):
     worker: str = ""
     """Folder of a run or an agent whose skills are taken; none are learned then."""
     algorithm: str = "diayn"
-    """How the worker learns: "diayn" (mini-episodes, before the manager plans) or "hmcts"
+    """Training of the worker: "diayn" (mini-episodes, before the manager plans) or "hmcts"
     (Algorithm 3 from scratch: rounds of search in training mazes)."""
     objective: dict[str, Any] = field(default_factory=dict)
-    """What sets skills apart: objective=metra, lsd, dads or diayn, the default;
+    """Objective of the skills: objective=metra, lsd, dads or diayn, the default;
     objective.KEY=VALUE."""
     loss: dict[str, Any] = field(default_factory=dict)
     """The worker's loss: loss=diayn, the default, or discrete_skill_sac; for actions within bounds
@@ -70,14 +70,14 @@ class SkillsConfig(RunConfig):
     curve_mazes: int = 20
     """Mazes, other than the test mazes, in which the worker is tried while it learns."""
     curve_points: int = 0
-    """How often it is tried; 0: never."""
+    """Number of such tests; 0: none."""
     keep: str = "best"
     """Which worker of DIAYN's training to keep: "best", that which solved the most of those mazes
     (of several the latest), or "last". Algorithm 3 keeps its last."""
     logger: str = "csv"
-    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
+    """Logger of the training's values: "csv" (always), "tensorboard" or "wandb" as well."""
     collector: str = "local"
-    """Where the worker acts for its training: "local" in this process, or "ray" in a process of a
+    """Collector of the training: "local" acts in this process, "ray" in a process of a
     Ray cluster (with algorithm=diayn; such a run does not continue exactly)."""
 
     KIT: ClassVar[str] = ""  # name of the kit
@@ -215,7 +215,7 @@ class LabMazeConfig(SkillsConfig):
     novelty_radius: float = 1.0
     """Cells within which a place counts as visited; less than an option covers."""
     curve_points: int = 10
-    """How often the worker is tried while it learns; 0: never."""
+    """Number of tests of the worker while it learns; 0: none."""
     robust_mazes: int = 40
     """Test mazes to solve where clock and friction differ from the model's, for each sign."""
     robust_error: float = 0.05
@@ -326,7 +326,7 @@ class WaterworldA3CConfig(RunConfig):
     eval_mazes: int = 64
     """Test mazes of a point of the curve."""
     logger: str = "csv"
-    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
+    """Logger of the training's values: "csv" (always), "tensorboard" or "wandb" as well."""
     toy: bool = False
     """Seconds instead of minutes: 4,000 base steps and 3 mazes, to see that everything works."""
 

@@ -28,7 +28,7 @@ class AtariConfig(RunConfig):
     """"deterministic" (comparable with the dissertation and the planning papers) or "sticky"
     (actions stick with probability 0.25, and the planner is given no random generator)."""
     source: str = "best"
-    """Where options come from; `options=` is the same key. Rules: "best" ("action_sets",
+    """Source of the options; `options=` is the same key. Rules: "best" ("action_sets",
     "actions" or "goals", with which a planner's trials score best), "goals" (found by a probe
     and trials), "repeat" (one for each action), "actions" (some of these, chosen by trials),
     "action_sets" (all of these, those that fire or those that do not, chosen by trials).
@@ -61,7 +61,7 @@ class AtariConfig(RunConfig):
     tree_policy: str = "puct"
     """"puct" (max backup, values scaled to [0, 1]) or "uct" (mean backup), e.g. to compare with."""
     guide: str = "none"
-    """Whether a network learns from the searches and guides those after them: "none", "prior" or
+    """Network that learns from the searches and guides those after them: "none", "prior" or
     "prior_value"."""
     c: float = 2.0
     """Weight of exploration; for UCT in units of the greatest reward seen."""

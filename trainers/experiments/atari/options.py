@@ -22,7 +22,7 @@ from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 
 @dataclass
 class Training:
-    """What a network worker was trained with: the live loss, transitions ``[n]`` of its data, and
+    """Training data of a network worker: the live loss, transitions ``[n]`` of its data, and
     the bytes whose displacement its objective reads (None if it reads the state)."""
 
     loss: DiscreteSkillSACLoss
