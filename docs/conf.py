@@ -128,7 +128,7 @@ html_show_sourcelink = False
 html_favicon = "_static/logo.svg"
 html_theme_options = {
     "logo": {
-        "text": "torchrl_hmcts",
+        "text": f"torchrl_hmcts {version}",
         "image_light": "_static/logo.svg",
         "image_dark": "_static/logo.svg",
     },

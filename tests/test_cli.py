@@ -100,10 +100,11 @@ def test_the_version_is_said(capsys) -> None:
 def test_the_first_words_come_before_torch_is_loaded(tmp_path) -> None:
     program = (
         "import sys\nfrom torchrl_hmcts.trainers import cli\n"
-        "from torchrl_hmcts.trainers.experiments.registry import Experiment\n"
-        "def stop(self): sys.exit('torch' in sys.modules)\n"
-        "Experiment.function = property(stop)\n"
-        f"cli.main(['train', 'experiment=labmaze', 'out={tmp_path}', 'logger=tensorboard'])\n"
+        "from torchrl_hmcts.trainers.command_line import running\n"
+        "def stop(config, parts): sys.exit('torch' in sys.modules)\n"
+        "running.with_parts = stop\n"
+        f"words = ['experiment=labmaze', 'out={tmp_path}', 'logger=tensorboard']\n"
+        "cli.main(['train', *words, 'planner/tree_policy=puct'])\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0

@@ -168,7 +168,8 @@ def test_values_go_to_other_loggers_as_well(tmp_path, logger) -> None:
 def test_a_board_gets_groups_and_what_the_page_shows(tmp_path, capsys, logger, monkeypatch) -> None:
     pytest.importorskip(logger)
     monkeypatch.delenv("WANDB_MODE", raising=False)
-    words = ["kit=waterworld", "toy=true", "curve_points=1", f"logger={logger}", f"out={tmp_path}"]
+    words = ["kit=waterworld", "toy=true", "mazes=1", f"logger={logger}", f"out={tmp_path}"]
+    words += ["curve_points=1", "curve_mazes=1", "expansions=60"]
     assert main(["train", *words]) == 0
     watch = {
         "tensorboard": f"tensorboard --logdir {tmp_path}\n",

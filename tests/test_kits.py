@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,10 @@ from torchrl_hmcts.planners import PUCT, UCT, MCTSPlanner, RadiusNovelty, Search
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.command_line import train
 from torchrl_hmcts.trainers.command_line.words import parse_config
+from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
 from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.registry import DEMO
-from torchrl_hmcts.trainers.experiments.settings import DemoConfig
+from torchrl_hmcts.trainers.experiments.settings import DemoConfig, LabMazeConfig
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 PARTS = ["objective=metra", "planner/tree_policy=puct", "planner/novelty=radius"]
@@ -26,6 +28,26 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ["kit=waterworld", *PARTS, "planner.novelty.radius=0.5", "toy=true", f"out={out}"]
     assert main(["train", *words]) == 0
     return out
+
+
+class Nothing:
+    """A figure of nothing, at any depth."""
+
+    def __getitem__(self, key: str) -> Nothing:
+        return self
+
+    def __format__(self, spec: str) -> str:
+        return format(float("nan"), spec.replace(",", ""))
+
+
+@pytest.mark.parametrize("config", [DemoConfig(), LabMazeConfig(), GymConfig(id="MountainCar-v0")])
+def test_the_table_that_ends_a_run_fits_80_columns_and_shows_no_nan(config) -> None:
+    kit = make_kit(config)
+    names = re.findall(r"\{(\w+)", " ".join(form for _, form in kit.rows()))
+    lines = kit.table({name: Nothing() for name in names}).splitlines()
+    assert len(lines) == len(kit.rows()) >= 7
+    assert all(len(line) < 80 and line.endswith(" -") for line in lines)
+    assert "solved" in lines[0]
 
 
 def test_a_composed_agent_is_noted_and_continued(run: Path) -> None:

@@ -319,7 +319,7 @@ class TestRecurrentWorker:
         assert sizes[0] == 0
         assert (sizes[1:] > 0).all()
         base = TransformedEnv(GymEnv("Pendulum-v1"), InitTracker())
-        with pytest.raises(ValueError, match=r"keep \['memory'\].*make_tensordict_primer"):
+        with pytest.raises(ValueError, match=r"keeps \['memory'\].*make_tensordict_primer"):
             base.append_transform(OptionTransform(worker, 1, 3, worker_memory="keep"))
 
 
@@ -558,7 +558,7 @@ def vector_env() -> EnvBase:
 class TestAutoReset:
     def test_several_gym_envs_in_one_are_refused(self) -> None:
         base = vector_env()
-        with pytest.raises(ValueError, match=r"GymEnv steps.*all its 3 at once.*SerialEnv\(3"):
+        with pytest.raises(ValueError, match=r"GymEnv steps.*its 3 elements at once.*SerialEnv\(3"):
             base.append_transform(level("o", "action", 4))
         base.close()
 

@@ -36,10 +36,10 @@ class SkillsConfig(RunConfig):
     worker: str = ""
     """Folder of a run or an agent whose skills are taken; none are learned then."""
     algorithm: str = "diayn"
-    """How the worker learns: "diayn" (mini-episodes, before the manager plans) or "hmcts"
+    """Training of the worker: "diayn" (mini-episodes, before the manager plans) or "hmcts"
     (Algorithm 3 from scratch: rounds of search in training mazes)."""
     objective: dict[str, Any] = field(default_factory=dict)
-    """What sets skills apart: objective=metra, lsd, dads or diayn, the default;
+    """Objective of the skills: objective=metra, lsd, dads or diayn, the default;
     objective.KEY=VALUE."""
     objective_key: str = ""
     """Entry of the state that the objective reads. Default: the displacement since the skill began
@@ -54,7 +54,7 @@ class SkillsConfig(RunConfig):
     planner.KEY=VALUE, planner.PART.KEY=VALUE. They hold for Algorithm 3's training rounds too, but
     the expansions of those are round_expansions."""
     manager: str = "novelty"
-    """How options are chosen: "novelty" (UCT that refuses places it knows), "source" (the
+    """Manager: "novelty" (UCT that refuses places it knows), "source" (the
     dissertation's four stages: UCT with a random simulation from each new node, no novelty test),
     or "learned" (prior and value learned from searches in training mazes, carried to the test
     mazes)."""
@@ -86,21 +86,21 @@ class SkillsConfig(RunConfig):
     novelty_radius: float = 1.0
     """Tiles within which a place counts as visited; about what an option covers."""
     features: str = "place"
-    """What the novelty test compares: "place"; "learned": the output of the objective's network,
+    """Features that the novelty test compares: "place"; "learned": the output of the objective's network,
     within a radius found from how far options move it; or "none": all states are searched."""
     gamma: float = 0.99
     """Discount per base step."""
     curve_mazes: int = 20
     """Mazes, other than the test mazes, in which the worker is tried while it learns."""
     curve_points: int = 0
-    """How often it is tried; 0: never (with algorithm=hmcts and keep=best 10 times)."""
+    """Number of such tests; 0: none (10 with algorithm=hmcts and keep=best)."""
     keep: str = "best"
     """Which worker of a training to keep: "best", that which solved the most of those mazes
     (of several the latest), or "last"."""
     logger: str = "csv"
-    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
+    """Logger of the training's values: "csv" (always), "tensorboard" or "wandb" as well."""
     collector: str = "local"
-    """Where the worker acts for its training: "local" in this process, or "ray" in a process of a
+    """Collector of the training: "local" acts in this process, "ray" in a process of a
     Ray cluster (with algorithm=diayn; such a run does not continue exactly)."""
 
     KIT: ClassVar[str] = ""  # name of the kit
@@ -168,7 +168,7 @@ class DemoConfig(SkillsConfig):
     mazes: int = 100
     """Test mazes to solve, at most the 342 of the test split."""
     task: str = "maze"
-    """What there is to do: "maze" (reach the target), "boat" (the same with a body that must turn
+    """Task: "maze" (reach the target), "boat" (the same with a body that must turn
     to where it goes), "apples" (collect what is worth most before the fuel is spent) or "key" (the
     target is shut to who has not taken the key)."""
     size: int = 9
@@ -242,7 +242,7 @@ class LabMazeConfig(SkillsConfig):
     out: str = "runs/labmaze"
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     task: str = "maze"
-    """What there is to do: "maze" (find the goal), "turn" (the same without steps sideways or back)
+    """Task: "maze" (find the goal), "turn" (the same without steps sideways or back)
     or "apples" (collect apples, 1 each, before max_frames are over; the goal pays 1 and ends
     it)."""
     size: int = 9
@@ -274,7 +274,7 @@ class LabMazeConfig(SkillsConfig):
     novelty_radius: float = 1.0
     """Cells within which a place counts as visited; less than an option covers."""
     curve_points: int = 10
-    """How often the worker is tried while it learns; 0: never."""
+    """Number of tests of the worker while it learns; 0: none."""
     robust_mazes: int = 40
     """Test mazes to solve where clock and friction differ from the model's, for each sign."""
     robust_error: float = 0.05
@@ -395,7 +395,7 @@ class WaterworldA3CConfig(RunConfig):
     eval_mazes: int = 64
     """Test mazes of a point of the curve."""
     logger: str = "csv"
-    """Where values go while it trains: "csv" (always), "tensorboard" or "wandb" as well."""
+    """Logger of the training's values: "csv" (always), "tensorboard" or "wandb" as well."""
     toy: bool = False
     """Seconds instead of minutes: 4,000 base steps and 3 mazes, to see that everything works."""
 

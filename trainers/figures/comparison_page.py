@@ -99,7 +99,7 @@ def _sections(groups: Sequence[RunGroup]) -> list[Section]:
     lines = "Lines are means over the seeds, bands go from the least to the largest of them."
     means = "Means over seeds; below, 95 % bootstrap intervals."
     runs = [run for group in groups for run in group.runs]
-    figures = _figures(groups)
+    figures, alone = _figures(groups)
     return [
         Section(
             tables=[
@@ -108,8 +108,9 @@ def _sections(groups: Sequence[RunGroup]) -> list[Section]:
         ),
         Section(
             "Figures",
-            words=[] if not figures else [means] * several,
-            tables=figures or [Table([["No run has finished."]])],
+            words=[means] * several if figures or alone else [],
+            tables=figures or ([] if alone else [Table([["No run has finished."]])]),
+            inside=[Section("Figures that one group alone has", tables=alone, folded=True)],
         ),
         Section("Curves", words=[lines] * several, panels=_panels(groups)),
         Section("Pictures", inside=_pictures(groups)),
@@ -137,16 +138,20 @@ def _count(group: RunGroup) -> str:
     return words + (f" ({unfinished} not finished)" if unfinished else "")
 
 
-def _figures(groups: Sequence[RunGroup]) -> list[Table]:
-    """A row per figure, a column per group."""
+def _figures(groups: Sequence[RunGroup]) -> tuple[list[Table], list[Table]]:
+    """A row per figure, a column per group: what can be compared, and what one group alone has."""
     columns = [group.figures() for group in groups]
     names = dict.fromkeys(name for figures in columns for name in figures)
-    rows = []
+    shared: list[list[Any]] = []
+    alone: list[list[Any]] = []
     for name in names:
         key = Cell(name.replace("_", " "), title=name, kind="name")
+        having = sum(name in figures for figures in columns)
+        rows = shared if having >= min(2, len(groups)) else alone
         rows.append([key, *(_statistics(figures.get(name)) for figures in columns)])
     head = ["", *(Cell(group.name, color=_color(i)) for i, group in enumerate(groups))]
-    return [Table(rows, head)] if rows else []
+    tables = [[Table(rows, head)] if rows else [] for rows in (shared, alone)]
+    return tables[0], tables[1]
 
 
 def _statistics(values: list[float] | None) -> Cell:

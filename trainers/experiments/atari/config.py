@@ -33,7 +33,7 @@ class AtariConfig(RunConfig):
     """"deterministic" (comparable with the dissertation and the planning papers) or "sticky"
     (actions stick with probability 0.25, and the planner is given no random generator)."""
     source: str = "best"
-    """Where options come from; `options=` and `worker=` are the same key. Rules: "best"
+    """Source of the options; `options=` and `worker=` are the same key. Rules: "best"
     ("action_sets", "actions" or "goals", with which a planner's trials score best), "goals"
     (found by a probe and trials), "repeat" (one for each action), "actions" (some of these,
     chosen by trials), "action_sets" (all of these, those that fire or those that do not, chosen
@@ -87,7 +87,7 @@ class AtariConfig(RunConfig):
     backup: str = "default"
     """"max", "mean" or "default": the max for PUCT, the mean for UCT."""
     guide: str = "none"
-    """Whether a network learns from the searches and guides those after them: "none", "prior" or
+    """Network that learns from the searches and guides those after them: "none", "prior" or
     "prior_value"."""
     c: float = 2.0
     """Weight of exploration; for UCT in units of the greatest reward seen."""

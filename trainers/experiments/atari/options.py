@@ -22,9 +22,9 @@ from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
 
 @dataclass
 class Training:
-    """What a network worker was trained with: the live loss, transitions ``[n]`` of its data, the
-    bytes whose displacement its objective reads (None if it reads the state), and how many samples
-    it has learned from."""
+    """Training data of a network worker: the live loss, transitions ``[n]`` of its data, the bytes
+    whose displacement its objective reads (None if it reads the state), and how many samples it has
+    learned from."""
 
     loss: DiscreteSkillSACLoss
     data: TensorDictBase

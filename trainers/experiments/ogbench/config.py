@@ -11,7 +11,7 @@ from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_
 
 @dataclass
 class OGBenchConfig(RunConfig):
-    """What ``hmcts train kit=ogbench env.id=NAME`` does: learn from recorded episodes, then act.
+    """Keys of ``hmcts train kit=ogbench env.id=NAME``: learn from recorded episodes, then act.
 
     The defaults were chosen on pointmaze-teleport-navigate, seed 0, and are the same everywhere.
 
@@ -38,7 +38,7 @@ class OGBenchConfig(RunConfig):
     goal_steps: int = 30
     """Base steps by which a goal of the worker lies ahead, at most, and of an option."""
     progress_coeff: float = 2.0
-    """How much more the worker clones an action that led to the goal fast; 0: not at all."""
+    """Weight of actions that led to the goal fast in the worker's cloning; 0: none."""
     updates: int = 4_000
     """Updates of the worker."""
     batch_size: int = 512

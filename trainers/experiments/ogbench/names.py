@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Recipe(NamedTuple):
-    """How a dataset is recorded, as OGBench's scripts do."""
+    """Recipe of a dataset, as in OGBench's scripts."""
 
     env: str  # id of the env
     kind: str  # "navigate": goal after goal; "stitch": one goal, four cells away
