@@ -86,8 +86,9 @@ class SkillsConfig(RunConfig):
     novelty_radius: float = 1.0
     """Tiles within which a place counts as visited; about what an option covers."""
     features: str = "place"
-    """Features that the novelty test compares: "place"; "learned": the output of the objective's network,
-    within a radius found from how far options move it; or "none": all states are searched."""
+    """Features that the novelty test compares: "place"; "learned": the output of the objective's
+    network, within a radius found from how far options move it; or "none": all states are
+    searched."""
     gamma: float = 0.99
     """Discount per base step."""
     curve_mazes: int = 20
