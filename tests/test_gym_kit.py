@@ -183,18 +183,12 @@ def test_rewards_are_collected_with_a_search_before_every_option() -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "backup", "depth"),
-    [
-        ({"env": "CartPole-v1"}, "mean", 30),
-        ({"env": "Pendulum-v1"}, "max", 10),
-        ({"env": "Pendulum-v1", "option_steps": 12}, "max", 5),  # 60 base steps
-    ],
-    ids=str,
+    ("name", "backup", "depth"), [("CartPole-v1", "mean", 30), ("Pendulum-v1", "max", 10)], ids=str
 )
 def test_where_it_pays_to_live_on_the_mean_over_rollouts_counts(
-    keys: dict[str, Any], backup: str, depth: int
+    name: str, backup: str, depth: int
 ) -> None:
-    planner = HMCTS(**keys).planner
+    planner = HMCTS(name).planner
     assert planner.backup == backup
     assert planner.rollout.max_options == depth
     chooses = MostVisited if backup == "mean" else HighestValue

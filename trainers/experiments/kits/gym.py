@@ -40,7 +40,6 @@ from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 _PLAYED = 1_000_003  # added to the seed of envs to act in
-_HORIZON = 50  # base steps of a random way, where rewards are collected
 _STILL = 0.05  # of the radius, within a fifth of an option: it no longer moves
 _GOALS = ("achieved_goal", "desired_goal")
 
@@ -326,8 +325,7 @@ class GymKit(Kit):
             most_visited = {"_component_": f"{planners}.MostVisited"}
             part |= {"tree_policy": uct | {"c": 1.0}, "final_choice": most_visited}
         elif self.look.kind == "return":
-            # Longer random ways end badly whatever the next option is, as those of a lander do.
-            part["rollout"]["max_options"] = min(10, -(-_HORIZON // config.option_steps))
+            part["rollout"]["max_options"] = 10
             part |= {
                 "tree_policy": uct | {"c": 0.3},
                 "backup": "max",
