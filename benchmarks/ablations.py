@@ -324,9 +324,9 @@ def tables(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
 def fill(page: str, found: dict[str, str]) -> str:
     """Return a page with the table behind each comment that names one."""
     for name, table in found.items():
-        pattern = rf"(<!-- {re.escape(name)} -->\n\n)(?:\|.*\n)*"
-        page = re.sub(pattern, lambda match, table=table: f"{match[1]}{table}\n", page)
-    return page
+        pattern = rf"(<!-- {re.escape(name)} -->\n\n)(?:\|.*\n)*\n?"
+        page = re.sub(pattern, lambda match, table=table: f"{match[1]}{table}\n\n", page)
+    return page.rstrip() + "\n"
 
 
 def main() -> None:
