@@ -135,7 +135,7 @@ class WaterworldMazeEnv(TileMazeEnv):
         angles = np.arange(_HEADINGS) * (2.0 * math.pi / _HEADINGS)
         self._compass = np.stack((np.cos(angles), np.sin(angles)), -1).astype(np.float32)
         self._touch = self.PLAYER_RADIUS + self.TARGET_RADIUS
-        self._placed = items and PlacedItems(items, self.mazes, self._touch)
+        self._placed = None if items is None else PlacedItems(items, self.mazes, self._touch)
         self._physics = ChipmunkMazes(
             self.mazes.cpu().numpy(),
             radius=self.PLAYER_RADIUS,

@@ -314,8 +314,8 @@ def make_objective(kit: Kit, env: EnvBase, node: Mapping[str, Any]) -> SkillObje
             key = kit.config.objective_key or "displacement"
             network: Any = SkillDiscriminator(int(spec[key].shape[-1]), number, in_keys=[key])
         elif name == "SkillDynamicsLoss":
-            keys = {"in_keys": [key], "target_key": key}
-            network = SkillDynamics(*2 * [int(spec[key].shape[-1])], number, **keys)
+            size = int(spec[key].shape[-1])
+            network = SkillDynamics(size, size, number, in_keys=[key], target_key=key)
         else:
             linear = SpectralLinear if name == "LSDEncoderLoss" else torch.nn.Linear
             network = SkillEncoder(spec[key].shape[-1], number, in_keys=[key], linear=linear)

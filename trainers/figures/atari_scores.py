@@ -304,7 +304,7 @@ def write_table(rows: Sequence[Row], path: Path) -> str:
             line.append(", ".join(sorted({str(r.get("acts", "rules")) for r in runs})) or "-")
             line.append(len(runs))
         cells.append(line)
-    means = [
+    normalised = [
         [protocol, key.replace("score_", ""), *_aggregated(ours, protocol, key)]
         for protocol in protocols
         for key in ("score_mean", "score_max")
@@ -316,7 +316,7 @@ def write_table(rows: Sequence[Row], path: Path) -> str:
     sections = [
         Section(words=[_NOTE], tables=[table]),
         Section("What they took", tables=[Table(took, _TOOK)]),
-        Section("Human-normalised scores of all games", tables=[Table(means, words)]),
+        Section("Human-normalised scores of all games", tables=[Table(normalised, words)]),
         Section(
             "Table A.1: means of OpenAI Baselines, as the dissertation gives them",
             tables=[Table(baselines, ["", *TABLE_5_1])],

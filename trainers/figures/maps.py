@@ -96,8 +96,13 @@ class WaterworldMap:
         found: dict[str, tuple[MapDrawing, TensorDictBase]] = {}
         rooms = (torch.zeros_like(walls), center), (walls, middle)
         for title, (here, start) in zip(_ROOMS, rooms, strict=True):
-            body = {"steering": self.env.steering, "drag": self.env.drag}
-            env = WaterworldMazeEnv(here[None], observation=False, max_steps=10**9, **body)
+            env = WaterworldMazeEnv(
+                here[None],
+                observation=False,
+                max_steps=10**9,
+                steering=self.env.steering,
+                drag=self.env.drag,
+            )
             corner = (~here).nonzero()[-1].flip(-1) + 0.5  # reached last
             state = env.make_state(torch.zeros(num, dtype=torch.long), start, corner)
             found[title] = WaterworldMap(env), state

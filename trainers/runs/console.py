@@ -70,6 +70,8 @@ class Bar(tqdm):
         )
         _State.bar, _State.spoken = self, time.monotonic()
 
+    total: float | None
+
     def update(self, n: float | None = 1) -> bool | None:
         """Move it on by a number of steps."""
         moved = (1 if n is None else n) * self.scale

@@ -157,15 +157,15 @@ class LabMazeKit(Kit):
         if config.task == "turn":  # who turns stands still
             config = dataclasses.replace(config, stall_steps=0)
         super().__init__(config)
-        read_outs = (self.place_key, *self.worker_keys)
+        read_outs: tuple[str, ...] = (self.place_key, *self.worker_keys)
         if config.objective_key in READ_OUTS[3:]:
             read_outs = (*read_outs, config.objective_key)
-        self.env_kwargs: dict[str, Any] = {"read_outs": read_outs}
-        self.env_kwargs |= {
+        tasks: dict[str, dict[str, Any]] = {
             "maze": {},
             "turn": {"actions": {name: LAB_ACTIONS[name] for name in TURN_ACTIONS}},
             "apples": {"apple_reward": 1.0, "read_outs": (*read_outs, "apples")},
-        }[config.task]
+        }
+        self.env_kwargs: dict[str, Any] = {"read_outs": read_outs, **tasks[config.task]}
         """Keywords of the task's env, besides its mazes."""
 
     # ------------------------------------------------------- envs

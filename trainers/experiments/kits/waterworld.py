@@ -151,12 +151,13 @@ class WaterworldKit(Kit):
     def __init__(self, config: DemoConfig) -> None:
         super().__init__(config)
         size = config.size
-        self.env_kwargs: dict[str, Any] = {
+        tasks: dict[str, dict[str, Any]] = {
             "maze": {},
             "boat": {"steering": "heading"},
             "apples": {"items": MazeItems(apples=size**2 // 9), "max_steps": 40 * size},
             "key": {"items": MazeItems(key=True)},
-        }[config.task]
+        }
+        self.env_kwargs = tasks[config.task]
         """Keywords of the task's env, besides its mazes."""
         extra = ("heading",) if config.task == "boat" else ()
         self.worker_keys = ("velocity", *extra)
