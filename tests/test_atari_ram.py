@@ -285,7 +285,7 @@ def test_arguments_out_of_range_are_refused_at_construction(keywords, message):
 
 def test_a_state_of_another_game_is_refused():
     pong = AtariRAMEnv("Pong", seed=0).reset()
-    with pytest.raises(ValueError, match="no state of Breakout"):
+    with pytest.raises(ValueError, match="not a state of Breakout"):
         AtariRAMEnv("Breakout", seed=0).reset(pong, set_state=True)
 
 

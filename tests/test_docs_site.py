@@ -178,6 +178,8 @@ def test_every_command_of_the_pages_is_understood(page: str, command: str) -> No
     assert verb in VERBS
     if verb not in {"demo", "train"} or not words:  # the bare verb is a name, no command
         return
+    if "-m" in words:  # the first of its runs
+        words = [word.partition(",")[0] for word in words if word != "-m"]
     own, keys = split_words(words, ["experiment", "kit"])
     experiment = DEMO
     if "kit" in own:

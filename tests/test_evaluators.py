@@ -201,7 +201,7 @@ def test_a_rollout_evaluator_serves_planners_of_one_env_and_discount_only() -> N
     rollout = bound(env, RolloutEvaluator(), gamma=0.9)
     bound(env, rollout, gamma=0.9)
     for other, gamma in ((ChainEnv(4), 0.9), (env, 0.8)):
-        with pytest.raises(ValueError, match=r"another env or discount.*one of its own"):
+        with pytest.raises(ValueError, match=r"another env or discount.*one for each planner"):
             bound(other, rollout, gamma)
 
 

@@ -222,7 +222,7 @@ def test_an_env_without_a_declared_state_gets_one() -> None:
 def test_unusable_arguments_are_refused_with_their_value() -> None:
     with pytest.raises(ValueError, match=r"min_reward >= 0.*got -1"):
         make_rule(min_reward=-1.0)
-    with pytest.raises(ValueError, match="one member"):
+    with pytest.raises(ValueError, match="the model has one"):
         make_rule(max_disagreement=0.5)
     model = OptionModel(lambda n: ChainRule(n), ["state"], {"place": ()}, max_duration=2)
     with pytest.raises(ValueError, match="'place'"):

@@ -153,7 +153,10 @@ class TestFolders:
 
     @pytest.mark.parametrize(
         ("word", "message"),
-        [("game=Nothing", "Nothing"), ("options_from=nowhere", "options_from=nowhere is no run")],
+        [
+            ("game=Nothing", "Nothing"),
+            ("options_from=nowhere", "options_from=nowhere is not a run"),
+        ],
     )
     def test_missing_inputs_are_noticed_before_anything_is_touched(
         self, capsys, word: str, message: str
@@ -284,6 +287,8 @@ class TestWords:
     ) -> None:
         if config is WaterworldGoalsConfig:
             word = word.replace("num_skills", "num_goals")
+        if config is AtariConfig and word == "num_skills=0":  # the grid of Table 5.1
+            word = "episodes=0"
         names = dict(zip(CONFIGS, ("demo", "labmaze", "waterworld_goals", "atari"), strict=True))
         command = ["demo"] if config is DemoConfig else ["train", f"experiment={names[config]}"]
         assert main([*command, word, "out=run"]) == 2

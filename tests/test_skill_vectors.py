@@ -404,7 +404,7 @@ def test_a_trainer_compares_what_its_env_draws_with_what_its_networks_know() -> 
     numbered = DIAYNTrainer.make_loss(env(SkillTransform(6)))  # as many as the env draws
     assert numbered.actor_network.num_skills == numbered.objective.num_skills == 6
     with pytest.raises(
-        ValueError, match="draws 7 skills.*SkillPolicy that knows 6 skills.*SkillTransform.6."
+        ValueError, match="draws 7 skills.*SkillPolicy knows 6 skills.*SkillTransform.6."
     ):
         DIAYNTrainer(env(SkillTransform(7)), numbered)
     with pytest.raises(ValueError, match="SkillReward: the env draws 7 skills"):
