@@ -55,6 +55,18 @@ def untrained(env: str) -> str:
     return f"{listed(r['solved'] for r in rows)} of {rows[0]['starts']}"
 
 
+def boat() -> tuple[list[int], list[int], int]:
+    """Mazes that trained and untrained workers solve where a body must turn, and of how many."""
+    rows = [
+        r for r in data("ablations.json")["rows"] if (r["table"], r["task"]) == ("worker", "boat")
+    ]
+    by_arm = {
+        arm: [sum(r["solved"]) for r in rows if r["arm"] == arm]
+        for arm in ("DIAYN, 81,920 base steps", "untrained")
+    }
+    return *by_arm.values(), len(rows[0]["solved"])  # type: ignore[return-value]
+
+
 def readme_claims() -> list[str]:
     """The rows of README's table of results, as the data have them."""
     demo, maze = data("demo/seeds.csv"), data("settable/point_mazes.json")
@@ -66,7 +78,10 @@ def readme_claims() -> list[str]:
     ants = [data("antmaze/results.json")["solving"][f"AntMaze_Large-v5 seed {s}"] for s in range(3)]
     ant = ", ".join(f"{ant['solved']} of {ant['starts']}" for ant in ants)
     steps = f"{int(demo[0]['train_base_steps']):,} steps of training"
+    turned, still, mazes = boat()
     return [
+        f"a body that must turn, 81,920 steps | {listed(turned)} of {mazes} "
+        f"| {min(still)} to {max(still)} of {mazes} | {len(turned)} |",
         f"mazes, 4 skills, {steps} | {listed(r['solved'] for r in demo)} of {demo[0]['mazes']} "
         f"| {untrained('waterworld')} | {len(demo)} |",
         f"{frames:,} frames of training | {listed(r['solved'] for r in lab)} of {lab[0]['mazes']} "
