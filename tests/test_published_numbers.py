@@ -81,7 +81,7 @@ def readme_claims() -> list[str]:
     turned, still, mazes = boat()
     return [
         f"a body that must turn, 81,920 steps | {listed(turned)} of {mazes} "
-        f"| {min(still)} to {max(still)} of {mazes} | {len(turned)} |",
+        f"| {min(still)} to {max(still)} of {mazes}, ten networks | {len(turned)} |",
         f"mazes, 4 skills, {steps} | {listed(r['solved'] for r in demo)} of {demo[0]['mazes']} "
         f"| {untrained('waterworld')} | {len(demo)} |",
         f"{frames:,} frames of training | {listed(r['solved'] for r in lab)} of {lab[0]['mazes']} "
