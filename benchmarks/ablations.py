@@ -1,7 +1,7 @@
 """What each part of the agent is worth: search, novelty test, simulation step, learned skills.
 
     python benchmarks/ablations.py --seeds 0 1 2 --out docs/results/ablations.json
-    python benchmarks/ablations.py --tables search --tasks apples --seeds 0
+    python benchmarks/ablations.py --tables search --tasks "apples 15" --seeds 0
 
 An arm is a line of words as `hmcts train` takes them, and what cannot be said in words: a worker
 that was never trained, a search with a queue, a random tree policy. Rows that the file already has
@@ -14,7 +14,7 @@ import json
 import re
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_hmcts.modules import SkillPolicy
-from torchrl_hmcts.planners import RolloutEvaluator
 from torchrl_hmcts.trainers.command_line.words import parse_config
 from torchrl_hmcts.trainers.evaluation import Results, plan_and_execute
 from torchrl_hmcts.trainers.experiments.kits import Kit, make_kit
@@ -40,7 +39,8 @@ from torchrl_hmcts.trainers.skills.rounds import frames_curve
 COMMAND = "python benchmarks/ablations.py --seeds 0 1 2 --out docs/results/ablations.json"
 TASKS: dict[str, tuple[str, ...]] = {  # kit, then words
     "maze": ("waterworld", "mazes=50"),
-    "maze, few": ("waterworld", "mazes=20"),
+    "maze, 100": ("waterworld", "mazes=100"),
+    "maze, 20": ("waterworld", "mazes=20"),
     "maze 15": ("waterworld", "mazes=50", "size=15", "search_steps=30000"),
     "boat": ("waterworld", "mazes=50", "task=boat", "search_steps=15000"),
     "key 15": ("waterworld", "mazes=30", "task=key", "size=15", "search_steps=60000"),
@@ -66,7 +66,6 @@ class Arm:
     words: tuple[str, ...] = ()
     worker: str = "trained"
     search: str = ""
-    rollouts: int = 0  # options of a random simulation
     seed: int = 0
     worker_seed: int | None = None
 
@@ -90,13 +89,12 @@ def arms(seeds: Sequence[int]) -> Iterator[Arm]:
     for seed in seeds:
         for task in ("maze", "lab"):
             yield from workers(task, seed)
-        for task in ("lab apples 15", "key 15", "maze"):
+        for task in ("maze, 100", "key 15", "lab apples 15"):
             yield from searches(task, seed)
         for task in ("maze", "maze 15"):
             for manager in ("novelty", "learned"):
                 yield Arm("manager", task, manager, (f"manager={manager}",), seed=seed)
-        yield from simulations("maze, few", seed)
-        yield from simulations("apples 15", seed)
+        yield from simulations(seed)
         for length in (10, 25, 50, 100):
             words = (f"option_steps={length}", f"novelty_radius={min(2.0, 0.04 * length):g}")
             yield Arm("option length", "maze", f"{length} base steps", words, seed=seed)
@@ -118,14 +116,17 @@ def searches(task: str, seed: int) -> Iterator[Arm]:
         yield Arm("search", task, name, search=name, seed=seed)
 
 
-def simulations(task: str, seed: int) -> Iterator[Arm]:
-    """Yield the simulation steps of a task, with and without a novelty test."""
-    few = ("expansions=100",) if task == "maze, few" else ()
-    for name, most in (("none", 0), ("random, 10 options", 10)):
-        for test in ("place", "none"):
-            words = (f"features={test}", *few)
-            label = f"simulation {name}; novelty {test}"
-            yield Arm("simulation", task, label, words, rollouts=most, seed=seed)
+def simulations(seed: int) -> Iterator[Arm]:
+    """Yield random simulations from new nodes, with and without a novelty test."""
+    rollouts = ("planner/leaf_evaluator=rollout",)
+    for name, words in {
+        "simulation none; novelty place": (),
+        "simulation none; novelty none": ("features=none",),
+        "simulation random, 10 options; novelty place": rollouts,
+    }.items():
+        yield Arm("simulation", "maze, 100", name, words, seed=seed)
+    name = "the dissertation's four stages"
+    yield Arm("simulation", "maze, 20", name, ("manager=source",), seed=seed)
 
 
 def workers(task: str, seed: int) -> Iterator[Arm]:
@@ -252,7 +253,7 @@ def run(kit: Kit, arm: Arm, worker: Any) -> Results:
     """Plan from each start, execute the plan in another instance."""
     kit.prepare(worker)
     starts = kit.starts("test", kit.config.mazes)
-    real = kit.make_options(kit.make_env("test"), worker, gamma=1.0)
+    real = kit.make_real(worker)
     planner = kit.make_planner(kit.make_simulator(worker))
     if arm.table == "algorithm 3":
         return solve(kit, worker).results
@@ -261,26 +262,8 @@ def run(kit: Kit, arm: Arm, worker: Any) -> Results:
     if arm.search == "random option":
         generator = torch.Generator().manual_seed(arm.seed)
         planner.tree_policy = lambda at: torch.rand(at.option_visits.shape, generator=generator)
-    if not arm.rollouts:
-        return plan_and_execute(planner, real, starts)
-    # each search alone, with rollouts of its own, whose steps count
-    parts = []
-    for start in starts.split(1):
-        part = kit.make_planner(kit.make_simulator(worker))
-        rollouts = RolloutEvaluator(max_options=arm.rollouts)
-        part.evaluate = replace_evaluator(part, rollouts)
-        results = plan_and_execute(part, real, start)
-        parts.append(
-            replace(results, simulated_steps=results.simulated_steps + rollouts.num_base_steps)
-        )
-    return Results.concatenate(parts)
-
-
-def replace_evaluator(planner: Any, evaluator: Any) -> Any:
-    """Return a planner's evaluation of new nodes with another evaluator."""
-    made = type(planner.evaluate)(evaluator, None, planner.num_options)
-    made.bind(planner.simulator, planner.gamma)
-    return made
+    group = 1 if arm.table == "simulation" else 38  # steps of rollouts belong to one search
+    return plan_and_execute(planner, real, starts, group=group)
 
 
 def pooled(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
 )
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers import DemoConfig, make_kit
+from torchrl_hmcts.trainers import HMCTS, DemoConfig, make_kit
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.managers import learn_manager, load_manager, save_manager
 from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
@@ -134,6 +134,7 @@ def test_items_are_drawn_from_their_seed_on_free_tiles() -> None:
         (lambda: maze_pool("test", 11), "9, 15 and 31"),
         (lambda: DemoConfig(size=11), "size is 9, 15 or 31"),
         (lambda: DemoConfig(task="sail"), "task is one of maze, boat"),
+        (lambda: DemoConfig(features="learned", algorithm="hmcts"), "goes with algorithm='diayn'"),
         (lambda: plan_with_features("learned"), "objective=metra"),
     ],
 )
@@ -234,13 +235,39 @@ def test_a_learned_manager_is_saved_and_plans_in_other_mazes(tmp_path) -> None:
     train = kit.make_simulator(worker, "train")
     network = learn_manager(kit, train, searches=30, iterations=2, updates=30)
     save_manager(tmp_path, network)
-    loaded = load_manager(kit, tmp_path, train)
+    loaded = load_manager(kit, tmp_path, lambda: train)
     td = train.reset(TensorDict(batch_size=[5]))
     assert torch.equal(network(td.clone())["logits"], loaded(td.clone())["logits"])
     kit.manager = kit.manager_for(loaded, "test")
     results = solve(kit, worker).results
     assert results.solved.all()
-    assert load_manager(kit, tmp_path / "none", train) is None
+    assert load_manager(kit, tmp_path / "none", lambda: train) is None
+
+
+def test_a_manager_stopped_before_or_after_its_first_checkpoint_is_the_same(tmp_path) -> None:
+    kit = make_kit(DemoConfig(manager="learned", option_steps=20))
+    few = {"searches": 4, "iterations": 2, "updates": 5, "save_dir": tmp_path}
+
+    def weights(resume: bool) -> list[torch.Tensor]:
+        simulator = kit.make_simulator(fixed_worker(), "train")
+        return list(learn_manager(kit, simulator, resume=resume, **few).parameters())
+
+    first = weights(resume=True)  # there is nothing to continue from
+    newest = max(tmp_path.glob("checkpoint-*"))
+    for again in (weights(resume=True), newest.unlink() or weights(resume=True)):
+        assert all(map(torch.equal, first, again))
+
+
+def test_an_agent_that_is_loaded_reports_the_rewards_that_a_run_does(tmp_path) -> None:
+    words = ["kit=waterworld", "options=actions", "option_steps=20", "toy=true", f"out={tmp_path}"]
+    assert main(["train", *words]) == 0
+    assert HMCTS.load(tmp_path).solve(seed=0).reward == 1.0
+
+
+def test_the_dissertations_manager_plans_the_rounds_too() -> None:
+    kit = make_kit(DemoConfig(manager="source", algorithm="hmcts"))
+    simulator = kit.make_options(kit.make_env("train"), fixed_worker())
+    assert kit.make_round_planner(simulator, seed=0).novelty is None
 
 
 def test_a_manager_that_cannot_learn_says_so() -> None:

@@ -174,7 +174,7 @@ class HMCTS:
     @cached_property
     def real_env(self) -> EnvBase:
         """The macro environment in which the agent acts, another instance."""
-        return self.kit.make_options(self.kit.make_env("test"), self.worker)
+        return self.kit.make_real(self.worker)
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -368,7 +368,7 @@ class HMCTS:
         agent = cls(config)
         if config.options == "learned":
             agent._take(skills.load_skills(agent.kit, folder))
-        network = load_manager(agent.kit, folder, agent.env)
+        network = load_manager(agent.kit, folder, lambda: agent.env)
         if network is not None:
             agent._guide(network)
         return agent

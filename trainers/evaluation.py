@@ -209,7 +209,7 @@ def plan_and_execute(
 
     Trees do not depend on what is searched beside them, so the results are those of one search
     after the other; a group of starts is only faster. ``planner.last_search`` is that of the last
-    group.
+    group. Base steps of an evaluator's rollouts count as simulated, a group's shared evenly.
 
     Args:
         planner: over the worker's options.
@@ -231,7 +231,7 @@ def plan_and_execute(
     """
     parts = []
     for some in starts.split(group):
-        begin = time.perf_counter()
+        begin, rolled = time.perf_counter(), _rolled(planner)
         search = planner.search(some)
         plans = extract_plans(search)
         seconds = (time.perf_counter() - begin) / len(some)
@@ -240,7 +240,7 @@ def plan_and_execute(
             Results(
                 found=plans.found.numpy(),
                 solved=executed.solved,
-                simulated_steps=search.num_base_steps.copy(),
+                simulated_steps=search.num_base_steps + (_rolled(planner) - rolled) // len(some),
                 expansions=search.num_expansions.copy(),
                 simulations=search.num_simulations.copy(),
                 plan_options=plans.lengths.numpy(),
@@ -253,6 +253,11 @@ def plan_and_execute(
             )
         )
     return Results.concatenate(parts)
+
+
+def _rolled(planner: MCTSPlanner) -> int:
+    """Base steps that a planner's evaluator has simulated, which its searches do not count."""
+    return int(getattr(planner.evaluate.leaf_evaluator, "num_base_steps", 0))
 
 
 @torch.no_grad()

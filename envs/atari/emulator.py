@@ -27,7 +27,7 @@ _SKIP_BYTES = (16, 16, 4, 1)  # of the parts of the generator that draws the fra
 
 @dataclass(frozen=True)
 class EmulatorSettings:
-    """What an emulator is set to: checked once, taken whole by all that have one.
+    """Settings of an emulator, checked once and taken whole by all that have one.
 
     Args:
         game (str): as in Gymnasium, ``"SpaceInvaders"``; ``"space_invaders"`` and
@@ -73,7 +73,7 @@ class EmulatorSettings:
 
     @property
     def sticky(self) -> bool:
-        """Whether actions stick."""
+        """True if actions stick."""
         return self.repeat_action_probability > 0.0
 
     @property

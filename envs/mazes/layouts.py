@@ -146,19 +146,20 @@ def generate_mazes(
 def maze_pool(split: Literal["train", "test", "all"] = "all", size: int = 9) -> Tensor:
     """Return the fixed pool of 2,342 distinct connected 9x9 mazes with 31 walls, or a split of it.
 
-    The pool is generated once, in a few seconds, and kept in a user cache folder:
-    ``TORCHRL_HMCTS_CACHE`` if set, else ``torchrl_hmcts`` in ``XDG_CACHE_HOME`` or ``~/.cache``. A
-    missing or damaged file is made again; a folder that cannot be written costs only the repeated
-    generation.
+    With ``size`` larger mazes by the same algorithm, 598 of a side. The pool of 9x9 is generated
+    once, in a few seconds, and kept in a user cache folder: ``TORCHRL_HMCTS_CACHE`` if set, else
+    ``torchrl_hmcts`` in ``XDG_CACHE_HOME`` or ``~/.cache``. A missing or damaged file is made
+    again; a folder that cannot be written costs only the repeated generation.
 
     Args:
         split (str): ``"train"`` (the first 2,000), ``"test"`` (the other 342) or ``"all"``. Default
             ``"all"``.
-        size (int): side of the mazes, 9, 15 or 31. Default 9. Of the larger ones there are 598
-            (256 to train in, 342 to test in), with 96 and 440 walls, made when they are asked for.
+        size (int): side of the mazes, 9, 15 (96 walls) or 31 (440 walls). Default 9. The larger
+            ones are made when they are asked for.
 
     Returns:
-        bool Tensor ``[2000 | 342 | 2342, 9, 9]``, True = wall; a copy that may be changed freely.
+        bool Tensor ``[2000 | 342 | 2342, 9, 9]``, of the larger ones ``[256 | 342 | 598, size,
+        size]``, True = wall; a copy that may be changed freely.
 
     Raises:
         ValueError: if ``split`` is another word, or there are no mazes of that size.

@@ -42,9 +42,9 @@ class CurveTests:
         self.records = RoundRecords()
         self._at = -1  # base steps at the latest test
         self._best: dict[str, Any] = {}  # "solved", how many, the "loss" that did, and its "step"
-        worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
-        self.model = kit.make_simulator(worker, "curve")
-        self.real = kit.make_options(kit.make_env("curve"), worker)
+        self.worker = SkillPolicy(trainer.loss_module.actor_network, deterministic=True)
+        self.model = kit.make_simulator(self.worker, "curve")
+        self.real = kit.make_real(self.worker, split="curve")
         with torch.random.fork_rng(devices=[]):  # a new env draws its seed
             self.starts = kit.starts("curve", kit.config.curve_mazes)
         trainer.register_op("setup", self)
@@ -58,6 +58,8 @@ class CurveTests:
             return
         self._at = steps
         with seeded(config.seed, "test", 0):
+            if config.features == "learned":  # their radius changes while they learn
+                self.kit.prepare(self.worker)
             planner = self.kit.make_planner(self.model, **curve_budget(config))
             results = plan_and_execute(planner, self.real, self.starts)
         self.records.add(results, np.arange(len(results.solved)), steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,8 @@ def learn_manager(
         seed=kit.config.seed,
     )
     if resume and save_dir is not None:
-        trainer.load(save_dir)
+        with suppress(FileNotFoundError):  # the run was stopped before the first
+            trainer.load(save_dir)
     trainer.train()
     return network.eval()
 
@@ -85,17 +87,19 @@ def save_manager(folder: Path, network: TensorDictModuleBase) -> None:
     plain_checkpoint(manager=network).save(folder / _FILE)
 
 
-def load_manager(kit: Kit, folder: str | Path, simulator: EnvBase) -> TensorDictModuleBase | None:
+def load_manager(
+    kit: Kit, folder: str | Path, make_simulator: Callable[[], EnvBase]
+) -> TensorDictModuleBase | None:
     """Read the network of a run or an agent; None if it has none.
 
     Args:
         kit: with a network like that in the folder.
         folder: of the run or the agent.
-        simulator: the macro env to plan in.
+        make_simulator: returns the macro env to plan in; called if there is a network.
     """
     path = Path(folder) / _FILE
     if not path.is_file():
         return None
-    network = kit.manager_network(kit.make_planner(simulator), "train", scale=False)
+    network = kit.manager_network(kit.make_planner(make_simulator()), "train", scale=False)
     plain_checkpoint(manager=network).load(path)
     return network.eval()

@@ -135,6 +135,12 @@ class SkillsConfig(RunConfig):
                 "searches need the env in this process."
             )
 
+        if self.features == "learned" and self.algorithm == "hmcts":
+            raise ValueError(
+                "features=learned goes with algorithm='diayn': the rounds of Algorithm 3 search "
+                "before there are features. Use features=place."
+            )
+
     def check_inputs(self) -> None:
         """Check what the run needs from outside, before anything is written.
 
@@ -225,7 +231,8 @@ class DemoConfig(SkillsConfig):
         """Return the configuration that is run: with ``toy`` a small one."""
         if not self.toy:
             return self
-        return dataclasses.replace(self, train_base_steps=1_920, mazes=min(3, self.mazes))
+        few = {"mazes": min(3, self.mazes), "manager_searches": min(2, self.manager_searches)}
+        return dataclasses.replace(self, train_base_steps=1_920, **few)
 
 
 @dataclass

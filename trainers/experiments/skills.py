@@ -147,8 +147,7 @@ def evaluate_skills(config: SkillsConfig) -> dict[str, Any]:
         checkpoint = load_networks(loss, config.out).name
         worker = SkillPolicy(loss.actor_network, deterministic=True)
     if config.manager == "learned":
-        kit.prepare(worker)
-        network = load_manager(kit, config.out, kit.make_simulator(worker, "train"))
+        network = load_manager(kit, config.out, lambda: kit.make_simulator(worker, "train"))
         if network is None:
             raise ExperimentError(f"{config.out} holds no manager; leave manager=learned out.")
         kit.manager = kit.manager_for(network, "test")
@@ -412,7 +411,7 @@ def _solve(
     progress: bool,
 ) -> Results:
     """Plan and act from a group of starts after the other."""
-    real = kit.make_options(kit.make_env("test"), worker, gamma=1.0)
+    real = kit.make_real(worker)
     parts: list[Results] = []
     unit = kit.start_name.split()[0]
     bar = console.Bar(len(starts), desc="solve", unit=unit) if progress else None

@@ -18,7 +18,6 @@ from torchrl_hmcts.trainers.figures.animation import write_gif
 from torchrl_hmcts.trainers.figures.curves import draw_band, style
 from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
-FRAMES_PER_STEP = 4
 _EVERY = 3  # base steps between two pictures
 
 
@@ -80,7 +79,8 @@ def write_atari_gif(
         state = after.select("emulator_state", "ram", "observation", strict=False)
         if shown >= real_steps or bool(after["done"].any()):
             break
-    seconds = _EVERY * FRAMES_PER_STEP / 60.0
+    assert isinstance(recorder.frame_skip, int)
+    seconds = _EVERY * recorder.frame_skip / 60.0
     frames = [p.repeat(2, axis=1) for p in pictures]  # a console's pixels are wide
     write_gif(frames, path, milliseconds=1000.0 * seconds, last=None)
     return shown, score

@@ -135,7 +135,7 @@ def load_worker(part: dict[str, Any]) -> OptionWorker:
 
 
 def has_network(worker: Any) -> bool:
-    """Whether a network executes one of a worker's options, or rules do all of them."""
+    """Return True if a network executes one of a worker's options, False if rules do all."""
     parts = getattr(worker, "workers", [getattr(worker, "worker", None)])
     return isinstance(worker, SharedMLP) or any(has_network(p) for p in parts if p is not None)
 

@@ -205,9 +205,9 @@ class Kit:
         With ``features="learned"`` the novelty radius becomes three quarters of that.
         """
         if self.config.features == "learned":
-            self.config = replace(self.config, novelty_radius=1e-9)
             reach = self.reach(self.make_simulator(worker, "train"), self.starts("train", 8))
-            self.config = replace(self.config, novelty_radius=RADIUS_SHARE * reach)
+            if reach > 0.0:  # a worker may stand still before it has learned
+                self.config = replace(self.config, novelty_radius=RADIUS_SHARE * reach)
 
     def reach(self, simulator: EnvBase, starts: TensorDictBase) -> float:
         """Return how far options move what the novelty test compares, see :func:`option_reach`."""
@@ -241,6 +241,17 @@ class Kit:
             split: of its mazes, levels or tasks.
         """
         return self.make_options(self.make_env(split), worker)
+
+    def make_real(
+        self, worker: TensorDictModuleBase, trajectory_keys: Any = None, split: str = "test"
+    ) -> EnvBase:
+        """Return the macro env to act in; its rewards are not discounted.
+
+        Args:
+            worker, trajectory_keys: as of :meth:`make_options`.
+            split: of its mazes, levels or tasks.
+        """
+        return self.make_options(self.make_env(split), worker, trajectory_keys, gamma=1.0)
 
     # ------------------------------------------------------- the planner
 
@@ -308,7 +319,7 @@ class Kit:
         """
         bare = {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
-            "novelty": self.planner_part()["novelty"],
+            "novelty": self.planner_part().get("novelty"),
             "budget": {"_component_": "torchrl_hmcts.planners.SearchBudget"},
         }
         if bare["novelty"] is not None:
@@ -460,8 +471,7 @@ class Kit:
         if render == "human":
             raise ValueError(f"{self.title}: no window. Leave render out, or write a film: out=.")
         keys = list(self.state_keys)
-        real = self.make_options(self.make_env("test"), worker, keys)
-        return self.act(planner, real, start, keys)
+        return self.act(planner, self.make_real(worker, keys), start, keys)
 
     def write_film(self, episode: Results, path: str | Path) -> None:
         """Write an episode as a GIF, and as a video beside it.

@@ -192,13 +192,8 @@ class GymKit(Kit):
             found.append(env.reset(**options))
         return torch.stack(found).exclude("done", "terminated", "truncated")  # type: ignore[attr-defined]
 
-    def make_options(
-        self,
-        env: EnvBase,
-        worker: TensorDictModuleBase,
-        trajectory_keys: Any = None,
-        *,
-        gamma: float | None = None,
+    def make_real(
+        self, worker: TensorDictModuleBase, trajectory_keys: Any = None, split: str = "test"
     ) -> EnvBase:
         return self.make_pool(worker, real=True)
 
