@@ -198,17 +198,6 @@ def worker(data: dict[str, Any]) -> str:
     return of_rows(data["rows"], columns) + note
 
 
-def untrained(data: dict[str, Any]) -> str:
-    columns: Columns = {
-        "worker": "worker",
-        "seeds": "seed",
-        "solved": "solved/starts",
-        "simulated base steps, median": rounded("simulated_steps.median"),
-        "base steps of an episode, median": rounded("episode_steps.median"),
-    }
-    return of_groups(data["rows"], "worker", columns)
-
-
 def objectives(data: list[dict[str, Any]]) -> str:
     columns: Columns = {
         "objective": "objective",
@@ -418,7 +407,6 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             ),
             ("demo/metrics.json",),
         ),
-        Section("Trained, untrained, single actions", "skills/untrained.json", untrained),
         Section("How much training the worker needs", "skills/worker.json", worker),
         Section("Skill objectives", "skills/skill_objectives.json", objectives),
         Section("Skills that are vectors", "skills/skill_vectors.json", objectives),
