@@ -21,22 +21,21 @@ class OGBenchConfig(RunConfig):
     """
 
     id: str = "pointmaze-medium-navigate-v0"
-    """Name of OGBench's dataset: the maze, and how it was recorded (navigate or stitch)."""
+    """Name of OGBench's dataset: the env, and how it was recorded (navigate, stitch or play)."""
     data: str = ""
     """Recorded episodes: a folder of `hmcts data`, or OGBench's own NAME.npz. Default:
-    data/ogbench/NAME, recorded there (minutes) if it is not yet."""
+    data/ogbench/NAME, recorded there (minutes; puzzles an hour) if it is not yet."""
     out: str = "runs/ogbench"
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
-    num_places: int = 2
-    """Numbers of an observation, its first ones, that say where the agent is."""
     radius: float = 1.5
-    """Least distance of two landmarks, in units of the maze, whose corridors are 4 wide."""
+    """Least distance of two landmarks, in units of the maze, whose corridors are 4 wide; the unit
+    of distances that the worker sees."""
     min_count: int = 1
     """Recorded passages from a landmark to another that make an option."""
     jump_factor: float = 10.0
     """Median steps from which on a recorded step is a jump, whose outcomes are left to chance."""
     goal_steps: int = 30
-    """Base steps by which a goal of the worker lies ahead, at most, and of an option."""
+    """Base steps by which a goal of the worker lies ahead, at most, and of an option; in mazes."""
     progress_coeff: float = 2.0
     """Weight of actions that led to the goal fast in the worker's cloning; 0: none."""
     updates: int = 4_000
@@ -69,6 +68,11 @@ class OGBenchConfig(RunConfig):
     PATHS = ("out", "data")
     ABOVE_ZERO = ("radius", "learning_rate", "jump_factor")
     LEAST = {"progress_coeff": 0}
+
+    @property
+    def place(self) -> slice:
+        """Columns of an observation that say where the point, or the hand, is."""
+        return slice(*split_name(self.id).place)
 
     def check_inputs(self) -> None:
         """Check that there is such a dataset, and OGBench.

@@ -10,13 +10,14 @@ class Recipe(NamedTuple):
     """Recipe of a dataset, as in OGBench's scripts."""
 
     env: str  # id of the env
-    kind: str  # "navigate": goal after goal; "stitch": one goal, four cells away
+    kind: str  # "navigate": goal after goal; "stitch": one goal, four cells away; "play": presses
     episodes: int
     steps: int  # of an episode
-    noise: float = 0.5  # standard deviation added to actions
+    noise: float = 0.5  # standard deviation: of what is added to actions, in puzzles to the plan
+    place: tuple[int, int] = (0, 2)  # columns of the observation: where the point, or the hand, is
 
 
-RECIPES = {
+_MAZES = {
     f"pointmaze-{maze}-{kind}-v0": Recipe(
         f"pointmaze-{maze}-v0",
         kind,
@@ -31,6 +32,11 @@ RECIPES = {
     for maze in ("medium", "large", "giant", "teleport")
     for kind in ("navigate", "stitch")
 }
+_PUZZLES = {
+    f"puzzle-{size}-play-v0": Recipe(f"puzzle-{size}-v0", "play", episodes, 1_001, 0.1, (12, 15))
+    for size, episodes in {"3x3": 1_000, "4x4": 1_000, "4x5": 3_000, "4x6": 5_000}.items()
+}
+RECIPES = _MAZES | _PUZZLES
 """By the dataset's name; numbers of ``data_gen_scripts/commands.sh`` in OGBench's repository."""
 
 
