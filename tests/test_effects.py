@@ -130,7 +130,7 @@ def reach(observation: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
     return torch.cat([moves, torch.zeros_like(moves[..., :1]), torch.ones_like(moves[..., :1])], -1)
 
 
-@pytest.mark.filterwarnings("ignore:Box .*precision:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*precision lowered:UserWarning")
 def test_an_agent_presses_the_buttons_of_a_puzzle_and_reads_nothing_else(tmp_path: Path) -> None:
     pytest.importorskip("ogbench")
     from torchrl_hmcts.trainers.experiments.ogbench.agent import fit_model, learn, make_agent

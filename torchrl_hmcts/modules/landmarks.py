@@ -351,8 +351,8 @@ class LandmarkEnv(EnvBase):
 
     A step goes to a landmark (a setting); at the goal's it pays 1 and ends. With chance an outcome
     is drawn. Stateless, batched and settable: ``"landmark"`` and ``"goal"`` (int64 ``[*B]``) are
-    its state. It writes ``"position"`` (float32 ``[*B, F]``), ``"action_mask"`` (bool ``[*B, A]``) and
-    ``"duration"`` (int64 ``[*B, 1]``, base steps) too.
+    its state. It writes ``"position"`` (float32 ``[*B, F]``), ``"action_mask"`` (bool ``[*B, A]``)
+    and ``"duration"`` (int64 ``[*B, 1]``, base steps) too.
 
     Args:
         model (LandmarkModel or EffectModel): read live.
