@@ -118,7 +118,9 @@ def make_loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
         actions, seen = data["action"].shape[-1], data["observation"].float()
         network = _ToGoal(seen, config.place, actions, config.radius)
     worker = TensorDictModule(network, ["observation", "goal"], ["action"])
-    return GoalCloningLoss(worker, progress_coeff=config.progress_coeff)
+    coeff = config.progress_coeff
+    default = split_name(config.id).progress_coeff
+    return GoalCloningLoss(worker, progress_coeff=default if coeff < 0.0 else coeff)
 
 
 def learn(

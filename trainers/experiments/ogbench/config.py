@@ -36,8 +36,9 @@ class OGBenchConfig(RunConfig):
     """Median steps from which on a recorded step is a jump, whose outcomes are left to chance."""
     goal_steps: int = 30
     """Base steps by which a goal of the worker lies ahead, at most, and of an option; in mazes."""
-    progress_coeff: float = 2.0
-    """Weight of actions that led to the goal fast in the worker's cloning; 0: none."""
+    progress_coeff: float = -1.0
+    """Weight of actions that led to the goal fast in the worker's cloning; 0: none. Default -1: 2 in
+    mazes and 0.5 in puzzles, where the arm has to move away from a button first."""
     updates: int = 4_000
     """Updates of the worker."""
     batch_size: int = 512
@@ -67,7 +68,7 @@ class OGBenchConfig(RunConfig):
     )
     PATHS = ("out", "data")
     ABOVE_ZERO = ("radius", "learning_rate", "jump_factor")
-    LEAST = {"progress_coeff": 0}
+    LEAST = {"progress_coeff": -1}
 
     @property
     def place(self) -> slice:
