@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from torchrl_hmcts.envs.gym.ant import body_of
 from torchrl_hmcts.modules import EffectModel, LandmarkEnv, LandmarkModel, find_jumps
 from torchrl_hmcts.objectives import GoalCloningLoss
 from torchrl_hmcts.planners import (
@@ -29,7 +30,6 @@ from torchrl_hmcts.planners import (
     ValueEvaluator,
 )
 from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
-from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 
 _HIDDEN = (256, 256)
 _LATE = 3.0  # times an option's base steps, after which it has failed
@@ -43,18 +43,35 @@ class _ToGoal(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, observations: Tensor, place: slice, num_actions: int, unit: float) -> None:
+    def __init__(self, observations: Tensor, num_actions: int, config: OGBenchConfig) -> None:
         super().__init__()
-        self.place, self.unit = place, unit
-        self.register_buffer("mean", observations.mean(0))
-        self.register_buffer("std", observations.std(0).clamp_min(1e-6))
-        inputs = observations.shape[-1] + observations[0, place].numel()
+        self.place, self.unit = config.place, config.radius
+        self.columns = slice(*config.recipe.seen)
+        place = self.place
+        ahead = torch.ones_like(observations[:, place])
+        seen, where = self.view(observations, ahead)
+        self.register_buffer("mean", seen.mean(0))
+        self.register_buffer("std", seen.std(0).clamp_min(1e-6))
+        inputs = seen.shape[-1] + where.shape[-1]
         self.layers = MLP(inputs, num_actions, num_cells=_HIDDEN, activation_class=nn.GELU)
+
+    def view(self, observation: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network sees of the agent and of the goal."""
+        return observation[..., self.columns], ahead
 
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         ahead = (goal - observation[..., self.place]) / self.unit
-        seen = (observation - self.mean) / self.std
-        return self.layers(torch.cat([seen, ahead], -1)).tanh()
+        seen, where = self.view(observation, ahead)
+        return self.layers(torch.cat([(seen - self.mean) / self.std, where], -1)).tanh()
+
+
+class _AntToGoal(_ToGoal):
+    """Sees the body from the direction of the goal: the plane has no north."""
+
+    def view(self, observation: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        length = ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        body, _ = body_of(observation.double().numpy(), (ahead / length).numpy().T)
+        return torch.from_numpy(body).float(), length
 
 
 def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel | EffectModel:
@@ -66,7 +83,7 @@ def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel | Ef
     """
     seen, ends = data["observation"].float(), data["done"][:, 0]
     places = seen[:, config.place]
-    if split_name(config.id).kind == "play":
+    if config.recipe.kind == "play":
         return EffectModel.fit(seen, ends, places)
     return LandmarkModel.fit(
         places,
@@ -116,11 +133,11 @@ def make_loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         actions, seen = data["action"].shape[-1], data["observation"].float()
-        network = _ToGoal(seen, config.place, actions, config.radius)
+        kind = _AntToGoal if config.id.startswith("ant") else _ToGoal
+        network = kind(seen, actions, config)
     worker = TensorDictModule(network, ["observation", "goal"], ["action"])
-    coeff = config.progress_coeff
-    default = split_name(config.id).progress_coeff
-    return GoalCloningLoss(worker, progress_coeff=default if coeff < 0.0 else coeff)
+    coeff = config.progress_coeff if config.progress_coeff >= 0.0 else config.recipe.progress_coeff
+    return GoalCloningLoss(worker, progress_coeff=coeff)
 
 
 def learn(
@@ -144,17 +161,17 @@ def learn(
     """
     begin, loss = time.process_time(), make_loss(data, config)
     optimizer = torch.optim.Adam(loss.parameters(), config.learning_rate)
-    decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.updates)
+    decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.num_updates)
     draw = (_NextEffect if isinstance(model, EffectModel) else _Ahead)(data, model, config)
     curves: dict[str, list[float]] = {"updates": [], "loss_actor": [], "action_error": []}
-    for update in progress(range(config.updates)):
+    for update in progress(range(config.num_updates)):
         out = loss(draw(config.batch_size))
         optimizer.zero_grad()
         out["loss_actor"].backward()
         nn.utils.clip_grad_norm_(loss.parameters(), _MAX_NORM)
         optimizer.step()
         decay.step()
-        if update % 100 == 99 or update == config.updates - 1:
+        if update % 100 == 99 or update == config.num_updates - 1:
             curves["updates"].append(update + 1)
             for name in ("loss_actor", "action_error"):
                 curves[name].append(out[name].item())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
+from torchrl_hmcts.trainers.experiments.ogbench.names import Recipe, split_name
 from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
 
@@ -37,10 +37,10 @@ class OGBenchConfig(RunConfig):
     goal_steps: int = 30
     """Base steps by which a goal of the worker lies ahead, at most, and of an option; in mazes."""
     progress_coeff: float = -1.0
-    """Weight of actions that led to the goal fast in the worker's cloning; 0: none. Default -1: 2 in
-    mazes and 0.5 in puzzles, where the arm has to move away from a button first."""
-    updates: int = 4_000
-    """Updates of the worker."""
+    """Weight of actions that led to the goal fast in the worker's cloning; 0: none. Default -1: 2
+    for points, 0 for ants, and 1 in puzzles, where the arm has to leave a button first."""
+    updates: int = 0
+    """Updates of the worker. Default 0: 4,000 for points, 10,000 for ants and in puzzles."""
     batch_size: int = 512
     """Transitions of an update."""
     learning_rate: float = 1e-3
@@ -68,12 +68,22 @@ class OGBenchConfig(RunConfig):
     )
     PATHS = ("out", "data")
     ABOVE_ZERO = ("radius", "learning_rate", "jump_factor")
-    LEAST = {"progress_coeff": -1}
+    LEAST = {"progress_coeff": -1, "updates": 0}
+
+    @property
+    def recipe(self) -> Recipe:
+        """What is known by hand of the env, and how it was recorded."""
+        return split_name(self.id)
 
     @property
     def place(self) -> slice:
-        """Columns of an observation that say where the point, or the hand, is."""
-        return slice(*split_name(self.id).place)
+        """Columns of an observation that say where the point, the ant or the hand is."""
+        return slice(*self.recipe.place)
+
+    @property
+    def num_updates(self) -> int:
+        """Updates of the worker."""
+        return self.updates or self.recipe.updates
 
     def check_inputs(self) -> None:
         """Check that there is such a dataset, and OGBench.

@@ -15,7 +15,9 @@ class Recipe(NamedTuple):
     steps: int  # of an episode
     noise: float = 0.5  # standard deviation: of what is added to actions, in puzzles to the plan
     place: tuple[int, int] = (0, 2)  # columns of the observation: where the point, or the hand, is
+    seen: tuple[int, int | None] = (0, None)  # columns that the worker sees
     progress_coeff: float = 2.0  # of the worker's loss
+    updates: int = 4_000  # of the worker
 
 
 _EPISODES = {"navigate": (1_000, 1_001), "stitch": (5_000, 201), "explore": (10_000, 501)}
@@ -29,13 +31,20 @@ _POINTS = {
 }
 _ANTS = {
     f"antmaze-{maze}-{kind}-v0": Recipe(
-        f"antmaze-{maze}-v0", kind, *episodes, noise=1.0 if kind == "explore" else 0.2
+        f"antmaze-{maze}-v0",
+        kind,
+        *episodes,
+        noise=1.0 if kind == "explore" else 0.2,
+        progress_coeff=0.0,
+        updates=10_000,
     )
     for maze in ("medium", "large", "giant", "teleport")
     for kind, episodes in (_GIANT if maze == "giant" else _EPISODES).items()
 }
 _PUZZLES = {
-    f"puzzle-{size}-play-v0": Recipe(f"puzzle-{size}-v0", "play", episodes, 1_001, 0.1, (12, 15), 0.5)
+    f"puzzle-{size}-play-v0": Recipe(
+        f"puzzle-{size}-v0", "play", episodes, 1_001, 0.1, (12, 15), (12, 18), 1.0, 10_000
+    )
     for size, episodes in {"3x3": 1_000, "4x4": 1_000, "4x5": 3_000, "4x6": 5_000}.items()
 }
 RECIPES = _POINTS | _ANTS | _PUZZLES

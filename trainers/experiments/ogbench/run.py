@@ -59,9 +59,9 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
         else:
             learned = learn(data, model, config, progress=counted("learn", "updates"))
             run.checkpoints.mkdir(exist_ok=True)
-            path = run.checkpoints / f"checkpoint-{config.updates:012d}.torchrl"
+            path = run.checkpoints / f"checkpoint-{config.num_updates:012d}.torchrl"
             plain_checkpoint(loss_module=learned.loss, training=learned).save(path)
-        save_worker(run.path, learned.loss, config.updates)
+        save_worker(run.path, learned.loss, config.num_updates)
         steps = learned.curves["updates"]
         curves = {k: (steps, values) for k, values in learned.curves.items() if k != "updates"}
         run.write_curves(curves, "updates")
