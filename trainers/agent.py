@@ -1,4 +1,4 @@
-"""The agent in one line: an environment's id, learned skills, plans, and a folder to keep it in."""
+"""The agent in one line: an environment's id, learned skills, plans, and a folder to save it in."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ class Solution:
     """One episode: its plan, and its result in another instance of the env.
 
     Attributes:
-        solved (bool, optional): whether the goal was reached; where rewards are collected, whether
-            they sum up to the env's ``reward_threshold``, and None where it names none.
+        solved (bool, optional): whether the goal was reached. If rewards are collected, whether
+            their sum reaches the env's ``reward_threshold``; None if the env has none.
         reward (float): the env's own rewards, summed.
         base_steps (int): of the episode.
         num_options (int): that were executed.
         simulated_steps (int): base steps of all searches.
         plan_seconds (float): of all searches.
-        plan (Plan, optional): that was executed, or the last one where every option had a search of
-            its own; options ``[L]``.
+        plan (Plan, optional): that was executed, or the last one if each option had its own search;
+            options ``[L]``.
 
     Example:
         >>> Solution(True, 1.0, 40, 4, 900, 0.1).solved
@@ -85,8 +85,7 @@ class HMCTS:
         **keys: of :class:`~torchrl_hmcts.trainers.experiments.gym_settings.GymConfig`, e.g.
             ``option_steps=10``, ``task="return"``, ``make={"max_episode_steps": 500}``,
             ``worker=DIR`` for the skills of another agent or run,
-            ``planner={"leaves_per_wave": 8}``. What is not given is found by a short look at the
-            env.
+            ``planner={"leaves_per_wave": 8}``. A short look at the env chooses the others.
 
     Raises:
         ValueError: if the id is unknown (the nearest are named), or the state cannot be stored.
@@ -261,7 +260,7 @@ class HMCTS:
         self.__dict__["planner"] = self.kit.guide(self.kit.make_planner(self.env), self.manager)
 
     def solve(self, seed: int = 0, *, search: bool = True) -> Solution:
-        """Plan from a start and act in an env of its own.
+        """Plan from a start, and execute the plan in another instance of the env.
 
         Args:
             seed: of the start, and of all that is drawn in the episode and its searches.
@@ -393,7 +392,7 @@ def _bar(name: str, shown: bool) -> Callable[..., Any] | None:
 
 @contextlib.contextmanager
 def _torchrl_quiet() -> Iterator[None]:
-    """Keeps TorchRL's messages that are no warnings to itself."""
+    """Hides messages of TorchRL that are not warnings."""
     logger = logging.getLogger("torchrl")
     level = logger.level
     logger.setLevel(max(level, logging.WARNING))

@@ -1,4 +1,4 @@
-"""The evaluation of new nodes: what a planner's parts say of them, in one checked call.
+"""The evaluation of new nodes: priors and values by a planner's parts, in one checked call.
 
 Letters: m nodes, A options.
 """
@@ -18,7 +18,7 @@ from torchrl_hmcts.planners.random_streams import with_seeds
 
 
 class Evaluation(NamedTuple):
-    """Priors and values of states; None for what is not known.
+    """Priors and values of states; None if not known.
 
     Attributes:
         priors (Tensor): ``[m, A]`` probabilities of the options. Default: uniform.
@@ -45,7 +45,7 @@ Evaluator = Callable[[TensorDictBase], Any]
 
 
 class NodeEvaluator:
-    """Asks for the priors and values of new nodes; priors of ``option_prior`` count first."""
+    """Computes priors and values of new nodes; priors of ``option_prior`` take precedence."""
 
     def __init__(
         self, leaf_evaluator: Evaluator | None, option_prior: Evaluator | None, num_options: int
