@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts import notebook
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
 from torchrl_hmcts.trainers.evaluation import Results
@@ -34,7 +35,7 @@ from torchrl_hmcts.trainers.experiments.registry import KITS, find_experiment, l
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.manager import ManagerPolicy
 from torchrl_hmcts.trainers.runs.console import Bar
-from torchrl_hmcts.trainers.runs.run import open_run
+from torchrl_hmcts.trainers.runs.run import FolderRefused, next_free, open_run, run_files
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import save_worker
 
@@ -204,7 +205,7 @@ class HMCTS:
             )
         changes: dict[str, Any] = {"options": "learned", "worker": ""}
         if base_steps is not None:
-            changes["train_base_steps"] = base_steps
+            changes["train_base_steps"] = whole_number("learn", "base_steps", base_steps, least=1)
         self.kit = self._make_kit(dataclasses.replace(self._asked, **changes))
         with _torchrl_quiet():
             self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
@@ -282,6 +283,8 @@ class HMCTS:
             out: GIF to write instead, with a video (``.mp4``) beside it: the env's own pictures
                 where it draws any, else its features.
         """
+        if out is not None and Path(out).suffix not in (".gif", ".mp4"):
+            raise ValueError(f"out is a film, FILE.gif or FILE.mp4; got {str(out)!r}.")
         start = self.start(seed)
         if out is None:
             mode = "human" if render else ""
@@ -310,7 +313,7 @@ class HMCTS:
         Returns:
             The state to start from, ``[1]``.
         """
-        own = self.config
+        own, seed = self.config, whole_number("HMCTS", "seed", seed)
         with torch.random.fork_rng(devices=[]):  # TorchRL seeds its global generator, too
             self.env.set_seed(seed)
             self.real_env.set_seed(seed + _OTHER_DRAWS)
@@ -342,6 +345,11 @@ class HMCTS:
                 "An agent over a function that makes its env cannot be saved: register the env "
                 "with gymnasium.register and build the agent from its id."
             )
+        if not overwrite and run_files(Path(folder)):
+            raise FolderRefused(
+                f"{str(folder)!r} holds an agent or a run already. Save into another folder, e.g. "
+                f"{next_free(str(folder))!r}, or pass overwrite=True to replace it."
+            )
         changes: dict[str, Any] = {"out": str(folder), "overwrite": overwrite, "resume": False}
         with open_run(dataclasses.replace(self.config, **changes)) as run:
             if self.learned is not None and self.learned.loss is not None:
@@ -358,8 +366,8 @@ class HMCTS:
             folder: of the agent, or of a run of the kits ``gym``, ``waterworld`` and ``labmaze``.
 
         Raises:
-            FileNotFoundError: if there is none, or it has no networks yet.
-            ValueError: if it is another kind of run, or damaged.
+            FileNotFoundError: if it has no networks yet.
+            ValueError: if there is no such folder, it holds another kind of run, or is damaged.
         """
         _, config = load_config(read_run(folder))
         if not isinstance(config, SkillsConfig):
@@ -382,7 +390,8 @@ class HMCTS:
         name = getattr(config, "id", "") or getattr(self._env, "__name__", config.EXPERIMENT)
         what = "skills" if config.options == "learned" else "actions"
         return (
-            f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
+            f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base step"
+            f"{'s' * (config.option_steps != 1)})"
         )
 
 
@@ -412,8 +421,8 @@ def load_worker(folder: str | Path) -> SkillPolicy:
         The policy, in evaluation mode, with its most probable actions.
 
     Raises:
-        FileNotFoundError: if there is none, or it has no networks yet.
-        ValueError: if its options are given, not learned.
+        FileNotFoundError: if it has no networks yet.
+        ValueError: if there is no such folder, or the agent's options are given, not learned.
 
     Example:
         >>> import tempfile

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import io
 import random
 from collections.abc import Callable
 from typing import Any, Literal
@@ -139,7 +140,8 @@ def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
             break
         except gymnasium.error.Error:
             try:
-                gymnasium.register_envs(importlib.import_module(package))
+                with contextlib.redirect_stderr(io.StringIO()):  # notes about other envs
+                    gymnasium.register_envs(importlib.import_module(package))
             except Exception:
                 continue
     try:

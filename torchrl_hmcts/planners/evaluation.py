@@ -57,6 +57,12 @@ class NodeEvaluator:
             no_class("MCTSPlanner", name, part)
             if part is not None and not callable(part):
                 raise TypeError(f"{name} must be callable on a tensordict; got {part!r}.")
+            if type(part).__module__.startswith("torch.nn."):
+                wrapper = "ValueEvaluator" if name == "leaf_evaluator" else "ModulePrior"
+                raise TypeError(
+                    f"{name} is called on a tensordict; got {type(part).__name__}, which reads "
+                    f"tensors. Write {name}={wrapper}(TensorDictModule(net, in_keys, out_keys))."
+                )
 
     def bind(self, simulator: Any, gamma: float) -> None:
         """Give the simulator and the discount to the parts that simulate."""

@@ -19,8 +19,8 @@ def check_env(env: EnvBase) -> None:
     """Refuse an env that cannot be set to a state, or has no state or several actions."""
     if not isinstance(env, EnvBase):
         raise TypeError(
-            f"MCTSPlanner plans in a TorchRL env; got {type(env).__name__}. Wrap a Gymnasium "
-            f"env as described in TorchRL's GymWrapper, with a state that can be set."
+            f"MCTSPlanner plans in a TorchRL env; got {env!r:.60}. Make one of a Gymnasium env or "
+            "its id: SettableGymEnv(env)."
         )
     name = env_name(env)
     if env.batch_locked and not env._supports_set_state:

@@ -16,7 +16,14 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from torchrl_hmcts.checks import instance, nested_key, one_of, real_number, whole_number
+from torchrl_hmcts.checks import (
+    instance,
+    nested_key,
+    no_class,
+    one_of,
+    real_number,
+    whole_number,
+)
 from torchrl_hmcts.nesting import parts
 from torchrl_hmcts.transforms.env_transform import zero_count
 from torchrl_hmcts.transforms.option_checks import HasOptions, Termination, check_skill_table
@@ -137,6 +144,7 @@ class OptionTransform(HasOptions):
         skills: Tensor | None = None,
     ) -> None:
         for name, part in (("worker", worker), ("termination", termination)):
+            no_class("OptionTransform", name, part)
             if not callable(part) and (part is not None or name == "worker"):
                 raise ValueError(
                     f"OptionTransform needs a {name} that it can call on a tensordict; got "

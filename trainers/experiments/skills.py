@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -78,7 +79,7 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
     kit = make_kit(config)
     if found := kit.describe():
-        print(found)
+        print(textwrap.fill(found, console.WIDTH))
     begin = time.perf_counter()
     logger = make_logger(config)
     learned = learn(

@@ -19,11 +19,13 @@ from typing import Any
 
 from tqdm import tqdm
 
-INTERVAL = 10.0  # seconds between two signs of life
+INTERVAL = 9.0  # seconds between two signs of life; looked at every second
 WIDTH = 79
 _NAME_WIDTH = 46
 
-_BAR = "{desc}: {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt}{unit} [{elapsed}<{remaining}{postfix}]"
+_BAR = (
+    "{desc}: {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt}{unit} [{elapsed}<{remaining}{postfix}]"
+)
 _BAR_WIDTH = 12  # at least
 _LINE = "{desc}: {percentage:.0f} % ({n_fmt} of {total_fmt}{unit}) in {elapsed}{postfix}"
 

@@ -22,6 +22,7 @@ from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.planners import PUCT, MCTSPlanner, PolicyValueEvaluator
 from torchrl_hmcts.trainers.diayn import worker_losses
 from torchrl_hmcts.trainers.evaluation import (
@@ -511,6 +512,7 @@ def make_kit(config: SkillsConfig, *env: Any) -> Kit:
         >>> type(make_kit(DemoConfig())).__name__
         'WaterworldKit'
     """
+    instance("make_kit", "config", config, SkillsConfig)
     path = f"{__name__}.{KITS[config.KIT]}"
     module, _, name = path.rpartition(".")
     kit: Kit = getattr(importlib.import_module(module), name)(config, *env)
