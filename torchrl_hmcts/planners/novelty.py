@@ -63,8 +63,7 @@ class NoveltyTest(Protocol):
         """
 
     def relax(self, root: int) -> bool:
-        """Be less strict for one root whose search is exhausted; return False if that is
-        impossible."""
+        """Be less strict for one exhausted root; return False if that is impossible."""
 
 
 def ask(
@@ -74,8 +73,8 @@ def ask(
     novel = np.asarray(test.accept(roots, features, base_steps))
     if novel.shape != (len(features),) or novel.dtype != np.bool_:
         raise ValueError(
-            f"The novelty test accepted {novel.dtype} {list(novel.shape)}; it must say of each "
-            f"of the {len(features)} states whether it is new, in bool."
+            f"The novelty test returned {novel.dtype} {list(novel.shape)}; return a bool for each "
+            f"of the {len(features)} states, True where it is new."
         )
     return novel
 

@@ -85,7 +85,7 @@ class SearchSettings:
         ):
             value = getattr(self, name)
             if not isinstance(value, str) or value not in allowed:
-                raise ValueError(f"{name} is {allowed[0]!r} or {allowed[1]!r}; got {value!r}.")
+                raise ValueError(f"{name} must be {allowed[0]!r} or {allowed[1]!r}; got {value!r}.")
         for name in ("leaves_per_wave", "waves_in_flight"):
             object.__setattr__(self, name, whole_number("A search", name, getattr(self, name)))
         leaves, waves = self.leaves_per_wave, self.waves_in_flight

@@ -35,7 +35,8 @@ def check_env(env: EnvBase) -> None:
         )
     if len(env.action_keys) != 1:
         raise ValueError(
-            f"MCTSPlanner chooses one option per step; {name} has the actions {env.action_keys}."
+            f"MCTSPlanner chooses one option per step; {name} has the actions {env.action_keys}. "
+            "Make one discrete action of them, e.g. by an OptionTransform around a worker."
         )
     if not list(env.full_state_spec.keys(True, True)):
         raise ValueError(
