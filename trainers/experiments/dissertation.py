@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchrl_hmcts.trainers.runs.config import unknown_key
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder
 
 _LAB_RUNS = "hmcts train experiment=labmaze seed={seed} out=runs/labmaze_{seed}"
@@ -153,8 +153,7 @@ def find_figure(name: str) -> SourceFigure:
     """Return a figure by its number; ``figure_`` or ``Figure `` before it does no harm."""
     short = name.lower().replace("figure", "").replace(" ", "").strip("_")
     if short not in FIGURES:
-        near = difflib.get_close_matches(short, FIGURES, n=3, cutoff=0.5) or FIGURES
-        raise ValueError(f"Unknown figure {name!r}. Did you mean: {', '.join(near)}?")
+        raise ValueError(unknown_key(short, FIGURES, "figure"))
     return FIGURES[short]
 
 

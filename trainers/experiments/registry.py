@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from fnmatch import fnmatch
 from typing import Any
 
-from torchrl_hmcts.trainers.runs.config import config_keys
+from torchrl_hmcts.trainers.runs.config import config_keys, unknown_key
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder
 
 
@@ -236,9 +236,7 @@ def find_experiment(name: str, among: Mapping[str, Experiment] = EXPERIMENTS) ->
         ValueError: Unknown experiment 'labmaz'. Did you mean: labmaze...
     """
     if name not in among:
-        near = difflib.get_close_matches(name, among, n=3, cutoff=0.4) or among
-        what = "kit" if among is KITS else "experiment"
-        raise ValueError(f"Unknown {what} {name!r}. Did you mean: {', '.join(near)}?")
+        raise ValueError(unknown_key(name, among, "kit" if among is KITS else "experiment"))
     return among[name]
 
 
