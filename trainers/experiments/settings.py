@@ -54,10 +54,9 @@ class SkillsConfig(RunConfig):
     planner.KEY=VALUE, planner.PART.KEY=VALUE. They hold for Algorithm 3's training rounds too, but
     the expansions of those are round_expansions."""
     manager: str = "novelty"
-    """Manager: "novelty" (UCT that refuses places it knows), "source" (the
-    dissertation's four stages: UCT with a random simulation from each new node, no novelty test),
-    or "learned" (prior and value learned from searches in training mazes, carried to the test
-    mazes)."""
+    """Manager: "novelty" (UCT with a novelty test), "four_stages" (the dissertation's: UCT with a
+    random simulation from each new node, no novelty test), or "learned" (prior and value, learned
+    from searches in training mazes, guide the search in test mazes)."""
     manager_searches: int = 400
     """Training searches in each of the four iterations of manager=learned."""
     num_skills: int = 4
@@ -115,7 +114,7 @@ class SkillsConfig(RunConfig):
     CHOICES = {
         "options": ("learned", "actions"),
         "algorithm": ("diayn", "hmcts"),
-        "manager": ("novelty", "source", "learned"),
+        "manager": ("novelty", "four_stages", "learned"),
         "features": ("place", "learned", "none"),
         "keep": ("best", "last"),
         "collector": ("local", "ray"),

@@ -259,7 +259,7 @@ class Kit:
     def planner_part(self) -> dict[str, Any]:
         """Return the entries of the planner at the kit's defaults, by keyword."""
         config = self.config
-        if config.manager == "source":
+        if config.manager == "four_stages":
             return four_stages(config.expansions)
         return {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
