@@ -35,14 +35,16 @@ _PACKAGES = ("gymnasium_robotics", "minigrid", "ogbench", "ale_py")
 
 
 class PrivateRandom(gymnasium.Wrapper):
-    """Gives an env that draws from the global generators of NumPy and Python states of its own.
+    """Gives an env that draws from the global generators of NumPy and Python its own states of
+    them.
 
-    Such an env is neither fixed by ``reset(seed=...)``, nor independent of what else draws. Under
-    this wrapper the global generators are as they were after every reset and step, and after a
-    ``with`` block of it: many steps in one block save the time of exchanging states, 0.2 ms each.
+    ``reset(seed=...)`` does not fix such an env, and other draws change it. This wrapper restores
+    the global generators after every reset and step, and after a ``with`` block of it. Many steps
+    in one block save the time of exchanging states, 0.2 ms each.
 
     Args:
-        env (gymnasium.Env): e.g. OGBench's mazes, which draw starts, goals and teleports so.
+        env (gymnasium.Env): e.g. a maze of OGBench, which draws starts, goals and teleports from
+        them.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
@@ -191,17 +193,17 @@ def _set_global_states(states: tuple[Any, Any]) -> None:
 
 
 class SettableGymEnv(GymWrapper):
-    """A Gymnasium env that a planner can set to any state, right to the bit.
+    """A Gymnasium env that a planner can set to any state, exact to the bit.
 
-    Its state is the entry ``"snapshot"``, uint8 ``[width]``, beside its observations. Any transform
-    of TorchRL can be put on top of it, an :class:`~torchrl_hmcts.transforms.OptionTransform` too.
+    The entry ``"snapshot"``, uint8 ``[width]``, holds its state beside its observations. You can
+    append any transform of TorchRL, an :class:`~torchrl_hmcts.transforms.OptionTransform` too.
 
     Args:
         env (str, gymnasium.Env or callable): an id, an env, or a function that makes one. It is
             reset.
-        snapshot (type, tuple of two functions, or callable, optional): how its state is stored,
-            see :func:`~torchrl_hmcts.envs.gym.families.snapshot_of`. Default: found by itself, and
-            named in the ``repr``.
+        snapshot (type, tuple of two functions, or callable, optional): how to store its state, see
+            :func:`~torchrl_hmcts.envs.gym.families.snapshot_of`. Default: chosen by the kind of
+            env; the ``repr`` names it.
         cap (int): bytes of the attributes in a row at most. Default 65,536.
         features (callable, optional): ``features(env, observation)`` gives an array ``[F]``, the
             entry ``"features"``. Default: none.

@@ -1,4 +1,4 @@
-"""Landmarks of recorded episodes, and to which of them options lead: a model to plan in.
+"""Landmarks of recorded episodes, and options between them: a model to plan in.
 
 Letters: T recorded steps, F numbers of a place, N landmarks, A options of a landmark, K outcomes
 of an option, *B batch of a tensordict.
@@ -35,7 +35,8 @@ class LandmarkModel(nn.Module):
 
     .. math:: P(j \mid p) = n_{pj} / n_p.
 
-    So a lucky jump is not taken for a way, as it is where goals are relabelled in hindsight.
+    So the model does not take a lucky jump for a reliable path, as relabelling goals in hindsight
+    does.
 
     Build it by :meth:`fit`; ``load_state_dict`` fills one that was built with the same sizes.
 
