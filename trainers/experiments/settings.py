@@ -230,8 +230,10 @@ class DemoConfig(SkillsConfig):
         """Return the configuration that is run: with ``toy`` a small one."""
         if not self.toy:
             return self
-        few = {"mazes": min(3, self.mazes), "manager_searches": min(2, self.manager_searches)}
-        return dataclasses.replace(self, train_base_steps=1_920, **few)
+        searches = min(2, self.manager_searches)
+        return dataclasses.replace(
+            self, train_base_steps=1_920, mazes=min(3, self.mazes), manager_searches=searches
+        )
 
 
 @dataclass

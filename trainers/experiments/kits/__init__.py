@@ -318,7 +318,7 @@ class Kit:
             simulator: the macro env to plan in.
             **own: what the trainer sets; another ``tree_policy`` of the configuration goes first.
         """
-        bare = {
+        bare: dict[str, Any] = {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
             "novelty": self.planner_part().get("novelty"),
             "budget": {"_component_": "torchrl_hmcts.planners.SearchBudget"},
