@@ -136,6 +136,7 @@ def _with_arrays(env: gymnasium.Env) -> gymnasium.Env:
 
 
 def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
+    missing = []
     for package in _PACKAGES:
         try:
             gymnasium.spec(name)
@@ -145,16 +146,18 @@ def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
                 with contextlib.redirect_stderr(io.StringIO()):  # notes about other envs
                     gymnasium.register_envs(importlib.import_module(package))
             except Exception:
-                continue
+                missing.append(package)
     try:
         return gymnasium.make(name, disable_env_checker=True, **keywords)
     except gymnasium.error.UnregisteredEnv:
         near = difflib.get_close_matches(name, list(gymnasium.registry), n=3, cutoff=0.5)
         hint = f"Nearest: {', '.join(near)}." if near else "gymnasium.pprint_registry() lists all."
-        raise ValueError(
-            f"No env has the id {name!r}. {hint} Box2D, MuJoCo's robots, MiniGrid and OGBench come "
-            "with pip install 'torchrl_hmcts[gym]', Atari with 'torchrl_hmcts[atari]'."
-        ) from None
+        if missing:
+            hint += (
+                f" Not installed here: {', '.join(missing)}. pip install 'torchrl_hmcts[gym]' adds "
+                "mazes, MiniGrid and OGBench, 'torchrl_hmcts[atari]' Atari."
+            )
+        raise ValueError(f"No env has the id {name!r}. {hint}") from None
     except gymnasium.error.DependencyNotInstalled as error:
         raise ImportError(
             f"{name} needs a package that is not installed: {' '.join(map(str, error.args))}. "

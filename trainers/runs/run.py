@@ -276,8 +276,9 @@ def check_folder(config: Any, experiment: str) -> None:
         )
     seed = "" if run.seed is None else f", seed {run.seed}"
     status = f"{run.status or ('finished' if run.metrics else 'unfinished')} run"
+    status = f"{'an' if status[0] in 'aeiou' else 'a'} {status}"
     raise FolderRefused(
-        f"{path} holds a {status}{f' of {run.experiment}' if run.experiment else ''}{seed} "
+        f"{path} holds {status}{f' of {run.experiment}' if run.experiment else ''}{seed} "
         f"({_some(there)}). Continue it with: {resume_command(config.out)}; replace it with "
         f"overwrite=true; or choose another folder, e.g. {_word('out', other)}."
     )
