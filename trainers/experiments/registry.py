@@ -94,7 +94,8 @@ class Experiment:
         """Return its keys with their defaults and meaning, a line or two each."""
         lines = []
         for key, (default, meaning) in config_keys(self.config_class).items():
-            lines.append(f"  {key}.KEY=VALUE" if default == {} else f"  {key}={default}")
+            shown = str(default).lower() if isinstance(default, bool) else default
+            lines.append(f"  {key}.KEY=VALUE" if default == {} else f"  {key}={shown}")
             indent = " " * 6
             lines += textwrap.wrap(meaning, 92, initial_indent=indent, subsequent_indent=indent)
         return "\n".join(lines)

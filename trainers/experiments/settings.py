@@ -176,7 +176,7 @@ class DemoConfig(SkillsConfig):
     task: str = "maze"
     """Task: "maze" (reach the target), "boat" (the same with a body that must turn
     to where it goes), "apples" (collect what is worth most before the fuel is spent) or "key" (the
-    target is shut to who has not taken the key)."""
+    target opens when the key has been taken)."""
     size: int = 9
     """Tiles along a side of the test mazes: 9, 15 or 31. Skills are learned in mazes of 9."""
     search_steps: int = 0
@@ -184,8 +184,8 @@ class DemoConfig(SkillsConfig):
     option_steps: int = 0  # type: ignore[misc]
     """Base steps of an option (the dissertation's N_worker_samples); 0: 25, for a boat 40."""
     skill_steps: int = 0  # type: ignore[misc]
-    """Base steps of a mini-episode in training: long enough for the skills to part; 0: 50, for a
-    boat 40."""
+    """Base steps of a mini-episode in training: long enough that skills become different; 0: 50,
+    for a boat 40."""
     train_base_steps: int = 0
     """Base steps of worker training in the training mazes; 0: 40,000, for a boat 80,000."""
     updates_per_step: float = 0.0
