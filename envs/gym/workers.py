@@ -174,7 +174,7 @@ class OccasionalAction:
         self.num_options = worker.num_options
 
     def act(self, observation: Any, option: int, generator: np.random.Generator) -> int:
-        """Return the action, or what the worker does."""
+        """Return the action, or the worker's."""
         if generator.random() < self.probability:
             return self.action
         return self.worker.act(observation, option, generator)

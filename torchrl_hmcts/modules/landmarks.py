@@ -193,7 +193,7 @@ class LandmarkModel(nn.Module):
         return bool((self.probabilities > 0.0).sum(-1).max() > 1)
 
     def values(self, goal: Tensor, gamma: float) -> Tensor:
-        r"""Return what landmarks are worth on the way to one, by value iteration.
+        r"""Return the values of all landmarks for one goal landmark, by value iteration.
 
         .. math:: V(i) = \max_a \gamma^{k_{ia}} \sum_j P(j \mid i, a)\, V(j), \qquad V(g) = 1
 

@@ -170,7 +170,7 @@ def learn(
     logger: Logger | None = None,
     resume: bool = False,
 ) -> LearnedSkills:
-    """Train a worker as the configuration of the kit says.
+    """Train a worker by the configuration of the kit.
 
     Args:
         kit: whose env it learns in.

@@ -211,12 +211,12 @@ class Kit:
                 self.config = replace(self.config, novelty_radius=RADIUS_SHARE * reach)
 
     def reach(self, simulator: EnvBase, starts: TensorDictBase) -> float:
-        """Return how far options move what the novelty test compares, see :func:`option_reach`."""
+        """Return how far options move the novelty test's features, see :func:`option_reach`."""
         novelty: Any = self.make_planner(simulator).novelty
         return option_reach(simulator, starts, novelty.features, self.config.num_skills)
 
     def note(self, loss: LossModule) -> None:
-        """Take note of the networks that are learned: what ``features="learned"`` compares."""
+        """Take note of the learned networks, which ``features="learned"`` compares."""
         objective: Any = getattr(loss, "objective", None)
         network = getattr(objective, "encoder", getattr(objective, "discriminator", None))
         self._encoder = network
@@ -308,7 +308,7 @@ class Kit:
 
     @property
     def manager_keys(self) -> Sequence[NestedKey]:
-        """Entries of the states of which a network for the manager can learn; none: none."""
+        """Entries of the states that a network for the manager reads; empty if there is none."""
         return ()
 
     def make_round_planner(self, simulator: EnvBase, **own: Any) -> MCTSPlanner:
@@ -331,7 +331,7 @@ class Kit:
         return planner
 
     def second_try(self) -> Kit | None:
-        """Return the kit with which starts are searched again that have no plan; None for none."""
+        """Return the kit with which starts without a plan are searched again; None for none."""
         return None
 
     def manager_network(
@@ -380,7 +380,7 @@ class Kit:
         )
 
     def describe(self) -> str:
-        """Return what the kit has found out of the env by itself, for the beginning of a run."""
+        """Return what the kit found out about the env, to print at the beginning of a run."""
         return ""
 
     def act_by(self, policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase) -> Results:
@@ -436,7 +436,7 @@ class Kit:
         }
 
     def map(self, env: EnvBase) -> Any:
-        """Return what draws the states of a base env; None where there is no map.
+        """Return a map that draws the states of a base env; None if there is none.
 
         See :class:`~torchrl_hmcts.trainers.figures.maps.MapDrawing`.
         """
