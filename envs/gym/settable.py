@@ -301,7 +301,7 @@ class SettableGymEnv(GymWrapper):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Steps the env with a fifth of the bookkeeping of TorchRL's GymWrapper."""
-        action = tensordict.get(self.action_key)
+        action = tensordict[self.action_key]
         if self._discrete:
             taken: Any = int(action)
         else:
