@@ -80,8 +80,9 @@ class MCTSPlanner(TensorDictModuleBase):
     are closed and never simulated again.
 
     Root ``b`` of a call with seed ``s`` draws its random numbers (root noise, Gumbel, rollouts,
-    sampled choices) from ``s + b``, so that its tree does not depend on the roots beside it
-    (with more than one wave in flight only where it is alone: waves are of all roots together).
+    sampled choices) from ``s + b``, so that its tree does not depend on the roots beside it. With
+    several waves in flight this holds for a single root only, since a wave takes leaves of all
+    roots.
 
     Args:
         env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or
