@@ -126,7 +126,7 @@ def simulations(seed: int) -> Iterator[Arm]:
     }.items():
         yield Arm("simulation", "maze, 100", name, words, seed=seed)
     name = "the dissertation's four stages"
-    yield Arm("simulation", "maze, 20", name, ("manager=source",), seed=seed)
+    yield Arm("simulation", "maze, 20", name, ("manager=four_stages",), seed=seed)
 
 
 def workers(task: str, seed: int) -> Iterator[Arm]:

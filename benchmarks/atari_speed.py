@@ -93,7 +93,7 @@ def rates(frames: int, seconds: float, cpu: float) -> dict[str, float]:
 
 
 class Agent:
-    """Decision after decision: search, take the chosen option, go on from there."""
+    """Decision after decision: search, take the chosen option, continue from there."""
 
     def __init__(self, game: str, args: argparse.Namespace) -> None:
         num_actions = AtariEmulator(EmulatorSettings(game)).num_actions

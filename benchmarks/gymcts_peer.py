@@ -8,7 +8,7 @@ moves. Players:
 
 - ``gymcts, deep copies`` and ``gymcts, action history``: its agent over its two wrappers, its
   defaults, single actions, the tree kept as in its examples. Its rollouts end where an episode
-  terminates, so a truncation is told to it as a termination; its second wrapper resets the env
+  terminates, so it gets a truncation as a termination; its second wrapper resets the env
   without a seed, so its env resets to one seed.
 - ``ours, rollouts``: the same search, single actions, UCT and a random rollout to the end from each
   new node, ``RolloutEvaluator``, two leaves a wave, so that no wave takes longer than a move has.

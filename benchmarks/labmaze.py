@@ -4,13 +4,13 @@
     python benchmarks/labmaze.py --quick
 
 For each seed, a worker is trained by DIAYN in 40,000 frames (10,000 base steps) of 9 x 9 mazes, and
-then mazes of all sizes are solved with it, each at the first trial: a plan in the model, carried
-out in another instance of the env. Further, in the 9 x 9 mazes: options of fixed length; envs whose
+then mazes of all sizes are solved with it, each at the first trial: a plan in the model, executed
+in another instance of the env. Further, in the 9 x 9 mazes: options of fixed length; envs whose
 clock and friction differ by 5 % from the model's, with a new plan after every option; workers of
 Algorithm 3 from scratch, and of DIAYN with 40,000 base steps (160,000 frames).
 
 Every part is written to ``--out`` as soon as it is known, and the workers to ``--work``; started
-again with the same arguments, the script goes on with what is missing.
+again with the same arguments, the script continues with what is missing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a network is told of a maze: a window of walls around the player.
+"""A view of a maze for a network: a window of walls around the player.
 
 Letters: *B batch of the tensordict, H rows, W columns, K walls, R tiles that the window reaches to
 each side.

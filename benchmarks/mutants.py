@@ -8,7 +8,7 @@ more, ``and`` becomes ``or``, a condition is turned round, ``min`` becomes ``max
 of them is drawn; for each, the tests of that file are run in a copy of the project until one fails.
 Error messages and type annotations are not changed.
 
-A call that was stopped goes on from its ``--out`` file. ``--again`` runs the survivors of such a
+A call that was stopped continues from its ``--out`` file. ``--again`` runs the survivors of such a
 file once more, after tests were added; what the first run found stays in it. Numba compiles a
 mutant of the kernels, and of the constants they read, with an empty cache.
 """

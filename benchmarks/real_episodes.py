@@ -72,7 +72,7 @@ class EpisodesInEachMaze(WaterworldMazeEnv):
 class Episodes:
     """What acting in the real env gave, one entry per maze ``[M]``.
 
-    ``solved`` (bool); ``base_steps`` carried out and ``num_plans`` made (int64); ``seconds`` of all
+    ``solved`` (bool); ``base_steps`` executed and ``num_plans`` made (int64); ``seconds`` of all
     episodes together.
     """
 

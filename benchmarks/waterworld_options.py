@@ -293,8 +293,8 @@ def error_by_horizon(model_env: EnvBase, real: EnvBase, horizon: int) -> list[fl
         horizon: options in a row.
 
     Returns:
-        Median distance of the predicted from the real position, tiles, over the episodes that go
-        on.
+        Median distance of the predicted from the real position, tiles, over the episodes that
+        continue.
     """
     with torch.no_grad():
         td = real.rollout(horizon, break_when_any_done=False, break_when_all_done=True)

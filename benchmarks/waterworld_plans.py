@@ -5,8 +5,8 @@
 
 Trains the demo's worker, plans in every test maze alone (B = 1), improves each plan by some more
 expansions, and, for the first ``--long-mazes``, compares it with the best plan of a search that
-goes on for as many expansions as ``--long-seconds`` at B = 1 would pay for. Those searches run side
-by side, since a tree does not depend on what is searched beside it.
+continues for as many expansions as ``--long-seconds`` at B = 1 would pay for. Those searches run
+side by side, since a tree does not depend on what is searched beside it.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 For every seed and length of training: skills learned in the training mazes; then, in the 342 test
 mazes, the discriminator's accuracy, the directions of the skills, the share of a maze's free tiles
-that a search of 200 expansions reaches, and the mazes solved at the first trial, each plan carried
-out in a separate instance of the env.
+that a search of 200 expansions reaches, and the mazes solved at the first trial, each plan executed
+in a separate instance of the env.
 """
 
 from __future__ import annotations

@@ -32,10 +32,11 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
-    "command_line_page",  # in docs/_extensions, as the next three
+    "command_line_page",  # in docs/_extensions, as the next four
     "public_names",
     "repository_links",
     "results_page",
+    "wide_pictures",
 ]
 if importlib.util.find_spec("sphinx-mathjax-offline"):  # equations without a network
     extensions.append("sphinx-mathjax-offline")

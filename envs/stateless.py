@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 
 class StatelessSimulator(EnvBase):
-    """Says of an env that all that its step reads is in the tensordict, so that it can be set.
+    """Declares that a step of an env reads nothing but the tensordict, so that it can be set.
 
     Brax and other functional simulators are such envs: TorchRL's wrappers hand their whole state
     out, and step from the one they are given, but do not support ``reset(td, set_state=True)``.

@@ -71,6 +71,8 @@ def test_an_unknown_key_of_an_experiment_is_refused_with_the_nearest(capsys) -> 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["trian"], "Unknown verb 'trian'. Did you mean: train"),
+        (["list", "gyn"], "Unknown experiment 'gyn'. Did you mean: gym"),
         (["train", "labmaze"], "Write experiment=labmaze"),
         (["train", "gym"], "Write kit=gym"),
         (["train", "labmase"], "Did you mean experiment=labmaze?"),
@@ -88,6 +90,17 @@ def test_an_unknown_key_of_an_experiment_is_refused_with_the_nearest(capsys) -> 
 def test_a_slip_is_answered_by_the_right_words(capsys, words: list[str], message: str) -> None:
     assert main(words) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_folder_that_is_refused_is_not_announced(tmp_path, capsys) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "run.json").write_text('{"experiment": "demo", "config": {"seed": 3}}')
+    assert main(["demo", f"out={tmp_path}/one"]) == 1
+    printed = capsys.readouterr()
+    assert "starts" not in printed.out
+    assert "holds a" in printed.err
+    assert main(["evaluate", f"run={tmp_path}"]) == 2  # a folder of runs
+    assert f"It holds the runs {tmp_path}/one." in capsys.readouterr().err
 
 
 def test_the_version_is_said(capsys) -> None:

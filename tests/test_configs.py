@@ -334,6 +334,10 @@ class TestParts:
             ("loss.num_skills=3", "num_skills, not loss.num_skills"),
             ("planner/transpositions=by_key", "planner.transpositions needs key"),
             ("planner.novelty.radius=-1", "radius"),
+            ("planner.budget=3", "planner.budget is a part; got 3. Write planner/budget=NAME"),
+            ("planner.backup=median", "backup must be 'mean' or 'max'; got 'median'"),
+            ("planner.waves_in_flight=0", "waves_in_flight"),
+            ("planner.gamma=2", "gamma"),
             ("planner", "no key=value"),
         ],
     )

@@ -25,7 +25,7 @@ from torchrl_hmcts.planners import (
     SearchBudget,
 )
 from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers import HMCTS, load_worker
+from torchrl_hmcts.trainers import HMCTS, load_worker, make_kit
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
 from torchrl_hmcts.trainers.saving.run_folder import read_run
@@ -368,11 +368,25 @@ def test_an_agent_is_not_written_over_a_run(tmp_path: Path) -> None:
     agent.save(tmp_path)
     (tmp_path / "manager.torchrl").write_bytes(b"of an older agent")
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="overwrite=true"):
+    with pytest.raises(ValueError, match="holds an agent or a run already.*overwrite=True"):
         agent.save(tmp_path)
     agent.save(tmp_path, overwrite=True)
     names = sorted(path.name for path in tmp_path.iterdir() if not path.name.startswith("."))
     assert names == ["notes.txt", "run.json"]
+
+
+def test_wrong_arguments_of_the_agent_are_named(tmp_path: Path) -> None:
+    agent = HMCTS("MountainCar-v0", option_steps=14)
+    with pytest.raises(ValueError, match="learn needs base_steps >= 1; got -5"):
+        agent.learn(-5)
+    with pytest.raises(TypeError, match="needs a whole number for seed; got 'x', a str"):
+        agent.solve(seed="x")
+    with pytest.raises(ValueError, match=r"FILE.gif or FILE.mp4; got 'film.xyz'"):
+        agent.play(out="film.xyz")
+    with pytest.raises(ValueError, match="'nowhere' is no folder of a run: it does not exist"):
+        HMCTS.load("nowhere")
+    with pytest.raises(TypeError, match="make_kit needs a SkillsConfig for config; got 'ant'"):
+        make_kit("ant")
 
 
 def test_ogbenchs_tasks_follow_the_seed() -> None:

@@ -222,7 +222,7 @@ def test_learned_features_are_a_key_of_the_command_line(tmp_path) -> None:
 
 
 def test_the_dissertations_manager_has_four_stages() -> None:
-    kit = make_kit(DemoConfig(manager="source"))
+    kit = make_kit(DemoConfig(manager="four_stages"))
     planner = kit.make_planner(kit.make_options(kit.make_env("test"), fixed_worker()))
     assert planner.novelty is None
     assert (planner.settings.expand, planner.settings.backup) == ("one", "mean")
@@ -265,7 +265,7 @@ def test_an_agent_that_is_loaded_reports_the_rewards_that_a_run_does(tmp_path) -
 
 
 def test_the_dissertations_manager_plans_the_rounds_too() -> None:
-    kit = make_kit(DemoConfig(manager="source", algorithm="hmcts"))
+    kit = make_kit(DemoConfig(manager="four_stages", algorithm="hmcts"))
     simulator = kit.make_options(kit.make_env("train"), fixed_worker())
     assert kit.make_round_planner(simulator, seed=0).novelty is None
 

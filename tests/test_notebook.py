@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 from gymnasium.envs.classic_control import CartPoleEnv
 from tensordict.nn import TensorDictModule
 from torchrl.envs import StepCounter, TransformedEnv
@@ -121,6 +122,8 @@ def test_positions_are_drawn_on_the_map_the_right_way_up(env) -> None:
         ({"budget": SearchBudget}, r"Write budget=SearchBudget\(\)"),
         ({"final_choice": BestPlan}, r"Write final_choice=BestPlan\(\)"),
         ({"leaf_evaluator": ValueEvaluator}, r"Write leaf_evaluator=ValueEvaluator\(module\)"),
+        ({"leaf_evaluator": torch.nn.Linear(1, 1)}, r"Write leaf_evaluator=ValueEvaluator\(Tensor"),
+        ({"option_prior": torch.nn.Linear(1, 2)}, r"Write option_prior=ModulePrior\(TensorDict"),
         ({"num_simulations": 50}, r"Write budget=SearchBudget\(simulations=...\)"),
         ({"seconds": 1.0}, r"Write budget=SearchBudget\(seconds=...\)"),
         ({"c_puct": 1.0}, r"Write tree_policy="),
@@ -141,3 +144,7 @@ def test_an_env_is_no_state_and_there_is_no_search_before_the_first() -> None:
         planner.plan(env)
     planner.plan(env.reset())
     assert planner.has_searched
+    with pytest.raises(TypeError, match=r"got 'CartPole-v1'. Make one .* SettableGymEnv\(env\)"):
+        MCTSPlanner("CartPole-v1")
+    with pytest.raises(TypeError, match="needs an object for worker; got the class TensorDictModu"):
+        OptionTransform(TensorDictModule, 2, 3)

@@ -733,7 +733,7 @@ def test_an_env_that_cannot_be_set_to_a_state_is_refused() -> None:
 
 
 def test_something_that_is_no_torchrl_env_is_refused() -> None:
-    with pytest.raises(TypeError, match="plans in a TorchRL env; got dict"):
+    with pytest.raises(TypeError, match="plans in a TorchRL env; got {}. Make one"):
         MCTSPlanner({})  # type: ignore[arg-type]
 
 

@@ -107,7 +107,7 @@ def test_the_worker_of_a_run_is_one_file_named_with_its_step(tmp_path: Path) -> 
         assert torch.equal(read.state_dict()[name], value), name
 
 
-def test_a_run_that_has_not_finished_shows_its_newest_checkpoint(tmp_path: Path) -> None:
+def test_a_run_that_has_not_finished_shows_its_newest_checkpoint(tmp_path: Path, capsys) -> None:
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
 
     with open_run(DemoConfig(out=str(tmp_path))) as run:
@@ -120,6 +120,7 @@ def test_a_run_that_has_not_finished_shows_its_newest_checkpoint(tmp_path: Path)
     assert find_worker(tmp_path).name == "worker-000000000064.torchrl"
     find_worker(tmp_path).write_bytes(b"damaged")
     assert find_worker(tmp_path) == newest
+    assert "worker-000000000064.torchrl is damaged (" in capsys.readouterr().err
 
 
 class TestReports:

@@ -130,6 +130,13 @@ def test_a_sweep_finds_the_best_and_each_trial_is_a_run(tmp_path, capsys) -> Non
     assert "Best of 12 trials: test.y = " in printed
 
 
+def test_each_trial_is_a_line(tmp_path, capsys) -> None:
+    assert sweep(tmp_path, "x=3..3.1", "trials=2", "prune=false") == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(" x=")[0] for line in lines] == ["trial 0:", "trial 1:"]
+    assert all(": test.y = -0.00" in line for line in lines)
+
+
 def test_the_key_that_matters_has_the_larger_importance_and_a_picture(tmp_path) -> None:
     assert sweep(tmp_path, "x=0..6", "z=[1,2]", "trials=14", "prune=false") == 0
     shares = told(tmp_path)["importances"]

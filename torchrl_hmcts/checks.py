@@ -29,10 +29,7 @@ def whole_number(owner: str, name: str, value: Any, *, least: int = 0) -> int:
         number = None
     if number is None:
         hint = f" Write {int(value)}." if isinstance(value, float) and value.is_integer() else ""
-        raise TypeError(
-            f"{owner} needs a whole number for {name}; got {value!r}, a {type(value).__name__}."
-            f"{hint}"
-        )
+        raise TypeError(f"{owner} needs a whole number for {name}; got {_described(value)}.{hint}")
     if number < least:
         raise ValueError(f"{owner} needs {name} >= {least}; got {number}.")
     return min(number, NO_LIMIT)
@@ -55,9 +52,7 @@ def real_number(
         ValueError: if it is outside the bounds.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (numbers.Real, np.number)):
-        raise TypeError(
-            f"{owner} needs a number for {name}; got {value!r}, a {type(value).__name__}."
-        )
+        raise TypeError(f"{owner} needs a number for {name}; got {_described(value)}.")
     number = float(value)
     if not (least <= number <= most and (number > above or above == -math.inf)) or (
         finite and math.isinf(number)
@@ -84,9 +79,7 @@ def instance(owner: str, name: str, value: Any, *kinds: Any) -> None:
     if not isinstance(value, kinds):
         no_class(owner, name, value)
         wanted = " or ".join(kind.__name__ for kind in kinds)
-        raise TypeError(
-            f"{owner} needs a {wanted} for {name}; got {value!r}, a {type(value).__name__}."
-        )
+        raise TypeError(f"{owner} needs a {wanted} for {name}; got {_described(value)}.")
 
 
 def one_of(owner: str, name: str, value: str, known: Iterable[str]) -> str:
@@ -98,12 +91,16 @@ def one_of(owner: str, name: str, value: str, known: Iterable[str]) -> str:
     return value
 
 
+def _described(value: Any) -> str:
+    kind = type(value).__name__
+    return f"{value!r}, {'an' if kind[0] in 'aeiouAEIO' else 'a'} {kind}"
+
+
 def nested_key(owner: str, name: str, value: Any) -> NestedKey:
     """Return a key of a tensordict in its flat form, or raise a TypeError."""
     if not _is_key(value):
         raise TypeError(
-            f"{owner} needs a string or a tuple of strings for {name}; got {value!r}, a "
-            f"{type(value).__name__}."
+            f"{owner} needs a string or a tuple of strings for {name}; got {_described(value)}."
         )
     return unravel_key(value)
 

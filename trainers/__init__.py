@@ -83,7 +83,16 @@ __all__ = sorted(_PLACES)
 def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_PLACES[name]), name)
+    try:
+        return getattr(importlib.import_module(_PLACES[name]), name)
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith("torchrl_hmcts"):
+            raise
+        raise ModuleNotFoundError(
+            f"{name} needs {error.name}, which is not installed: pip install "
+            "'torchrl_hmcts[train]'.",
+            name=error.name,
+        ) from error
 
 
 def __dir__() -> list[str]:

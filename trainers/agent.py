@@ -1,4 +1,4 @@
-"""The agent in one line: an environment's id, learned skills, plans, and a folder to keep it in."""
+"""The agent in one line: an environment's id, learned skills, plans, and a folder to save it in."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts import notebook
+from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import MCTSPlanner, Plan
 from torchrl_hmcts.trainers.evaluation import Results
@@ -34,7 +35,7 @@ from torchrl_hmcts.trainers.experiments.registry import KITS, find_experiment, l
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.manager import ManagerPolicy
 from torchrl_hmcts.trainers.runs.console import Bar
-from torchrl_hmcts.trainers.runs.run import open_run
+from torchrl_hmcts.trainers.runs.run import FolderRefused, next_free, open_run, run_files
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import save_worker
 
@@ -46,15 +47,15 @@ class Solution:
     """One episode: its plan, and its result in another instance of the env.
 
     Attributes:
-        solved (bool, optional): whether the goal was reached; where rewards are collected, whether
-            they sum up to the env's ``reward_threshold``, and None where it names none.
+        solved (bool, optional): whether the goal was reached. If rewards are collected, whether
+            their sum reaches the env's ``reward_threshold``; None if the env has none.
         reward (float): the env's own rewards, summed.
         base_steps (int): of the episode.
         num_options (int): that were executed.
         simulated_steps (int): base steps of all searches.
         plan_seconds (float): of all searches.
-        plan (Plan, optional): that was executed, or the last one where every option had a search of
-            its own; options ``[L]``.
+        plan (Plan, optional): that was executed, or the last one if each option had its own search;
+            options ``[L]``.
 
     Example:
         >>> Solution(True, 1.0, 40, 4, 900, 0.1).solved
@@ -85,8 +86,7 @@ class HMCTS:
         **keys: of :class:`~torchrl_hmcts.trainers.experiments.gym_settings.GymConfig`, e.g.
             ``option_steps=10``, ``task="return"``, ``make={"max_episode_steps": 500}``,
             ``worker=DIR`` for the skills of another agent or run,
-            ``planner={"leaves_per_wave": 8}``. What is not given is found by a short look at the
-            env.
+            ``planner={"leaves_per_wave": 8}``. A short look at the env chooses the others.
 
     Raises:
         ValueError: if the id is unknown (the nearest are named), or the state cannot be stored.
@@ -205,7 +205,7 @@ class HMCTS:
             )
         changes: dict[str, Any] = {"options": "learned", "worker": ""}
         if base_steps is not None:
-            changes["train_base_steps"] = base_steps
+            changes["train_base_steps"] = whole_number("learn", "base_steps", base_steps, least=1)
         self.kit = self._make_kit(dataclasses.replace(self._asked, **changes))
         with _torchrl_quiet():
             self._take(skills.learn(self.kit, save_dir=save_dir, progress=_bar("learn", progress)))
@@ -261,7 +261,7 @@ class HMCTS:
         self.__dict__["planner"] = self.kit.guide(self.kit.make_planner(self.env), self.manager)
 
     def solve(self, seed: int = 0, *, search: bool = True) -> Solution:
-        """Plan from a start and act in an env of its own.
+        """Plan from a start, and execute the plan in another instance of the env.
 
         Args:
             seed: of the start, and of all that is drawn in the episode and its searches.
@@ -283,6 +283,8 @@ class HMCTS:
             out: GIF to write instead, with a video (``.mp4``) beside it: the env's own pictures
                 where it draws any, else its features.
         """
+        if out is not None and Path(out).suffix not in (".gif", ".mp4"):
+            raise ValueError(f"out is a film, FILE.gif or FILE.mp4; got {str(out)!r}.")
         start = self.start(seed)
         if out is None:
             mode = "human" if render else ""
@@ -311,7 +313,7 @@ class HMCTS:
         Returns:
             The state to start from, ``[1]``.
         """
-        own = self.config
+        own, seed = self.config, whole_number("HMCTS", "seed", seed)
         with torch.random.fork_rng(devices=[]):  # TorchRL seeds its global generator, too
             self.env.set_seed(seed)
             self.real_env.set_seed(seed + _OTHER_DRAWS)
@@ -343,6 +345,11 @@ class HMCTS:
                 "An agent over a function that makes its env cannot be saved: register the env "
                 "with gymnasium.register and build the agent from its id."
             )
+        if not overwrite and run_files(Path(folder)):
+            raise FolderRefused(
+                f"{str(folder)!r} holds an agent or a run already. Save into another folder, e.g. "
+                f"{next_free(str(folder))!r}, or pass overwrite=True to replace it."
+            )
         changes: dict[str, Any] = {"out": str(folder), "overwrite": overwrite, "resume": False}
         with open_run(dataclasses.replace(self.config, **changes)) as run:
             if self.learned is not None and self.learned.loss is not None:
@@ -359,8 +366,8 @@ class HMCTS:
             folder: of the agent, or of a run of the kits ``gym``, ``waterworld`` and ``labmaze``.
 
         Raises:
-            FileNotFoundError: if there is none, or it has no networks yet.
-            ValueError: if it is another kind of run, or damaged.
+            FileNotFoundError: if it has no networks yet.
+            ValueError: if there is no such folder, it holds another kind of run, or is damaged.
         """
         _, config = load_config(read_run(folder))
         if not isinstance(config, SkillsConfig):
@@ -383,7 +390,8 @@ class HMCTS:
         name = getattr(config, "id", "") or getattr(self._env, "__name__", config.EXPERIMENT)
         what = "skills" if config.options == "learned" else "actions"
         return (
-            f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base steps)"
+            f"HMCTS({name}, {config.num_skills} {what}, each for {config.option_steps} base step"
+            f"{'s' * (config.option_steps != 1)})"
         )
 
 
@@ -393,7 +401,7 @@ def _bar(name: str, shown: bool) -> Callable[..., Any] | None:
 
 @contextlib.contextmanager
 def _torchrl_quiet() -> Iterator[None]:
-    """Keeps TorchRL's messages that are no warnings to itself."""
+    """Hides messages of TorchRL that are not warnings."""
     logger = logging.getLogger("torchrl")
     level = logger.level
     logger.setLevel(max(level, logging.WARNING))
@@ -413,8 +421,8 @@ def load_worker(folder: str | Path) -> SkillPolicy:
         The policy, in evaluation mode, with its most probable actions.
 
     Raises:
-        FileNotFoundError: if there is none, or it has no networks yet.
-        ValueError: if its options are given, not learned.
+        FileNotFoundError: if it has no networks yet.
+        ValueError: if there is no such folder, or the agent's options are given, not learned.
 
     Example:
         >>> import tempfile

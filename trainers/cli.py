@@ -14,6 +14,7 @@ from torchrl_hmcts.trainers.command_line.listing import summaries
 from torchrl_hmcts.trainers.command_line.running import Failure
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVEL_HELP
 from torchrl_hmcts.trainers.experiments.registry import DEMO
+from torchrl_hmcts.trainers.runs.config import unknown_key
 
 _DEMO = f"""\
 Train skills in the training mazes of Waterworld, then solve test mazes by planning over them.
@@ -167,7 +168,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # in a locale without UTF-8
-    arguments, unknown = _parser().parse_known_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    if not words:
+        _parser().print_help()
+        return 2
+    if words[0][:1] != "-" and words[0] not in _VERBS:
+        print(f"hmcts: {unknown_key(words[0], _VERBS, 'verb')}", file=sys.stderr)
+        return 2
+    arguments, unknown = _parser().parse_known_args(words)
     if unknown:
         print(
             f"hmcts {arguments.verb}: {_without_dashes(unknown, arguments.words)}", file=sys.stderr

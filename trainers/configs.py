@@ -21,7 +21,6 @@ Example:
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import importlib
 import inspect
@@ -287,9 +286,7 @@ def compose_parts(
         classes = {path.rpartition(".")[2]: short for short, path in COMPONENTS[group].items()}
         name = classes.get(name, name)
         if name not in COMPONENTS[group]:
-            near = difflib.get_close_matches(name, COMPONENTS[group], cutoff=0.4)
-            names = ", ".join(near or COMPONENTS[group])
-            raise ValueError(f"Unknown {group} {name!r}. Did you mean: {names}?")
+            raise ValueError(unknown_key(name, COMPONENTS[group], group))
         before, path = where[last] or {}, COMPONENTS[group][name]
         if before.get("_component_") != path:  # the same class keeps its keywords
             needed = [n for n, p in keywords_of(named(path)).items() if p.default is p.empty]

@@ -44,7 +44,7 @@ def make_guided_planner(
     budget: SearchBudget | None = None,
     **planner_kwargs: Any,
 ) -> MCTSPlanner:
-    """Build a planner that a network guides: PUCT with its prior, its values at the leaves.
+    """Build a planner that a network guides: PUCT with its prior, and its values at the leaves.
 
     Args:
         env: the macro environment.
@@ -167,7 +167,7 @@ class SearchCollector(LocalCollector):
 
 
 class ExpertIterationTrainer(OffPolicyTrainer):
-    """Trains the network that guides a planner, on what the planner finds with its help.
+    """Trains the network that guides a planner, on the planner's own results.
 
     Per iteration: search at fresh starts, store the examples, and make ``updates_per_iteration``
     updates with Adam, whose learning rate falls to zero by a cosine over all updates. Iteration 0

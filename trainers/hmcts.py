@@ -1,4 +1,4 @@
-"""Algorithm 3: skills that are learned from the searches that use them."""
+"""Algorithm 3: skills learn from the searches that use them."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ class HMCTSTrainer(OffPolicyTrainer):
        :math:`S \cup D`; then play round t (there is none after the last training): search a plan
        by UCT whose expansions are options executed by h, and execute the plan.
 
-    A sample is a trajectory of one option; a round adds all those that it simulated and executed,
+    A sample is a trajectory of one option. A round adds all samples that it simulated and executed,
     by an :class:`OptionRecorder` in the simulator and in the env. During training the worker
     samples its actions; in test rounds it takes the most probable ones.
 
     A run that is resumed (``load``) is the same bit for bit as one that never stopped, if it had
     stopped after a multiple of ``retrain_interval`` rounds.
 
-    The rounds between two trainings have the same worker and are searched side by side. The frames
-    that the ``Trainer`` counts and passes to its logger as steps are the base steps of S.
+    The rounds between two trainings have the same worker and are searched side by side. The
+    ``Trainer`` counts the base steps of S as its frames, and passes them to its logger as steps.
 
     Args:
         make_env (callable): returns a fresh base env in which plans are executed, stateless
@@ -278,7 +278,7 @@ class HMCTSTrainer(OffPolicyTrainer):
 
 @dataclass
 class _MacroEnvs:
-    """Makes envs of a worker's options, with a recorder of what they did or without."""
+    """Makes envs of a worker's options, with or without a recorder."""
 
     make_options: Callable[..., OptionTransform]
     make_recorder: Callable[..., OptionRecorder]
@@ -333,7 +333,7 @@ def _check(given: Mapping[str, Any]) -> None:
 
 
 class _Progressed:
-    """How far the trainer is, and what its tests gave."""
+    """The trainer's progress, and the results of its tests."""
 
     def __init__(self, trainer: HMCTSTrainer) -> None:
         self.trainer = trainer

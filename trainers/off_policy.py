@@ -126,7 +126,7 @@ class OffPolicyTrainer(ResumableTrainer):
         return int(self.collected_frames)
 
     def progress_figures(self) -> dict[str, str]:
-        """Return what stands beside the progress bar."""
+        """Return the figures beside the progress bar."""
         raise NotImplementedError
 
     def move_progress(self) -> None:

@@ -1,7 +1,8 @@
 """Checks the built site: ``python docs/_extensions/check_site.py docs/_build/html``.
 
-Links inside the site lead somewhere. In a real browser, where one is installed: no page of 390 or
-1,280 pixels scrolls sideways, no console error, and equations render without a network.
+Links inside the site lead somewhere, and a page leads to each public name. In a real browser, where
+one is installed: no page of 390 or 1,280 pixels scrolls sideways, no console error, and equations
+render without a network.
 """
 
 from __future__ import annotations
@@ -74,6 +75,17 @@ def dead_links(root: Path) -> list[str]:
     return sorted(dead)
 
 
+def unlinked_names(root: Path) -> list[str]:
+    """Return the public names that no page but the reference leads to."""
+    own, elsewhere = [], []
+    for page in pages(root):
+        reference = page.startswith(("auto_reference/", "reference/", "genindex"))
+        (own if reference else elsewhere).append((root / page).read_text(encoding="utf-8"))
+    name = r"torchrl_hmcts\.\w+\.\w+"
+    names = set(re.findall(rf'<dt class="sig sig-object py" id="({name})"', "".join(own)))
+    return sorted(names - set(re.findall(rf'href="[^"]*#({name})"', "".join(elsewhere))))
+
+
 def in_browser(root: Path, browser: str) -> list[str]:
     """Return what is wrong with pages in a browser that has no network."""
     script = _PROBE.replace("PAGES", json.dumps(pages(root))).replace("WIDTHS", str(list(WIDTHS)))
@@ -108,6 +120,7 @@ class _Quiet(http.server.SimpleHTTPRequestHandler):
 def main() -> int:
     root = Path(sys.argv[1])
     wrong = [f"dead link: {link}" for link in dead_links(root)]
+    wrong += [f"no page leads to {name}" for name in unlinked_names(root)]
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         print("No browser is installed: widths, console and equations were not checked.")

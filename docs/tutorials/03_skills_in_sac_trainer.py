@@ -12,8 +12,8 @@ is two transforms and a loss; the rest stays as it was.
 # ------------------
 #
 # ``SkillTransform`` draws one of four skills, and another every 50 steps.
-# ``DisplacementTransform`` writes how far the disc has come since: what the discriminator is to
-# read decides what "different" means, and here it is to mean directions.
+# ``DisplacementTransform`` writes how far the disc has moved since. The entry that the
+# discriminator reads decides what "different" means; here skills are to be directions.
 
 import torch
 from torchrl.envs import Compose, TransformedEnv
@@ -50,9 +50,9 @@ loss = DIAYNLoss(
 # TorchRL's trainer
 # -----------------
 #
-# ``SkillReward`` on the replay buffer scores what is sampled with the discriminator as it is at
-# that moment, so that old transitions carry no stale rewards. ``make_skill_optimizer`` is an Adam
-# with a learning rate for each part; any optimiser will do.
+# ``SkillReward`` on the replay buffer rewards sampled transitions by the present discriminator, so
+# old transitions have no stale rewards. ``make_skill_optimizer`` is an Adam with a learning rate
+# for each part; any optimiser will do.
 
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer

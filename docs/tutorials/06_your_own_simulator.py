@@ -169,7 +169,7 @@ axes.set(aspect="equal", xlim=(-2.1, 2.1), ylim=(-2.1, 2.1), xticks=[], yticks=[
 plt.show()
 
 # %%
-# An env with a state of its own is stepped for one node after the other, so a search costs its
-# steps one by one: make the env stateless and batched if you can (:doc:`01_options_in_ten_lines`
-# has one in thirty lines), or pool processes as :class:`~torchrl_hmcts.envs.AtariOptionPool`
-# does. If nothing can be set, as with a robot, plan in a model that was learned: :doc:`/skills`.
+# An env with a state of its own is stepped for one node after the other, so a search takes its
+# steps one by one. If you can, make the env stateless and batched: :doc:`01_options_in_ten_lines`
+# has one in thirty lines. Or use processes, as :class:`~torchrl_hmcts.envs.AtariOptionPool` does.
+# If nothing can be set, as with a robot, plan in a model that was learned: :doc:`/skills`.

@@ -60,9 +60,9 @@ def draw(values, searches, name):
 # The length of an option
 # -----------------------
 #
-# Short options move too little: a search looks only so many options ahead, and most of them end
-# within the novelty radius of where they began. Long options are few and coarse: they run past side
-# ways, and every one costs its whole length.
+# Short options move too little. A search sees only a limited number of options ahead, and most of
+# them end within the novelty radius of their start. Long options are few and coarse: they run past
+# side ways, and every one costs its whole length.
 
 lengths = [4, 20, 160]
 by_length = [search(steps, 0.6) for steps in lengths]
@@ -79,11 +79,12 @@ draw(lengths, by_length, "option steps")
 # The radius
 # ----------
 #
-# With too small a radius, almost nothing is refused, and the search spends its budget on places
-# that are nearly the same. With too large a radius everything in reach is soon refused. Then the
-# radius is halved until something is new again, so that in these mazes the search finds its plans
-# all the same, and cheaply. What it loses is choice: of several ways to a place it keeps the first.
-# A test that cannot shrink, such as one of your own without ``relax``, would end without a plan.
+# With too small a radius almost nothing is refused. The search spends its budget on places that are
+# nearly the same. With too large a radius everything in reach is soon refused. Then the radius
+# shrinks, by a quarter each time, until something is new again. So in these mazes the search still
+# finds its plans, and cheaply. But it has less choice: of several ways to a place it keeps the
+# first. A test that cannot shrink, such as one of your own without ``relax``, would end without a
+# plan.
 
 radii = [0.1, 0.6, 5.0]
 by_radius = [search(20, radius) for radius in radii]

@@ -11,9 +11,9 @@ training adds. So "solved" alone is no proof of learning: set the untrained work
 # ------------------------
 #
 # A worker is a network that reads the velocity and the skill. Before training its weights are
-# random, but the skill is among its inputs: so each skill prefers other thrusts than the next. From
-# the same place, different skills lead to different places, and that is all that a tree search
-# needs. Trained skills do the same more reliably: each is a straight direction.
+# random. But the skill is one of its inputs, so each skill prefers other thrusts. From the same
+# place, different skills lead to different places. A tree search needs nothing more. Trained skills
+# do the same more reliably: each is a straight direction.
 
 import matplotlib.pyplot as plt
 import torch
@@ -57,9 +57,9 @@ plt.show()
 # How many mazes that solves
 # --------------------------
 #
-# The same search in the same fifty mazes, with ten networks that were never trained, three that
-# were, and a worker by rule, whose options repeat one of the four thrusts; measured by
-# ``benchmarks/ablations.py``.
+# ``benchmarks/ablations.py`` ran the same search in the same fifty mazes: with ten networks that
+# were never trained, with three that were, and with a worker by rule, whose options repeat one of
+# the four thrusts.
 
 import json
 from pathlib import Path
@@ -77,15 +77,16 @@ for arm in ("untrained", "DIAYN, 40,960 base steps", "hand-written"):
 #
 # - **It works for more seeds.** With one seed the untrained skills reach everything, with another
 #   two of them are nearly the same and most of the mazes stay unsolved. Training ends well more
-#   often, not always: skills keep changing, and the last ones need not be the best. With
-#   ``curve_points=10`` a run keeps those that solved the most of other mazes on the way; so kept,
-#   all three seeds solve all.
+#   often, but not always: skills keep changing, and the last ones need not be the best. With
+#   ``curve_points=10`` a run tests skills on the way in other mazes and keeps the best; then all
+#   three seeds solve all mazes.
 # - **It matters more where actions are far from motion.** In Waterworld an action is a thrust, and
 #   to repeat one is as good as a trained skill. In DeepMind Lab's maze a key turns the player or
 #   pushes it. An ant cannot walk before it has learned to: of five starts in OGBench's antmaze the
 #   untrained worker solves none.
-# - **A body that must turn cannot do without.** With ``task=boat`` no action held for long leads
-#   through a maze: the best of ten untrained workers solves barely more than half of the mazes.
+# - **A body that must turn needs training.** With ``task=boat`` no single action, held for long,
+#   leads through a maze. The best of ten untrained workers solves barely more than half of the
+#   mazes.
 #
 # So read each "solved" on these pages beside its baseline; :doc:`/ablations` leaves out the other
 # parts as well. :doc:`12_option_length` shows how much

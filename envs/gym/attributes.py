@@ -106,7 +106,7 @@ class AttributeSnapshot(Snapshot):
         self._load(row)
 
     def is_fixed(self, value: Any) -> bool:
-        """Return whether an object is no state: it stays as it is in each instance.
+        """Return whether an object is not state: it never changes in an instance.
 
         Args:
             value: any object that an env refers to.

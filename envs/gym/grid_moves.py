@@ -47,7 +47,7 @@ class GridMoves:
         self._last = _FORWARD
 
     def act(self, observation: Any, option: int, generator: np.random.Generator) -> int:
-        """Return the action that turns to where the option leads, or takes it there."""
+        """Return the action that turns towards the option's direction, or executes it."""
         if not isinstance(observation, dict) or "direction" not in observation:
             raise ValueError(
                 "GridMoves reads the direction in MiniGrid's own observation, or in that of "

@@ -27,7 +27,7 @@ _STATE = ("physics", "goal")
 
 
 class MujocoBatch(EnvBase):
-    r"""Steps a batch of states of one MuJoCo env, each to the bit as the Gymnasium env does.
+    r"""Steps a batch of states of one MuJoCo env, each with the same bits as the Gymnasium env.
 
     .. math:: s' = \mathrm{mj\_step}^k(s, a), \qquad o = f(s'), \quad r, d = g(s')
 

@@ -14,7 +14,7 @@ from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 
 
 class MujocoTask:
-    """All that a :class:`~torchrl_hmcts.envs.MujocoBatch` knows of an env beside its physics.
+    """Observations, rewards and ends of an env for a :class:`~torchrl_hmcts.envs.MujocoBatch`.
 
     A robot in a maze with a goal. Sub-classes say what differs; a task of your own is passed as
     ``task=`` and is called with the env.

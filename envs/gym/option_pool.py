@@ -23,23 +23,22 @@ class OptionPool(ProcessPool):
 
     .. math:: \text{reward} = \sum_{i<k} \gamma^i r_{i+1}, \qquad \text{duration} = k.
 
-    Stateless: the state is in the tensordict, ``"snapshot"`` beside the observation, as
-    :class:`SettableGymEnv` writes it, and any batch can be stepped. So a planner searches in it,
-    and an agent plays in it. One message goes to a process per option, which costs little beside
-    the env's own steps. A wave wants ``leaves_per_wave`` a few times as large as ``num_processes``.
+    It is stateless: the tensordict holds the state as ``"snapshot"``, as :class:`SettableGymEnv`
+    writes it, and any batch can be stepped. A planner can search in it, and an agent can act in it.
+    Each option is one message to a process, which costs little beside the env's own steps. Choose
+    ``leaves_per_wave`` a few times as large as ``num_processes``.
 
-    An outcome is a function of the state, option, the worker's weights and the pool's seed,
-    whichever process finds it. So a search is the same with any number of processes, and what was
-    planned is what happens. With ``determinised=False`` every call draws other numbers, the worker
-    and the env's own generators, for a planner that samples options more than once
-    (``chance=ProgressiveWidening()``). The state holds these generators: else a planner knows the
-    dice of an env that draws.
+    An outcome is a function of the state, the option, the worker's weights and the pool's seed; the
+    process does not matter. So a search is the same with any number of processes, and a plan
+    happens as predicted. The state holds the generators of the env and of the worker, so a planner
+    knows their draws in advance. With ``determinised=False`` every call draws other numbers, for a
+    planner that samples options more than once (``chance=ProgressiveWidening()``).
 
-    A process that dies, is stopped, or hangs for ``step_seconds`` is started again, and its options
-    run again; ``num_restarts`` counts them, ``num_steps`` all base steps, those that were lost
-    included. The processes start with the first step. A copy of a pool has processes of its own; in
-    a forked process, and in one that may have none, such as a worker of a ``DataLoader``, options
-    run as with ``num_processes=0``. Threads take turns.
+    If a process dies, is stopped, or hangs for ``step_seconds``, the pool starts it and its options
+    again. ``num_restarts`` counts restarts; ``num_steps`` counts all base steps, lost ones
+    included. The processes start with the first step. A copy of a pool has its own processes. In a
+    forked process, and in one that may have no children, such as a worker of a ``DataLoader``,
+    options run as with ``num_processes=0``. Threads take turns.
 
     Writes, besides the observation: ``"snapshot"`` (uint8 ``[*B, width]``), ``"duration"`` (int64
     ``[*B, 1]``, base steps), and ``"features"`` (``[*B, F]``) where ``features`` are given.
@@ -57,14 +56,14 @@ class OptionPool(ProcessPool):
         snapshot, cap: as in :class:`SettableGymEnv`.
         features (callable, optional): ``features(env, observation)`` gives an array ``[F]`` of the
             state at an option's end, e.g. a place for a novelty test that no observation has.
-        still (float): an option ends early once it has moved the features less than this within a
-            fifth of ``max_steps``, e.g. before a wall. Default 0: it does not.
+        still (float): an option ends early when it moves the features less than this within a fifth
+            of ``max_steps``, e.g. at a wall. Default 0: never.
         start_method ("forkserver" or "spawn"): how processes are started. Default forkserver, or
             spawn where the path of the temporary folder (``TMPDIR``) is too long for it. As
             always with :mod:`multiprocessing`, a script needs ``if __name__ == "__main__":``.
-        step_seconds (float): longest time for one step of the worker and the env, seconds;
-            processes that neither step nor use the processor for so long are replaced, and those
-            that compute without a step after ten times as long, but two minutes. Default 60.
+        step_seconds (float): longest time for one step of the worker and the env, seconds. A
+            process that neither steps nor uses the processor for so long is replaced; one that
+            computes without a step, after ten times as long, at least two minutes. Default 60.
         batch_size (sequence of int): of ``reset()`` without a tensordict. Default none.
         seed (int, optional): of starts and of the draws inside options.
         **keywords: of ``gymnasium.make``.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import io
 import random
 from collections.abc import Callable
 from typing import Any, Literal
@@ -34,14 +35,16 @@ _PACKAGES = ("gymnasium_robotics", "minigrid", "ogbench", "ale_py")
 
 
 class PrivateRandom(gymnasium.Wrapper):
-    """Gives an env that draws from the global generators of NumPy and Python states of its own.
+    """Gives an env that draws from the global generators of NumPy and Python its own states of
+    them.
 
-    Such an env is neither fixed by ``reset(seed=...)``, nor independent of what else draws. Under
-    this wrapper the global generators are as they were after every reset and step, and after a
-    ``with`` block of it: many steps in one block save the time of exchanging states, 0.2 ms each.
+    ``reset(seed=...)`` does not fix such an env, and other draws change it. This wrapper restores
+    the global generators after every reset and step, and after a ``with`` block of it. Many steps
+    in one block save the time of exchanging states, 0.2 ms each.
 
     Args:
-        env (gymnasium.Env): e.g. OGBench's mazes, which draw starts, goals and teleports so.
+        env (gymnasium.Env): e.g. a maze of OGBench, which draws starts, goals and teleports from
+        them.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
@@ -133,24 +136,28 @@ def _with_arrays(env: gymnasium.Env) -> gymnasium.Env:
 
 
 def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
+    missing = []
     for package in _PACKAGES:
         try:
             gymnasium.spec(name)
             break
         except gymnasium.error.Error:
             try:
-                gymnasium.register_envs(importlib.import_module(package))
+                with contextlib.redirect_stderr(io.StringIO()):  # notes about other envs
+                    gymnasium.register_envs(importlib.import_module(package))
             except Exception:
-                continue
+                missing.append(package)
     try:
         return gymnasium.make(name, disable_env_checker=True, **keywords)
     except gymnasium.error.UnregisteredEnv:
         near = difflib.get_close_matches(name, list(gymnasium.registry), n=3, cutoff=0.5)
         hint = f"Nearest: {', '.join(near)}." if near else "gymnasium.pprint_registry() lists all."
-        raise ValueError(
-            f"No env has the id {name!r}. {hint} Box2D, MuJoCo's robots, MiniGrid and OGBench come "
-            "with pip install 'torchrl_hmcts[gym]', Atari with 'torchrl_hmcts[atari]'."
-        ) from None
+        if missing:
+            hint += (
+                f" Not installed here: {', '.join(missing)}. pip install 'torchrl_hmcts[gym]' adds "
+                "mazes, MiniGrid and OGBench, 'torchrl_hmcts[atari]' Atari."
+            )
+        raise ValueError(f"No env has the id {name!r}. {hint}") from None
     except gymnasium.error.DependencyNotInstalled as error:
         raise ImportError(
             f"{name} needs a package that is not installed: {' '.join(map(str, error.args))}. "
@@ -189,17 +196,17 @@ def _set_global_states(states: tuple[Any, Any]) -> None:
 
 
 class SettableGymEnv(GymWrapper):
-    """A Gymnasium env that a planner can set to any state, right to the bit.
+    """A Gymnasium env that a planner can set to any state, exact to the bit.
 
-    Its state is the entry ``"snapshot"``, uint8 ``[width]``, beside its observations. Any transform
-    of TorchRL can be put on top of it, an :class:`~torchrl_hmcts.transforms.OptionTransform` too.
+    The entry ``"snapshot"``, uint8 ``[width]``, holds its state beside its observations. You can
+    append any transform of TorchRL, an :class:`~torchrl_hmcts.transforms.OptionTransform` too.
 
     Args:
         env (str, gymnasium.Env or callable): an id, an env, or a function that makes one. It is
             reset.
-        snapshot (type, tuple of two functions, or callable, optional): how its state is stored,
-            see :func:`~torchrl_hmcts.envs.gym.families.snapshot_of`. Default: found by itself, and
-            named in the ``repr``.
+        snapshot (type, tuple of two functions, or callable, optional): how to store its state, see
+            :func:`~torchrl_hmcts.envs.gym.families.snapshot_of`. Default: chosen by the kind of
+            env; the ``repr`` names it.
         cap (int): bytes of the attributes in a row at most. Default 65,536.
         features (callable, optional): ``features(env, observation)`` gives an array ``[F]``, the
             entry ``"features"``. Default: none.
@@ -294,7 +301,7 @@ class SettableGymEnv(GymWrapper):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Steps the env with a fifth of the bookkeeping of TorchRL's GymWrapper."""
-        action = tensordict.get(self.action_key)
+        action = tensordict[self.action_key]
         if self._discrete:
             taken: Any = int(action)
         else:

@@ -14,7 +14,7 @@ from torchrl_hmcts.envs.gym.option_run import OptionWorker
 
 
 class RepeatActions:
-    """Options that take one action all the time.
+    """Options that repeat one action.
 
     Args:
         actions (int or sequence): the action of each option, an index or an array; a number means
@@ -54,7 +54,7 @@ class RepeatActions:
 
 
 class Goal(Protocol):
-    """Protocol of what an option of :class:`FollowGoals` brings about, e.g. a :class:`FeatureGoal`.
+    """Protocol of the goal of an option of :class:`FollowGoals`, e.g. a :class:`FeatureGoal`.
 
     It may have ``reached(observation) -> bool`` too: whether the option ends.
     """
@@ -141,7 +141,7 @@ class FollowGoals:
 
 
 class OccasionalAction:
-    """Another worker's options, with one action taken now and then.
+    """Another worker's options, sometimes interrupted by one action.
 
     Games wait for FIRE, e.g. to serve; a learned worker that has forgotten it never starts.
 
@@ -174,7 +174,7 @@ class OccasionalAction:
         self.num_options = worker.num_options
 
     def act(self, observation: Any, option: int, generator: np.random.Generator) -> int:
-        """Return the action, or what the worker does."""
+        """Return the action, or the worker's."""
         if generator.random() < self.probability:
             return self.action
         return self.worker.act(observation, option, generator)

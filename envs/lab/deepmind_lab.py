@@ -205,7 +205,7 @@ class DeepMindLabEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self._running:
             raise RuntimeError("The episode has ended, or none has begun. Call reset() first.")
-        action = tensordict.get("action").numpy(force=True).astype(np.int64)
+        action = tensordict["action"].numpy(force=True).astype(np.int64)
         native = np.zeros(len(NATIVE_ACTIONS), np.intc)
         if self.actions is None:
             native[:] = action

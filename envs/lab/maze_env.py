@@ -89,7 +89,7 @@ class LabMazeEnv(MazeEnv):
             ``[*B, 7]``: these four, then fire, jump and crouch, which are ignored.
         terminate_on_goal (bool): whether the goal ends the episode. Default True.
         max_frames (int): of an episode. Default 10,800, three minutes.
-        fps (int): frames per second that the engine is told, 15 to 240. Default 60: its frames then
+        fps (int): frames per second of the engine, 15 to 240. Default 60: its frames then
             last 16 ms.
         clock ("constant" or "exact"): whether every frame lasts the same, or 1 ms more and
             sometimes 2 ms less, as the engine's do. Default constant: after a few hundred frames

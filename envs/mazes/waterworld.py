@@ -216,7 +216,7 @@ class WaterworldMazeEnv(TileMazeEnv):
 
     def _thrust(self, tensordict: TensorDictBase) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """The acceleration of each disc, float32 ``[n, 2]``, and where a boat heads afterwards."""
-        action = tensordict.get("action").numpy(force=True).reshape(-1)
+        action = tensordict["action"].numpy(force=True).reshape(-1)
         if self.steering == "directions":
             return self._acceleration[action], {}
         heading = tensordict.get("heading").numpy(force=True).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Landmarks of recorded episodes, and to which of them options lead: a model to plan in.
+"""Landmarks of recorded episodes, and options between them: a model to plan in.
 
 Letters: T recorded steps, F numbers of a place, N landmarks, A options of a landmark, K outcomes
 of an option, *B batch of a tensordict.
@@ -36,7 +36,8 @@ class LandmarkModel(nn.Module):
 
     .. math:: P(j \mid p) = n_{pj} / n_p.
 
-    So a lucky jump is not taken for a way, as it is where goals are relabelled in hindsight.
+    So the model does not take a lucky jump for a reliable path, as relabelling goals in hindsight
+    does.
 
     Build it by :meth:`fit`; ``load_state_dict`` fills one that was built with the same sizes.
 
@@ -234,7 +235,7 @@ class LandmarkModel(nn.Module):
         return bool((self.probabilities > 0.0).sum(-1).max() > 1)
 
     def values(self, goal: Tensor, gamma: float) -> Tensor:
-        r"""Return what landmarks are worth on the way to one, by value iteration.
+        r"""Return the values of all landmarks for one goal landmark, by value iteration.
 
         .. math:: V(i) = \max_a \gamma^{k_{ia}} \sum_j P(j \mid i, a)\, V(j), \qquad V(g) = 1
 

@@ -77,13 +77,13 @@ class SkillDiscriminator(SkillNetwork):
 
 
 class SkillEncoder(SkillNetwork):
-    r"""Maps what is read of a state to a representation with one dimension per skill.
+    r"""Maps entries of a state to a representation with one dimension per skill.
 
     .. math:: \phi(s) = \mathrm{MLP}(s) \in \mathbb{R}^Z
 
     or, where skills are vectors, with their dimensions.
 
-    What it reads decides what "far apart" means: with the position, skills travel through the maze.
+    Its entries decide what "far apart" means: with the position, skills travel through the maze.
     Losses call it on both ends of a transition, so ``in_keys`` are written without ``"next"``.
 
     Args:

@@ -19,7 +19,7 @@ from torchrl_hmcts.modules.skill_mlp import check_sizes, key_list
 
 
 class OptionMemory:
-    r"""Replaces a prediction by what the same option did from nearly the same state.
+    r"""Replaces a prediction by an observed outcome of the same option from nearly the same state.
 
     With :math:`\phi` the entries ``keys`` side by side and :math:`(s_i, o_i)` the options executed
     in the same context, a prediction for :math:`(s, o)` gives way to outcome :math:`i` if
@@ -113,7 +113,7 @@ class OptionMemory:
             self._count[context] += 1
 
     def recall(self, tensordict: TensorDictBase, predicted: TensorDict) -> TensorDict:
-        """Return predictions ``[*B]``, those replaced of which an outcome is remembered."""
+        """Return predictions ``[*B]``, replaced where an outcome is remembered."""
         if self._place is None or self._outcome is None:
             return predicted
         td = tensordict.reshape(-1)

@@ -167,7 +167,7 @@ class OptionModel(TensorDictModuleBase):
         return out
 
     def outputs(self, tensordict: TensorDictBase) -> Tensor:
-        """Return what the networks say, ``[K, *B, D + 3]``.
+        """Return the outputs of the networks, ``[K, *B, D + 3]``.
 
         Normalised changes, reward and duration, then the logit of an end of the episode.
         """
@@ -207,7 +207,7 @@ class OptionModel(TensorDictModuleBase):
         terminated_key: NestedKey | None = None,
         normalized: bool = True,
     ) -> Tensor:
-        """Return what :meth:`outputs` should be for recorded transitions, ``[*B, D + 3]``.
+        """Return the targets of :meth:`outputs` for recorded transitions, ``[*B, D + 3]``.
 
         Args:
             tensordict: macro transitions: root entries and ``"next"``.
@@ -257,7 +257,7 @@ class OptionModel(TensorDictModuleBase):
         return self
 
     def member(self, index: int) -> OptionModel:
-        """Return a copy with one member only, to see what the ensemble is good for."""
+        """Return a copy with one member only, to measure the worth of the ensemble."""
         if not 0 <= index < self.num_models:
             raise ValueError(
                 f"OptionModel has the members 0 to {self.num_models - 1}; got index {index}."

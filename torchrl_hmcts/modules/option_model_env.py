@@ -24,7 +24,7 @@ from torchrl_hmcts.nesting import known_gamma
 
 
 class OptionModelEnv(ModelBasedEnvBase):
-    r"""The macro environment that an :class:`OptionModel` stands for, to plan in.
+    r"""The macro environment of an :class:`OptionModel`, to plan in.
 
     A step is what the model predicts: state, discounted reward, base steps and end of an option.
     It is stateless, can be set to any state, and has the specs of the env it stands for, so that

@@ -12,7 +12,7 @@ from torchrl_hmcts.checks import whole_number
 
 
 class SkillPrior(nn.Module, ABC):
-    r"""A distribution p(z) over skills, read live by all that samples, rewards or plans with them.
+    r"""A distribution p(z) over skills, read by each part that samples, rewards or plans with them.
 
     .. math:: p(z) \ge 0, \qquad \sum_{z < Z} p(z) = 1
 

@@ -164,7 +164,7 @@ def draw_vectors(
 
 
 def spread_skills(spec: TensorSpec, number: int, *, seed: int = 0) -> Tensor:
-    """Chooses a few skills that stand for all vectors of a spec, as options to plan with.
+    """Chooses a few skills that represent all vectors of a spec, as options to plan with.
 
     Vectors are drawn, those that are farthest from each other are taken first, and each is then
     moved to the mean of what is nearest to it, until all stay (k-means). On a sphere the mean is

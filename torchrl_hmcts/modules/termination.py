@@ -174,7 +174,7 @@ class TerminationNetwork(SkillNetwork):
 
 
 class LearnedTermination:
-    r"""Ends an option with the probability a network says, or where it says at least one half.
+    r"""Ends an option with a network's probability, or where that is at least one half.
 
     A call gives bool ``[*B]``.
 

@@ -17,7 +17,7 @@ _MOST = 3.0  # standard deviations of progress that count
 
 
 class GoalCloningLoss(Loss):
-    r"""Clones the recorded actions that led towards a goal, those that led there fast above all.
+    r"""Clones recorded actions that led to a goal; actions that led there fast weigh more.
 
     .. math::
 

@@ -54,7 +54,7 @@ class _OptionLoss(Loss):
 
 
 class OptionTerminationLoss(_OptionLoss):
-    r"""The termination gradient: end an option where another one promises more.
+    r"""The termination gradient: ends an option where the value of another is larger.
 
     .. math::
 
@@ -170,7 +170,7 @@ class OptionTerminationLoss(_OptionLoss):
 
 
 class IntraOptionQLoss(_OptionLoss):
-    r"""Values of options that end with a learned probability, from parts of their way.
+    r"""Learns values of options that end with a learned probability, from any piece of an option.
 
     .. math::
 
@@ -259,7 +259,7 @@ class IntraOptionQLoss(_OptionLoss):
 
     @torch.no_grad()
     def target(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns what Q(s, o) should be, ``[*B]``."""
+        """Returns the target of Q(s, o), ``[*B]``."""
         keys, option = self.tensor_keys, tensordict.get(self.tensor_keys.skill)
         next_td = self._next_with_option(tensordict)
         params = self.target_qvalue_network_params  # without a delay those of now, detached

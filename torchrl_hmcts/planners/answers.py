@@ -14,7 +14,7 @@ from torchrl_hmcts.planners.tree import LARGEST
 
 
 def check_priors(priors: Any, shape: tuple[int, int], reader: str) -> Tensor:
-    """Return probabilities, contiguous on the CPU; refuse what is none."""
+    """Return probabilities, contiguous on the CPU; refuse numbers that are no probabilities."""
     _check_tensor(priors, reader)
     if tuple(priors.shape) != shape:
         raise ValueError(
@@ -31,7 +31,7 @@ def check_priors(priors: Any, shape: tuple[int, int], reader: str) -> Tensor:
 
 
 def check_values(values: Any, num_states: int, reader: str) -> Tensor:
-    """Return values, float32 ``[m]`` on the CPU; refuse what no search can use."""
+    """Return values, float32 ``[m]`` on the CPU; refuse those that no search can use."""
     _check_tensor(values, reader)
     if tuple(values.shape) not in ((num_states,), (num_states, 1)):
         raise ValueError(

@@ -37,12 +37,13 @@ class Root(NamedTuple):
     """The states to search from.
 
     Attributes:
-        prior (Array): ``[B, A]`` float32, probabilities of options; those of the options that may
-            be taken are scaled to sum to 1.
+        prior (Array): ``[B, A]`` float32, probabilities of options; scaled so that those of the
+            allowed options sum to 1.
         value (Array): ``[B]`` float32.
-        embedding (Array): ``[B, ...]`` what the transition function needs of a state, any dtype. Or
-            a mapping or tuple of such arrays, nested in any way, a TensorDict included; or a list
-            of B states of any kind, which the search keeps and no other code may change.
+        embedding (Array): ``[B, ...]`` the state as the transition function reads it, any dtype. It
+            may be a mapping or tuple of such arrays, nested in any way, or a TensorDict. It may
+            also be a list of B states of any kind; the search keeps them, and no other code may
+            change them.
 
     Example:
         >>> import numpy as np
@@ -66,8 +67,8 @@ class Transition(NamedTuple):
         prior (Array): ``[m, A]`` float32, probabilities of options in the next state, scaled to
             sum to 1.
         value (Array): ``[m]`` float32, of the next state.
-        embedding (Array): ``[m, ...]`` of the next state, shape and dtype of the roots', in the
-            same structure; a list of m states for one of roots.
+        embedding (Array): ``[m, ...]`` of the next state, with the structure, shapes and dtypes of
+            the roots'; a list of m states if the roots' is a list.
 
     Example:
         >>> import numpy as np
@@ -103,17 +104,17 @@ def tree_search(
 ) -> Search:
     r"""Search from ``B`` states at once with a transition function of your own.
 
-    The counterpart of mctx's ``muzero_policy(params, key, root, recurrent_fn)``: the planner's
-    trees, policies and backups without environments or tensordicts in the loop. Every simulation
+    It is the counterpart of mctx's ``muzero_policy(params, key, root, recurrent_fn)``: it has the
+    planner's trees, policies and backups, without environments and tensordicts. Every simulation
     takes one option in one leaf, for all roots in one call of ``transition``, and backs up
 
     .. math:: Q = R + D\, V.
 
     Args:
-        root: states to search from. NumPy arrays or CPU tensors; the transition function is called
-            with the kind the embedding has, that of the prior for a list of states.
-        transition: ``transition(embedding [m, ...], option [m] int64) -> Transition`` of
-            contiguous float32 arrays. The arrays it is given are copies, reused by the next call.
+        root: states to search from, NumPy arrays or CPU tensors. The transition function gets the
+            same kind as the embedding, or as the prior if the embedding is a list.
+        transition: ``transition(embedding [m, ...], option [m] int64) -> Transition`` of contiguous
+            float32 arrays. Its arguments are copies; the next call uses their memory again.
         num_simulations: per root.
         tree_policy, backup, leaves_per_wave, exhausted: as in :class:`SearchSettings`, but by
             default ``PUCT()`` and ``"revisit"``.

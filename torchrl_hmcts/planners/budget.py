@@ -1,4 +1,4 @@
-"""Limits of a search: its spending, its repeated outcomes, and its look beyond a leaf."""
+"""Limits of a search: its budget, its repeated outcomes, and its rollouts beyond a leaf."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _DEFAULT_EXPANSIONS = 1000
 
 @dataclass(frozen=True)
 class SearchBudget:
-    """Limits of a search, each per root; the first that is reached ends the root's search.
+    """Limits of a search, each per root; the search of a root ends at the first limit it reaches.
 
-    Simulations are exact with ``expand="one"``; with ``"all"`` the last leaf still simulates all of
-    its options. The others are looked at after every wave, with a ``TreeRollout`` after its
-    rollouts, so a search may exceed them by what one wave simulates, or all that are in flight.
-    A tree of 2,130,706,431 visits is not searched further.
+    The limit of simulations is exact with ``expand="one"``; with ``"all"`` the last leaf still
+    simulates all of its options. The other limits are checked after every wave, and with a
+    ``TreeRollout`` after its rollouts. So a search may exceed them by the waves in flight. A tree
+    of 2,130,706,431 visits is not searched further.
 
     Args:
         expansions: nodes whose options are simulated (with ``expand="one"``: options simulated).
@@ -123,11 +123,11 @@ class TreeRollout:
 
     .. math:: o_{i+1} \sim P(\cdot \mid s_i), \qquad i < n
 
-    The simulation step of the textbook, except that every state on the way becomes a node: nothing
-    that was simulated is thrown away, and a reward far ahead is found by a path that can be
-    executed. Uniform without an ``option_prior``. A rollout ends where the episode does, where the
-    novelty test refuses the state, and where the budget of simulations is spent; the other limits
-    are looked at between rollouts. Its steps count in the budget, as all of a tree's do.
+    It is the simulation step of the textbook, except that every state on the way becomes a node. So
+    no simulated step is lost, and a reward far ahead is found by a path that can be executed.
+    Without an ``option_prior`` options are drawn uniformly. A rollout ends with the episode, where
+    the novelty test refuses the state, and where the budget of simulations is spent. The other
+    limits are checked between rollouts. Its steps count in the budget.
 
     Args:
         max_options: n, options of a rollout at most. Default 10.

@@ -36,39 +36,38 @@ class HierarchicalPolicy(TensorDictModuleBase):
     with :math:`\phi` the entries ``divergence_key`` side by side. Where no plan is found, the
     planner's choice is taken, and a new plan is made after it.
 
-    The plan lives in the tensordict, as a recurrent policy's state does: ``"plan"`` (int64
-    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"``, the plans made so far, or
-    in this episode with TorchRL's ``InitTracker`` (int64 ``[*B, 1]``), and with ``divergence``
-    ``"plan_states"`` (float32 ``[*B, L + 1, f]``). Every episode begins with a new plan: the policy
-    looks at what the last step led to, and where it was the end, or another state than the one it
-    is to act in, the plan is out of date. Where it cannot see that, as in a tensordict that was
-    copied before the step, append TorchRL's ``InitTracker`` or ``StepCounter`` to the env.
+    The plan is kept in the tensordict, as the state of a recurrent policy is: ``"plan"`` (int64
+    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"`` (int64 ``[*B, 1]``), and
+    with ``divergence`` ``"plan_states"`` (float32 ``[*B, L + 1, f]``). ``"num_plans"`` counts the
+    plans made so far; with TorchRL's ``InitTracker``, those of the episode. Every episode begins
+    with a new plan. The policy detects a new episode by the last step: it ended the old one, or led
+    to another state than the present one. It cannot detect it in a tensordict that was copied
+    before the step; append TorchRL's ``InitTracker`` or ``StepCounter`` to the env there.
 
-    The env to act in need not be the planner's. With ``state_map`` the state to plan from is made
-    from what that env shows, :math:`\hat s = \mathrm{map}(o)`: so one acts in an env that cannot be
-    set to a state by planning in a model that can. The real env is under an
-    :class:`~torchrl_hmcts.transforms.OptionTransform` with the same worker; plan again after every
-    option (``replan_every=1``), since it ends elsewhere than the model predicted.
+    The policy may act in another env than the planner's. ``state_map`` then makes the state to plan
+    from of that env's entries, :math:`\hat s = \mathrm{map}(o)`. So you can act in an env that
+    cannot be set to a state, and plan in a model that can. Put the real env under an
+    :class:`~torchrl_hmcts.transforms.OptionTransform` with the same worker. Plan again after every
+    option (``replan_every=1``), since options end elsewhere than the model predicts.
 
-    With ``reuse`` the trees are kept from one decision to the next: where the options executed
-    led to a state that the tree holds, its subtree is searched further
-    (:meth:`MCTSPlanner.advance`), elsewhere a new tree is planted. The trees live in the policy,
-    so it serves one rollout at a time; another rollout gets right plans too, but nothing to reuse.
+    ``reuse`` keeps the trees from one decision to the next. If the executed options led to a state
+    that the tree holds, its subtree is searched further (:meth:`MCTSPlanner.advance`); otherwise a
+    new tree begins. The policy keeps the trees, so it can reuse them in one rollout at a time.
+    Another rollout gets correct plans too, but no subtrees.
 
     Args:
         planner (MCTSPlanner): the manager.
         max_plan_length (int): options of a plan that are kept, L. Default 64.
-        replan_every (int, optional): options after which to plan again though the plan continues; 1
-            for every option, which is then the planner's ``final_choice``. Default: at the plan's
-            end.
+        replan_every (int, optional): options after which to plan again before the plan has ended.
+            With 1 each option is the planner's ``final_choice``. Default: at the plan's end.
         divergence (float, optional): distance from the predicted state, in units of the entries,
-            above which to plan again. Default: the prediction is not looked at.
+            above which to plan again. Default: states are not compared.
         divergence_key (NestedKey or sequence of them, optional): entries of the simulator's state
             or observation that are compared, e.g. ``"position"``.
         reuse (bool): keep the trees between decisions. Default ``False``.
-        state_map (callable, optional): ``state_map(td) -> TensorDict [*B]`` of what the planner
-            reads (its ``in_keys``), from the entries of the env that is acted in. Default: that env
-            writes them itself, and they are taken as they are.
+        state_map (callable, optional): ``state_map(td) -> TensorDict [*B]`` of the planner's
+            ``in_keys``, from the entries of the env in which the policy acts. Default: that env
+            writes the ``in_keys`` itself.
         env (EnvBase, optional): the macro env to act in, checked once against the planner's.
 
     Raises:
@@ -171,13 +170,13 @@ class HierarchicalPolicy(TensorDictModuleBase):
             )
 
     def reset(self) -> None:
-        """Forget the last step, and the trees that ``reuse`` keeps; the next call plants others."""
+        """Forget the last step, and the trees that ``reuse`` keeps."""
         self._starts.forget()
         self._search: Search | None = None
         self._shape: torch.Size | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the next option of each row's plan, after planning where one is due."""
+        """Write the next option of each row's plan, and plan first where a plan is needed."""
         shape, state = tensordict.batch_size, self._state(tensordict)
         done, stepped = tensordict.get("done", None), tensordict.get("_step", None)
         kept = {key: tensordict.get(key, None) for key in self._plan_keys}
@@ -378,7 +377,7 @@ class GoalPlanner:
 
 
 class EpisodeStarts:
-    """Tells in which elements an episode began since the policy acted last.
+    """Finds the elements in which an episode began since the policy acted last.
 
     TorchRL's env writes what a step led to under ``"next"`` of the tensordict that the policy has
     written to. Where that was the end, or another state than the one to act in now, the env was
@@ -396,13 +395,13 @@ class EpisodeStarts:
         self.forget()
 
     def forget(self) -> None:
-        """Take the next call for that of another rollout."""
+        """Treat the next call as one of another rollout."""
         self._acted: TensorDictBase | None = None
         self._stale: TensorDictBase | None = None  # what was under "next" already
         self._wrote: dict[NestedKey, Tensor] = {}
 
     def remember(self, td: TensorDictBase) -> None:
-        """Keep the tensordict that the policy has written to, for what a step makes of it."""
+        """Keep the tensordict that the policy has written to: a step adds its result there."""
         self._acted, self._stale = td, td.get("next", None)
         self._wrote = {key: td.get(key) for key in self.plan_keys}
 

@@ -109,12 +109,13 @@ def plot_tree(
     option_names: Sequence[str] | None = None,
     legend: bool = True,
 ) -> Axes:
-    """Draw the tree of one root in layers: a node stands as deep as options lead to it.
+    """Draw the tree of one root in layers: the depth of a node is its number of options from the
+    root.
 
-    Nodes are coloured by their value V and sized by their visits, on a logarithmic scale. Edges
-    have the colour of their option. The best plan lies on a yellow band. White squares are
-    terminal, green rims earned a reward, grey crosses were refused by the novelty test, grey
-    diamonds are states that are searched elsewhere in the tree.
+    The colour of a node shows its value V, its size its visits, on a logarithmic scale. Edges have
+    the colour of their option. The best plan lies on a yellow band. White squares are terminal
+    nodes. Nodes with a green rim earned a reward. Grey crosses were refused by the novelty test.
+    Grey diamonds are states that are searched elsewhere in the tree.
 
     Args:
         tree: of a finished or interrupted search.
@@ -204,16 +205,16 @@ def plot_positions(
 ) -> Axes:
     """Draw where the options of a search led: every node at its place in the plane.
 
-    Straight lines join each node to the one above, in the colour of the option; what was refused is
-    grey, the best plan thick, with a letter or number for each option. The blue dot is the root.
+    A straight line in the colour of the option joins each node to the one above. Refused nodes are
+    grey. The best plan is thick, with a letter or number for each option. The blue dot is the root.
 
     Args:
         tree: of a finished or interrupted search, whose states are kept.
         root: which of the ``B`` roots. Default 0.
         key: entry of the state with (x, y), any shape of two numbers; or a callable that makes
             ``[N, 2]`` of the states ``[N]``. Default ``"position"``.
-        ax: axes to draw over, whose limits stay if they show something already, e.g. a maze.
-            Default: those of a new figure of pyplot, over the map of an env that has ``draw_map``.
+        ax: axes to draw in; if they show something already, e.g. a maze, their limits stay.
+            Default: those of a new figure of pyplot, over the map if the env has ``draw_map``.
         max_nodes: how many nodes at most: those with most visits, and the best plan. Default: all.
         option_names: one for each of the ``A`` options. Default: their numbers.
         legend: whether to say what the colours mean. Default True.

@@ -1,4 +1,4 @@
-"""The evaluation of new nodes: what a planner's parts say of them, in one checked call.
+"""The evaluation of new nodes: priors and values by a planner's parts, in one checked call.
 
 Letters: m nodes, A options.
 """
@@ -18,7 +18,7 @@ from torchrl_hmcts.planners.random_streams import with_seeds
 
 
 class Evaluation(NamedTuple):
-    """Priors and values of states; None for what is not known.
+    """Priors and values of states; None if not known.
 
     Attributes:
         priors (Tensor): ``[m, A]`` probabilities of the options. Default: uniform.
@@ -45,7 +45,7 @@ Evaluator = Callable[[TensorDictBase], Any]
 
 
 class NodeEvaluator:
-    """Asks for the priors and values of new nodes; priors of ``option_prior`` count first."""
+    """Computes priors and values of new nodes; priors of ``option_prior`` take precedence."""
 
     def __init__(
         self, leaf_evaluator: Evaluator | None, option_prior: Evaluator | None, num_options: int
@@ -57,6 +57,12 @@ class NodeEvaluator:
             no_class("MCTSPlanner", name, part)
             if part is not None and not callable(part):
                 raise TypeError(f"{name} must be callable on a tensordict; got {part!r}.")
+            if type(part).__module__.startswith("torch.nn."):
+                wrapper = "ValueEvaluator" if name == "leaf_evaluator" else "ModulePrior"
+                raise TypeError(
+                    f"{name} is called on a tensordict; got {type(part).__name__}, which reads "
+                    f"tensors. Write {name}={wrapper}(TensorDictModule(net, in_keys, out_keys))."
+                )
 
     def bind(self, simulator: Any, gamma: float) -> None:
         """Give the simulator and the discount to the parts that simulate."""

@@ -25,12 +25,12 @@ from torchrl_hmcts.planners.simulator import Simulator
 
 
 class ValueEvaluator:
-    r"""The value of a state is what a network says: :math:`V(s) = v_\theta(s)`.
+    r"""Takes the value of a state from a network: :math:`V(s) = v_\theta(s)`.
 
-    The network is called in the mode it is in (``module.eval()`` is yours to call), without
-    gradients, and never becomes part of the planner. The network of a plain ``TensorDictModule``
-    is called on its tensors, which saves most of the cost of a small one. Networks may round
-    differently when more states share a call; then the last digits of a tree depend on its company.
+    The network is called without gradients, in its present mode; call ``module.eval()`` yourself.
+    It does not become a part of the planner. The network of a plain ``TensorDictModule`` is called
+    on its tensors, which saves most of the cost of a small one. Networks may round differently when
+    more states share a call; then the last digits of a tree depend on the trees beside it.
 
     Args:
         module: a TensorDictModule whose inputs are entries of the macro environment.
@@ -71,7 +71,7 @@ class ValueEvaluator:
 
 
 class ModulePrior:
-    r"""The prior of the options is what a network says: :math:`P(s, \cdot)`.
+    r"""Takes the prior of the options from a network: :math:`P(s, \cdot)`.
 
     Args:
         module: a TensorDictModule that writes probabilities or logits ``[m, A]``. Of a
@@ -130,21 +130,21 @@ class ModulePrior:
 
 
 class PolicyValueEvaluator:
-    r"""A network that says both what to try and what a state is worth, called once for both.
+    r"""Takes the prior of the options and the value of a state from one network, in one call.
 
     .. math:: P(s, a) = (1 - \epsilon)\, \mathrm{softmax}_a(l_\theta(s) / T) + \epsilon / A, \qquad
               V(s) = v_\theta(s)
 
-    Its answer is an :class:`Evaluation`, so that a planner needs it once, as ``leaf_evaluator``,
-    and saves the second call that a :class:`ValueEvaluator` beside a :class:`ModulePrior` would
-    make. The network is called as that of a :class:`ValueEvaluator`.
+    It returns an :class:`Evaluation`, so a planner needs it only as ``leaf_evaluator``. It saves
+    the second call that a :class:`ValueEvaluator` beside a :class:`ModulePrior` makes. The network
+    is called as that of a :class:`ValueEvaluator`.
 
     Args:
         module: a TensorDictModule whose inputs are entries of the macro environment and which
             writes logits ``[m, A]`` and values ``[m, 1]`` or ``[m]``.
         temperature: T > 0 of the prior. Default 1.
-        uniform_share: :math:`\epsilon` in [0, 1], how much of the prior is spread over all options,
-            so that none is ruled out by a network that is too sure. Default 0.
+        uniform_share: :math:`\epsilon` in [0, 1], the share of the prior that is uniform, so that a
+            network that is too sure rules out no option. Default 0.
         logits_key, value_key: its outputs. Defaults ``"logits"`` and ``"state_value"``.
 
     Raises:
@@ -205,24 +205,24 @@ class PolicyValueEvaluator:
 
 
 class RolloutEvaluator:
-    r"""The value of a state is the return of rollouts from it: the simulation step of the textbook.
+    r"""Takes the value of a state from rollouts that begin there: the textbook's simulation step.
 
     .. math:: V(s) = R_1 + D_1 (R_2 + D_2 (\dots (R_n + D_n\, b(s_n)))), \qquad D_i = \gamma^{k_i}
 
-    for options of :math:`k_i` base steps that a policy takes in the planner's own simulator, up to
-    the end of the episode or ``max_options``. :math:`b` is 0 at a terminal state, else the
-    bootstrap evaluator's value. All rollouts of a wave run in one simulator call per option, and
-    those that have ended cost nothing. In a deterministic simulator a state's value depends on the
-    state and its seed only, not on what is evaluated beside it. The budget of the search does not
-    count these steps: ``num_base_steps`` does.
+    A policy takes options of :math:`k_i` base steps in the planner's own simulator, up to the end
+    of the episode or ``max_options``. :math:`b` is 0 at a terminal state, else the bootstrap
+    evaluator's value. All rollouts of a wave run in one simulator call per option, and those that
+    have ended cost nothing. In a deterministic simulator a state's value depends only on the state
+    and its seed, not on the states beside it. The budget of the search does not count these steps;
+    ``num_base_steps`` does.
 
     Args:
         policy: ``policy(td) -> probabilities [m, A]`` of the options, e.g. :class:`ModulePrior`;
             options that the mask forbids are never taken. Default: uniform.
         max_options: options of a rollout at most. Default 10.
         num_rollouts: rollouts from each state, of which the mean is taken. Default 1.
-        bootstrap: evaluator of the state in which a rollout was cut off: by ``max_options``, a
-            truncation, or a state without an option that may be taken. Default: 0.
+        bootstrap: evaluator of the state in which a rollout is cut off: by ``max_options``, by a
+            truncation, or where no option is allowed. Default: 0.
 
     Raises:
         ValueError: if a number is below 1; at the call if the policy gives no probabilities.
@@ -403,7 +403,7 @@ class MixedEvaluator:
         self.is_random = any(getattr(part, "is_random", False) for part in (first, second))
 
     def bind(self, simulator: Simulator, gamma: float) -> None:
-        """Hand the simulator and the discount of a planner on to both evaluators."""
+        """Give the simulator and the discount of a planner to both evaluators."""
         for part in (self.first, self.second):
             _bind(part, simulator, gamma)
 

@@ -56,13 +56,14 @@ def check_root(tree: TreeArrays, root: int) -> int:
 
 
 def best_plan(tree: TreeArrays, root: int) -> list[int]:
-    """Return the nodes of the best plan from the root on, or none."""
+    """Return the nodes of the best plan, beginning at the root, or none."""
     best = int(tree.roots["best_node"][root])
     return tree.path(root, best) if best > 0 else []
 
 
 def most_visited_path(tree: TreeArrays, root: int) -> list[int]:
-    """Return the nodes from the root on along the options with most visits, then highest Q."""
+    """Return the nodes along the options with most visits, then highest Q, beginning at the
+    root."""
     path = [0]
     while True:
         edges = tree.edges[root, path[-1]]
@@ -237,9 +238,9 @@ def to_torchrl(tree: TreeArrays, root: int = 0) -> Tree:
 def summary(tree: TreeArrays, root: int = 0, option_names: Sequence[str] | None = None) -> str:
     """Return what a search found as text: its size, the root's options, and the principal plan.
 
-    The plan is the best one found, or else the path of most visits. Of its columns, ``steps`` and
-    ``return`` (discounted) are counted from the root, ``R`` is the reward of the option, ``Q`` its
-    value, ``V`` the value of the node it led to.
+    The plan is the best one found, or else the path of most visits. ``steps`` and ``return``
+    (discounted) count from the root. ``R`` is the reward of the option, ``Q`` its value, ``V`` the
+    value of the node it led to.
 
     Args:
         tree: of a finished or interrupted search.

@@ -80,17 +80,18 @@ class MCTSPlanner(TensorDictModuleBase):
     are closed and never simulated again.
 
     Root ``b`` of a call with seed ``s`` draws its random numbers (root noise, Gumbel, rollouts,
-    sampled choices) from ``s + b``, so that its tree does not depend on the roots beside it
-    (with more than one wave in flight only where it is alone: waves are of all roots together).
+    sampled choices) from ``s + b``, so that its tree does not depend on the roots beside it. With
+    several waves in flight this holds for a single root only, since a wave takes leaves of all
+    roots.
 
     Args:
         env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or
             any env with a discrete action, that is stateless (``batch_locked=False``, its state in
-            the tensordict) or can be set to a state by ``reset(td, set_state=True)``. The planner
-            steps an env of the second kind away from its state, and sets it back to the state of
-            the call after a search. Transforms that remember something outside the tensordict
-            are refused, except ``CatFrames``: every node has its own frames, and planning changes
-            none of those of the env that is acted in.
+            the tensordict) or can be set to a state by ``reset(td, set_state=True)``. A search
+            changes the state of an env of the second kind, and then sets it back to the state of
+            the call. Transforms that remember something outside the tensordict are refused.
+            ``CatFrames`` is the exception: every node has its own frames, and planning does not
+            change those of the env that acts.
         gamma (float, optional): discount per base step. Default: that of the env's
             ``OptionTransform``, through any nesting of envs; 0.99 for an env without durations.
         tree_policy, backup, novelty, transpositions, chance: parts of the search, see
@@ -110,11 +111,11 @@ class MCTSPlanner(TensorDictModuleBase):
         budget (SearchBudget): limits per root. Default: 1,000 expansions, until a plan is found.
         duration_key, mask_key (NestedKey): entries of the env with the base steps of a step, int64
             ``[*B, 1]`` (1 if the env has none or None is named), and the options that may be taken,
-            bool ``[*B, A]`` (all if it has none or None is named). Under an ``OptionTransform``
-            the mask of the base actions goes by another name, and is not that of the options.
+            bool ``[*B, A]`` (all if it has none or None is named). Under an ``OptionTransform`` the
+            mask of the base actions has another name; it is not the options' mask.
         reward_key (NestedKey, optional): which reward, if the env has several.
-        seed (int, optional): of the planner's random numbers; every call moves on from it. Default:
-            drawn from torch's global generator when first needed.
+        seed (int, optional): of the planner's random numbers; each call continues the stream.
+            Default: drawn from torch's global generator when first needed.
         progress (callable, optional): called with a :class:`SearchProgress` after every wave.
 
     Writes: the env's action (the option), and ``"plan_found"`` (bool ``[*B, 1]``), ``"root_value"``
@@ -286,7 +287,7 @@ class MCTSPlanner(TensorDictModuleBase):
         return tensordict
 
     def planning(self, td: TensorDictBase) -> Tensor:
-        """Return the options to take ``[*B]``; the form of TorchRL's planners."""
+        """Return the options to take ``[*B]``, as TorchRL's planners do."""
         return self.forward(td.copy()).get(self.option_key)
 
     def plan(self, td: TensorDictBase) -> Plan:
@@ -320,7 +321,7 @@ class MCTSPlanner(TensorDictModuleBase):
         return search
 
     def _capacity(self, num_roots: int) -> int:
-        """Nodes to make room for at once: all that the budget allows, if that is not very many."""
+        """Nodes to make room for at once: all that the budget allows, if they are not very many."""
         budget, settings = self.budget, self.settings
         limits = [x for x in (budget.simulations, budget.nodes) if x is not None]
         per_wave = settings.leaves_per_wave * settings.waves_in_flight * self.num_options
@@ -365,13 +366,13 @@ class MCTSPlanner(TensorDictModuleBase):
     ) -> Tensor:
         """Move the roots of a search along: ``options`` were executed and led to ``td``.
 
-        Where an outcome of the options in the tree is the state in ``td``, bit for bit, its subtree
-        is kept; elsewhere a new tree is planted. Nothing is simulated until :meth:`resume`.
+        If the tree holds the state in ``td`` as an outcome of the options, bit for bit, its subtree
+        is kept; otherwise a new tree is planted. Nothing is simulated until :meth:`resume`.
 
         Args:
             search: as :meth:`search` returned it.
-            options: int64 ``[*B]``, or ``[*B, k]`` for several one after the other, with -1 behind
-                the last; -1 alone for a new tree.
+            options: int64 ``[*B]``, or ``[*B, k]`` for k options in a row, padded with -1; -1 alone
+                for a new tree.
             td: states ``[*B]`` after the options.
             where: bool ``[*B]``, the roots to move; the others stay as they are. Default: all.
             seed: as in :meth:`search`.

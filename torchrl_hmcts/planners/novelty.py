@@ -19,7 +19,7 @@ from torchrl_hmcts.checks import instance, nested_keys, real_number, whole_numbe
 
 
 class NoveltyTest(Protocol):
-    """Protocol of a novelty test; write your own with these members.
+    """Protocol of a novelty test; a test of your own needs these members.
 
     A method ``statistics() -> dict`` is optional: its counts join those of the search.
 
@@ -47,7 +47,7 @@ class NoveltyTest(Protocol):
     def start(self, num_roots: int) -> None:
         """Forget everything: ``num_roots`` searches begin.
 
-        Assign new arrays here: each search starts a shallow copy of the test, of its own.
+        Assign new arrays here: each search starts a shallow copy of the test.
         """
 
     def restart(self, root: int) -> None:
@@ -63,7 +63,7 @@ class NoveltyTest(Protocol):
         """
 
     def relax(self, root: int) -> bool:
-        """Be less strict for one root whose search is exhausted; False if that is impossible."""
+        """Be less strict for one exhausted root; return False if that is impossible."""
 
 
 def ask(
@@ -73,14 +73,14 @@ def ask(
     novel = np.asarray(test.accept(roots, features, base_steps))
     if novel.shape != (len(features),) or novel.dtype != np.bool_:
         raise ValueError(
-            f"The novelty test accepted {novel.dtype} {list(novel.shape)}; it must say of each "
-            f"of the {len(features)} states whether it is new, in bool."
+            f"The novelty test returned {novel.dtype} {list(novel.shape)}; return a bool for each "
+            f"of the {len(features)} states, True where it is new."
         )
     return novel
 
 
 class _Counted:
-    """What both tests count."""
+    """Counts that both tests keep."""
 
     num_tested: int
     _tally: np.ndarray
@@ -103,32 +103,33 @@ class RadiusNovelty(_Counted):
 
     .. math:: \text{novel}(s) \iff \min_{s' \in A} \lVert \phi(s) - \phi(s') \rVert \ge r
 
-    with :math:`A` the accepted states and :math:`\phi` the entries ``key`` side by side, each
-    times its scale. Options that lead back to places the tree holds are simulated once and not
-    searched further, which is what makes a search over options in a continuous space finite. The
-    radius must be smaller than the distance an option covers, or every outcome is refused; an
-    exhausted search shrinks it and reopens what it had refused.
+    with :math:`A` the accepted states and :math:`\phi` the entries ``key`` side by side, each times
+    its scale. An option that leads back to a place in the tree is simulated once and not searched
+    further. This makes a search over options in a continuous space finite. The radius must be
+    smaller than the distance that an option covers, or every outcome is refused. An exhausted
+    search shrinks the radius and reopens refused nodes.
 
     With ``shorter_paths`` a state is novel as well if its :math:`k` base steps from the root are
     fewer than those of all accepted states around it, so that plans get shorter after the first:
 
     .. math:: k(s) < \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
 
-    The subtree behind the longer path stays. A grid of cells makes the cost of a test independent
-    of the size of the tree; with more than three features it spans the three that vary most.
+    The subtree behind the longer path stays. With a grid of cells, the cost of a test does not
+    depend on the size of the tree; with more than three features the grid spans the three that vary
+    most.
 
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``.
         radius: in units of the (scaled) entries.
         scale: factor of each entry. Default: all 1.
-        relaxation: factor of the radius when a search is exhausted, in ``(0, 1)``. Default
-            0.75; a smaller factor reopens more at once, which the hardest searches pay for.
+        relaxation: factor of the radius when a search is exhausted, in ``(0, 1)``. Default 0.75; a
+            smaller factor reopens more at once, and makes the hardest searches longer.
         max_relaxations: how often the radius of a search may be relaxed. Default 14, to a sixtieth.
-        shorter_paths: accept states near others that are reached in fewer base steps. Default
-            False: a place is searched from the first path to it. Meant for a budget that continues
+        shorter_paths: also accept a state near others if it is reached in fewer base steps. Default
+            False: only the first path to a place is searched. Use it with a budget that continues
             after the first plan (``improve_expansions``).
         encoder (TensorDictModule, optional): writes ``key`` from entries of the state or
-            observation, e.g. a :class:`~torchrl_hmcts.modules.SkillEncoder`: novelty is then of
+            observation, e.g. a :class:`~torchrl_hmcts.modules.SkillEncoder`; the test then compares
             learned features. Default: none, ``key`` is an entry itself.
 
     Raises:
@@ -287,21 +288,22 @@ class WidthNovelty(_Counted):
 
     .. math:: \text{novel}(s) \iff \exists f:\ \lvert \{ s' \in A : s'_f = s_f \} \rvert < n
 
-    with :math:`A` the accepted states and :math:`n = 1`, raised by one whenever a search is
-    exhausted. At most as many states are accepted as features have values, times :math:`n`: width-1
-    search, the "IW(1)" of classical planning. For discrete features, e.g. the 128 RAM bytes of an
-    Atari game.
+    with :math:`A` the accepted states. :math:`n` is 1, and one more each time a search is
+    exhausted. The number of accepted states is at most the number of values of all features, times
+    :math:`n`. This is width-1 search, the "IW(1)" of classical planning. It is meant for discrete
+    features, e.g. the 128 RAM bytes of an Atari game.
 
-    With ``stages`` an exhausted search first compares more features, before :math:`n` is raised:
-    those that tell many states apart come last. The values of all features are remembered from the
-    start.
+    With ``stages`` an exhausted search first compares more features, and only then raises
+    :math:`n`. Put features that tell many states apart last. The test remembers the values of all
+    features from the start.
 
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``, of an integer
             type or bool.
         max_relaxations: how often :math:`n` may be raised for a search. Default 14; at most 254.
-        stages (sequence of int): how many of the features, the first ones, are compared at first,
-            after one relaxation, and so on, rising; then all are. Default: all at once.
+        stages (sequence of int): number of features, counted from the first, to compare at first,
+            after one relaxation, and so on; each larger than the one before. After the last stage
+            all are compared. Default: all at once.
 
     Raises:
         ValueError: if no key is given, ``max_relaxations`` is out of its range, or the stages do

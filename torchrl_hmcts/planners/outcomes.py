@@ -1,4 +1,4 @@
-"""Outcomes of options, as arrays, and the refusal of what no search can use.
+"""Outcomes of options, as arrays, and the refusal of numbers that no search can use.
 
 Letters: ``m`` outcomes of one wave, or roots; ``A`` options, ``F`` novelty features, ``K`` bytes.
 """
@@ -63,7 +63,7 @@ def refuse(outcomes: Outcomes, bad: int) -> None:
 
 
 def check_durations(durations: np.ndarray, above: np.ndarray) -> None:
-    """Refuse times that no option can have taken, and paths whose length would wrap."""
+    """Refuse durations that no option can have, and paths whose length would overflow."""
     good = (durations >= 1) & (durations <= MOST_BASE_STEPS - above.astype(np.int64))
     if not good.all():
         raise ValueError(

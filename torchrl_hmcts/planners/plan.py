@@ -1,4 +1,4 @@
-"""Plans: what a search found, as tensors.
+"""Plans of a search, as tensors.
 
 Letters: *B batch of roots, L length of the longest plan.
 """

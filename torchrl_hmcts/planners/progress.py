@@ -18,8 +18,8 @@ class SearchProgress:
         expansions (int): nodes expanded so far, of all roots.
         base_steps (int): base steps simulated so far, of all roots.
         seconds (float): since the search began.
-        search (Search): the search as it stands, of B roots; ``extract_plans(search)`` gives the
-            best plans so far.
+        search (Search): the search so far, of B roots; ``extract_plans(search)`` returns its best
+            plans.
 
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner
@@ -40,7 +40,7 @@ class SearchProgress:
 
     @classmethod
     def of(cls, search: Search, num_active: int, seconds: float) -> SearchProgress:
-        """Return how far a search is after ``seconds``."""
+        """Return the progress of a search after ``seconds``."""
         return cls(
             num_roots=search.num_roots,
             num_active=num_active,

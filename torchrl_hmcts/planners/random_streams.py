@@ -1,4 +1,4 @@
-"""Random numbers of states: what they draw depends on their place in a tree, not on their company.
+"""Random numbers of states, which depend on their place in a tree, not on the trees beside it.
 
 Letters: ``m`` states, ``w`` rollouts.
 """

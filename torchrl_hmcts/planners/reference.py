@@ -1,4 +1,4 @@
-"""The textbook's tree search in plain Python: to read first, and to check the compiled one by."""
+"""The textbook's tree search in plain Python: read it first; tests check the compiled one by it."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ class Node:
 class ReferenceSearch:
     r"""Searches a model by one descent per simulation, over options that last several steps.
 
-    A simulation goes down from the root by the tree policy until it meets an option that was never
-    simulated (``expand="one"``) or a node without any (``expand="all"``), adds what the model
-    gives, and carries its value up:
+    A simulation descends from the root by the tree policy to an option that was never simulated
+    (``expand="one"``), or to a node without simulated options (``expand="all"``). It adds the
+    model's outcome as a node, and updates the values up to the root:
 
     .. math:: G \leftarrow R + \gamma^k G, \qquad
               V \leftarrow V + \frac{G - V}{N} \;\text{ or }\; \max_o Q(o), \qquad
               Q = R + \gamma^k V
 
-    What :class:`MCTSPlanner` and :func:`tree_search` do for many roots at once, compiled;
-    their trees are compared with this one's, node by node.
+    :class:`MCTSPlanner` and :func:`tree_search` do the same for many roots at once, compiled. Tests
+    compare their trees with this one's, node by node.
 
     Args:
         root: the state to search from.
@@ -108,7 +108,7 @@ class ReferenceSearch:
             self.simulate()
 
     def simulate(self) -> None:
-        """Go down once, to new nodes or to a terminal one once more."""
+        """Descend once, to new nodes or to a known terminal one."""
         node = self.root
         while node.priors:
             if self.expand == "all" and not node.children:
@@ -136,7 +136,7 @@ class ReferenceSearch:
         return max(options, key=lambda option: (self.score(node, option), node.priors[option]))
 
     def score(self, node: Node, option: int) -> float:
-        """Return what UCT or PUCT maximises."""
+        """Return the score that UCT or PUCT maximises."""
         policy, child = self.tree_policy, node.children.get(option)
         if isinstance(policy, UCT):
             if child is None:

@@ -118,8 +118,8 @@ class HighestValue:
     """The option of the root with the highest value.
 
     Args:
-        random_ties: draw among options of equal value, as there are many where rewards are rare,
-            instead of taking the one of lower index. Default ``False``.
+        random_ties: among options of equal value draw one, instead of taking the one of lowest
+            index. Many values are equal where rewards are rare. Default ``False``.
 
     Reference:
         Chaslot et al., "Progressive strategies for Monte-Carlo tree search", 2008: the max child.

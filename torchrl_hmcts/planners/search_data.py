@@ -93,7 +93,7 @@ def search_examples(
         plan_share: :math:`w` in [0, 1]. Default 1: a search that stops at its first plan has spent
             most visits elsewhere. 0 is AlphaZero's target.
         tree_values: use the tree's values where no plan is known. Default False: without a leaf
-            evaluator they are 0 there, which says only that nothing was found yet.
+            evaluator they are 0 there, which means only that nothing was found yet.
         keys: entries of the states to take. Default: all that the search stored.
 
     Returns:

@@ -1,4 +1,4 @@
-"""All that a search is set to, in one object that a planner and its searches share."""
+"""All settings of a search, in one object that a planner and its searches share."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from torchrl_hmcts.planners.tree_policies import UCT, CompiledPolicy, Gumbel, Tr
 
 @dataclass(frozen=True)
 class SearchSettings:
-    r"""The parts and numbers of a search, checked once and never changed.
+    r"""Holds the parts and numbers of a search, checked once and never changed.
 
-    A planner builds one of its keywords, ``planner.settings``; to assign a part, as in
-    ``planner.tree_policy = UCT(c=5.0)``, replaces it. A search holds the one it was planted with
-    and takes a new one over when it is resumed.
+    A planner builds one from its keywords, ``planner.settings``. To assign a part, as in
+    ``planner.tree_policy = UCT(c=5.0)``, replaces it by a changed copy. A search keeps the settings
+    it was planted with, and takes the planner's new ones when it is resumed.
 
     Args:
         tree_policy: :class:`UCT` (default, ``c=1``), :class:`PUCT`, :class:`Gumbel`,
             :class:`TorchRLScore`, or a callable over :class:`NodeStatistics`.
-        backup: how the value of a node follows from what was found below it. ``"mean"`` (default)
-            of its own evaluation and all returns through it,
+        backup: how the value of a node is computed. ``"mean"`` (default): the mean of its own
+            evaluation and all returns through it,
             :math:`V \leftarrow V + (R + D\,V' - V) / N` (Coulom 2006; dissertation, section
-            2.4.2); ``"max"``, the value of its best option, :math:`V = \max_o R + D\,V'`, exact in
+            2.4.2). ``"max"``: the value of its best option, :math:`V = \max_o R + D\,V'`, exact in
             a deterministic simulator.
         novelty: which new nodes are worth searching, e.g. ``RadiusNovelty("position", 0.35)``.
             Default: all.
@@ -42,16 +42,16 @@ class SearchSettings:
             option that the tree policy chooses, as in the textbook.
         leaves_per_wave: leaves of each root that share a simulator call. More are faster for few
             roots and search less selectively. At most 255; default 1.
-        waves_in_flight: waves that are simulated at a time, the next one chosen before the
-            outcomes of those before it are known. For a simulator that works beside the planner,
-            such as :class:`~torchrl_hmcts.envs.AtariOptionPool` with processes: with 2 it has work
-            while the planner inserts and selects. Outcomes are inserted in the order of the waves,
-            whichever is ready first, so that the tree is the same each time (but for a budget of
-            seconds) and on every simulator. Times ``leaves_per_wave`` at most 255; default 1.
-        exhausted: what a descent does with an option behind which nothing is left to simulate:
-            ``"skip"`` it (default: every simulation finds something new), or ``"revisit"`` it and
-            back its known value up once more, at no simulator's cost, so that visits and mean
-            values are those of the textbook. Always ``"revisit"`` with ``chance`` or ``Gumbel``.
+        waves_in_flight: waves that are simulated at a time; each is chosen before the outcomes of
+            the earlier ones are known. For a simulator that works beside the planner, such as
+            :class:`~torchrl_hmcts.envs.AtariOptionPool` with processes: with 2 it has work while
+            the planner inserts and selects. Outcomes are inserted in the order of the waves, so the
+            tree is the same each time and on every simulator, unless the budget has ``seconds``.
+            Times ``leaves_per_wave`` at most 255; default 1.
+        exhausted: what a descent does with an option behind which nothing is left to simulate.
+            ``"skip"`` (default): every simulation finds something new. ``"revisit"``: the known
+            value is backed up once more, without the simulator, so that visits and mean values are
+            those of the textbook. Always ``"revisit"`` with ``chance`` or ``Gumbel``.
 
     Raises:
         ValueError: if a number is out of range, or two parts do not go together.
@@ -85,7 +85,7 @@ class SearchSettings:
         ):
             value = getattr(self, name)
             if not isinstance(value, str) or value not in allowed:
-                raise ValueError(f"{name} is {allowed[0]!r} or {allowed[1]!r}; got {value!r}.")
+                raise ValueError(f"{name} must be {allowed[0]!r} or {allowed[1]!r}; got {value!r}.")
         for name in ("leaves_per_wave", "waves_in_flight"):
             object.__setattr__(self, name, whole_number("A search", name, getattr(self, name)))
         leaves, waves = self.leaves_per_wave, self.waves_in_flight

@@ -1,11 +1,11 @@
-"""A macro environment as the planner sees it: states in, outcomes of options out.
+"""A macro environment as the planner uses it: states go in, outcomes of options come out.
 
 Two kinds of env can be set to any state. A stateless one (``batch_locked=False``) keeps its state
 in the tensordict: all states of a wave are one call. If its type has ``step_async(td) -> ticket``,
 ``step_wait(ticket) -> next`` and ``step_abandon(ticket)``, as that of :class:`AtariOptionPool`, it
-works on several waves beside the planner; every ticket is waited for, or given up where that fails.
-One with a state of its own (e.g. TorchRL's MuJoCo envs) is set by ``reset(td, set_state=True)`` and
-steps as many states at a time as its batch size holds.
+works on several waves beside the planner. The planner waits for every ticket, and abandons it if
+that fails. One with a state of its own (e.g. TorchRL's MuJoCo envs) is set by ``reset(td,
+set_state=True)`` and steps as many states at a time as its batch size holds.
 
 Letters: ``m`` states of one call, ``A`` options.
 """
@@ -180,7 +180,7 @@ class Simulator:
         return after
 
     def searching(self) -> AbstractContextManager[None]:
-        """Let nothing that a search does stay in the transforms of the env."""
+        """Restore the transforms of the env after a search."""
         return self._foreign.unchanged(self._name)
 
     def leave(self, td: TensorDictBase) -> None:

@@ -1,4 +1,4 @@
-"""Checks of an env that is to be a planner's simulator: what would be misread is refused."""
+"""Checks of a planner's simulator: an env that the planner would misread is refused."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def check_env(env: EnvBase) -> None:
     """Refuse an env that cannot be set to a state, or has no state or several actions."""
     if not isinstance(env, EnvBase):
         raise TypeError(
-            f"MCTSPlanner plans in a TorchRL env; got {type(env).__name__}. Wrap a Gymnasium "
-            f"env as described in TorchRL's GymWrapper, with a state that can be set."
+            f"MCTSPlanner plans in a TorchRL env; got {env!r:.60}. Make one of a Gymnasium env or "
+            "its id: SettableGymEnv(env)."
         )
     name = env_name(env)
     if env.batch_locked and not env._supports_set_state:
@@ -35,7 +35,8 @@ def check_env(env: EnvBase) -> None:
         )
     if len(env.action_keys) != 1:
         raise ValueError(
-            f"MCTSPlanner chooses one option per step; {name} has the actions {env.action_keys}."
+            f"MCTSPlanner chooses one option per step; {name} has the actions {env.action_keys}. "
+            "Make one discrete action of them, e.g. by an OptionTransform around a worker."
         )
     if not list(env.full_state_spec.keys(True, True)):
         raise ValueError(
@@ -61,7 +62,7 @@ def count_options(env: EnvBase, spec: TensorSpec) -> int:
 def check_rewards_and_ends(
     env: EnvBase, reward_key: NestedKey, done_keys: tuple[NestedKey, NestedKey]
 ) -> None:
-    """Refuse rewards and ends of which a search would read other numbers than are meant."""
+    """Refuse rewards and ends that a search would misread."""
     reward = env.full_reward_spec[reward_key]
     if not _one_number(reward.shape, env) or reward.dtype.is_complex:
         raise ValueError(
@@ -82,7 +83,7 @@ def check_rewards_and_ends(
 def check_durations_and_masks(
     env: EnvBase, duration_key: NestedKey | None, mask_key: NestedKey | None, num_options: int
 ) -> None:
-    """Refuse durations and masks of which a search would read other numbers than are meant."""
+    """Refuse durations and masks that a search would misread."""
     shown = env.full_observation_spec
     if duration_key is not None:
         duration = shown[duration_key]
@@ -142,7 +143,7 @@ def check_masks(masks: np.ndarray, done: np.ndarray, roots: np.ndarray) -> None:
 
 
 def find_reward_key(env: EnvBase, reward_key: NestedKey | None) -> NestedKey:
-    """Return the reward that is asked for, or the only one."""
+    """Return the key of the reward: the given one, or the only one."""
     keys = [unravel_key(k) for k in env.reward_keys]
     if reward_key is not None:
         reward_key = nested_key("MCTSPlanner", "reward_key", reward_key)
@@ -157,7 +158,8 @@ def find_reward_key(env: EnvBase, reward_key: NestedKey | None) -> NestedKey:
 
 
 def _masks_actions_below_options(env: EnvBase, mask_key: NestedKey) -> int:
-    """The number of base actions if the mask is theirs and nobody behind the options wrote it."""
+    """The number of base actions if the mask is theirs and no transform behind the options wrote
+    it."""
     transforms = flat_transforms(env) if isinstance(env, TransformedEnv) else []
     for transform in reversed(transforms):
         if mask_key in map(unravel_key, transform.out_keys):

@@ -1,4 +1,4 @@
-"""Trees that are searched further: rollouts in them, what is reopened, roots that move along."""
+"""Trees that are searched further: rollouts in them, reopened nodes, roots that move."""
 
 from __future__ import annotations
 

@@ -16,11 +16,11 @@ from torchrl_hmcts.checks import nested_keys
 
 
 class Transpositions:
-    """Recognises states that are equal, bit for bit, to one already in the tree.
+    """Recognises a state that equals one in the tree, bit for bit.
 
-    The second node of a state is not searched: it takes its value from the first one, its twin,
-    now and whenever a descent passes by. The tree becomes a graph of distinct states. Meant for
-    discrete states in a deterministic simulator; for continuous ones see
+    The second node of a state is not searched. It takes its value from the first one, its twin, at
+    once and each time a descent passes. The tree becomes a graph of distinct states. It is meant
+    for discrete states in a deterministic simulator; for continuous ones see
     :class:`~torchrl_hmcts.planners.RadiusNovelty`.
 
     Args:

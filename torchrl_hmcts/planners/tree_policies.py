@@ -1,4 +1,4 @@
-"""Tree policies: which option a descent takes in a node.
+"""Tree policies, which choose the option that a descent takes in a node.
 
 :class:`UCT`, :class:`PUCT` and :class:`Gumbel` run inside the compiled descent. A policy of your
 own is any callable over :class:`NodeStatistics`; it sees the nodes of one level of all descents at
@@ -36,7 +36,7 @@ class NodeStatistics(TensorClass, metaclass=KeepsDocstring):
     """Statistics that a tree policy may read: the nodes where descents of a wave stand, ``[d]``.
 
     Visits include the options that are being simulated in the same wave. The value of an option
-    that was never tried is 0; ``allowed`` says which ones may be chosen.
+    that was never tried is 0. Only options with ``allowed`` may be chosen.
 
     Attributes:
         node_visits (Tensor): ``[d]`` float32, visits n of the node, its own evaluation included.
@@ -128,8 +128,8 @@ class PUCT(CompiledPolicy):
 
     .. math:: \arg\max_a\; Q(s,a) + c\, P(s,a)\, \frac{\sqrt{\sum_b N(s,b)}}{1 + N(s,a)}
 
-    P sums to 1 over the options that the mask allows. Options behind which nothing is left to
-    find keep their share.
+    P sums to 1 over the options that the mask allows. An option keeps its share when nothing is
+    left to find behind it.
 
     Args:
         c: exploration constant, in units of :math:`Q`. Default ``1.25``.
@@ -205,7 +205,7 @@ class Gumbel(CompiledPolicy):
     .. math:: g(a) + \ln P(s,a) + \sigma(\hat Q(s,a)), \qquad
               \sigma(q) = (c_{visit} + \max_b N(s,b))\, c_{scale}\, q
 
-    is chosen. Below the root, visits follow the improved policy
+    is taken. Below the root, visits follow the improved policy
 
     .. math:: \arg\max_a\; \pi'(a) - \frac{N(s,a)}{1 + \sum_b N(s,b)}, \qquad
               \pi' = \mathrm{softmax}(\ln P + \sigma(\hat Q)).
@@ -312,9 +312,9 @@ class TorchRLScore:
               \exp\Bigl(\frac{\gamma}{K}\, N Q_a\Bigr), \qquad p_t \approx \frac{n_a}{N}, \quad
               N = \sum_b n_b,
 
-    and nothing is drawn: the option with the largest :math:`p_a / (1 + n_a)` is taken, which
-    spreads visits in proportion to the probabilities. EXP3's guarantee against an adversary is
-    that of random draws and does not carry over. Like UCB1-Tuned it is meant for returns in [0, 1].
+    and nothing is drawn. The option with the largest :math:`p_a / (1 + n_a)` is taken, so visits
+    are in proportion to the probabilities. EXP3's guarantee against an adversary holds for random
+    draws only, not here. Like UCB1-Tuned it is meant for returns in [0, 1].
 
     Args:
         score_module: e.g. ``PUCTScore(c=1.25)``, a member of ``MCTSScores``, or a module of your

@@ -1,4 +1,4 @@
-"""The search tree as users see it: tensors, text, graphs and pictures of the kernels' records."""
+"""The search tree for users: tensors, text, graphs and pictures of the kernels' records."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torchrl_hmcts.planners.tree import KeepsDocstring, TreeArrays
 class TreeView(TensorClass, metaclass=KeepsDocstring):
     """A search tree as tensors that share the memory of the kernels' records.
 
-    Only the first ``num_nodes[b]`` nodes of root ``b`` have a meaning. Node 0 is the root. A view
-    is of the arrays at the time it was made: make a new one after the tree has grown.
+    Only the first ``num_nodes[b]`` nodes of root ``b`` are in use. Node 0 is the root. Make a new
+    view after the tree has grown.
 
     Attributes:
         num_nodes (Tensor): ``[B]`` nodes in use.

@@ -94,7 +94,7 @@ def check_macro_env(
     redrawn_keys: Sequence[NestedKey] = (),
     tolerance: float = 0.0,
 ) -> None:
-    """Check that a planner can search an env: a macro environment, one that is set to states.
+    """Check that a planner can search an env, and that its state is all that a step depends on.
 
     All of :func:`check_env`, and: the action is one discrete option; a step takes at least one base
     step; some option may be taken wherever an episode continues; set to the states of a rollout and
@@ -179,7 +179,7 @@ def check_parallel_env(
     num_steps: int = 4,
     seed: int = 0,
 ) -> None:
-    """Check that an env does in the processes of a ``ParallelEnv`` what it does in this one.
+    """Check that an env does the same in the processes of a ``ParallelEnv`` as in this one.
 
     For every start method: specs hold, and rollouts with the same seed and actions are those of
     TorchRL's ``SerialEnv``.

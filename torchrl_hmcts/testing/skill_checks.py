@@ -88,7 +88,7 @@ def check_skill_objective(
 
 
 def check_skill_prior(prior: SkillPrior) -> None:
-    """Check that a distribution over skills is one.
+    """Check that a skill prior is a distribution over skills.
 
     ``probs()`` is not negative and sums to 1; ``log_probs()`` and ``active()`` say the same;
     nothing of it is drawn at random; it survives its state dict.

@@ -197,7 +197,7 @@ class ChainEnv(_TinyEnv):
 
 
 class PointMassEnv(EnvBase):
-    r"""A point with momentum in a box, pushed about without any reward: to learn skills in.
+    r"""A point with momentum in a box, without any reward: to learn skills in.
 
     .. math:: v' = v + 0.05\,(4 a - 2 v), \qquad x' = x + 0.05\, v'
 

@@ -15,8 +15,8 @@ _CONVENTION = "action_mask"  # TorchRL's name
 class BaseMasks:
     """Renames the masks of an env's actions, ``"action_mask"`` to ``"base_action_mask"``.
 
-    Above an OptionTransform the action is the option, and what is written under ``"action_mask"``
-    there is the mask of the options. Below it, worker, termination and env see the base env's.
+    Above an OptionTransform the action is the option, and ``"action_mask"`` is the mask of the
+    options. Below it, worker, termination and env read the base env's mask.
     """
 
     def __init__(self, env: EnvBase) -> None:
@@ -30,7 +30,7 @@ class BaseMasks:
                 self.renamed[key] = new
 
     def hide(self, td: TensorDictBase) -> TensorDictBase:
-        """Rename the base masks in what the env wrote, for those above; in place."""
+        """Rename the base masks in the env's output, for the parts above; in place."""
         for key, new in self.renamed.items():
             mask = td.pop(key, None)
             if mask is not None:

@@ -18,7 +18,7 @@ class DisplacementTransform(EnvTransform):
     .. math:: \Delta_t = x_t - x_{t_0}, \qquad t_0 = \text{the step at which the skill was drawn}
 
     A discriminator that reads it tells skills apart by direction instead of place. The origin
-    :math:`x_{t_0}` travels in the tensordict, so the env stays stateless. On the last transition of
+    :math:`x_{t_0}` is kept in the tensordict, so the env stays stateless. On the last transition of
     a mini-episode ``("next", "displacement")`` is measured from the old origin; the next root is
     zero again.
 

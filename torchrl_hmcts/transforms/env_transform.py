@@ -1,4 +1,4 @@
-"""A base of the transforms here: they follow an env, and what they carry is in the tensordict."""
+"""A base of the transforms here: they follow an env, and keep their state in the tensordict."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class EnvTransform(Transform):
         )
 
     def _stays_outside(self) -> str | None:
-        """Tell what it does that it cannot do in the workers of a batched env."""
+        """Return why it cannot work inside the workers of a batched env."""
         return None
 
     def _check_batched_worker_compat(self) -> None:

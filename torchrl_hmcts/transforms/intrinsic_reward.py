@@ -14,19 +14,19 @@ from torchrl_hmcts.objectives.skill_objective import SkillObjective
 
 
 class SkillReward(Transform):
-    r"""Rewards transitions with what a skill objective makes of them.
+    r"""Rewards transitions by a skill objective.
 
     .. math:: r = c_i\, r_\phi(s, z, s') + c_e\, r_{\text{env}}
 
-    On a replay buffer it scores the sampled transitions with the objective as it is now, so old
-    data never carry stale rewards; that is the usual place. On an env it scores each step as it is
-    taken. Use it in one of the two places, or the second counts the first as the env's reward
-    (harmless while ``extrinsic_coeff`` is 0).
+    Usually it belongs to a replay buffer. There it rewards sampled transitions by the present
+    objective, so old data never have stale rewards. On an env it rewards each step when it is
+    taken. Use it in one of the two places only: the second would take the first one's reward for
+    the env's (harmless while ``extrinsic_coeff`` is 0).
 
     Args:
         objective (SkillObjective): gives the reward :math:`r_\phi`, e.g. ``loss.objective`` of a
-            :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`. It stays the property of
-            whoever trains it: its parameters are not listed among the transform's.
+            :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`. Its parameters are not listed
+            among the transform's; its owner trains them.
         intrinsic_coeff (float): :math:`c_i`. Default ``1.0``.
         extrinsic_coeff (float): :math:`c_e`. Default ``0.0``: the env's reward is replaced.
         reward_key (NestedKey): reward to write, ``[*B, 1]``, under ``"next"``. Default

@@ -16,7 +16,14 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 
-from torchrl_hmcts.checks import instance, nested_key, one_of, real_number, whole_number
+from torchrl_hmcts.checks import (
+    instance,
+    nested_key,
+    no_class,
+    one_of,
+    real_number,
+    whole_number,
+)
 from torchrl_hmcts.nesting import parts
 from torchrl_hmcts.transforms.env_transform import zero_count
 from torchrl_hmcts.transforms.option_checks import HasOptions, Termination, check_skill_table
@@ -27,7 +34,7 @@ _ROOT = "_option_root_"
 
 
 class OptionTransform(HasOptions):
-    r"""Wraps each rollout of a worker as one macro-step, so that a planner or a loss sees an SMDP.
+    r"""Makes each rollout of a worker one macro-step, so that a planner or a loss works on an SMDP.
 
     The action of the transformed env is an **option**. One step runs the worker closed-loop in the
     base env, until the option's termination, ``max_steps`` base steps or ``done``. With
@@ -36,29 +43,29 @@ class OptionTransform(HasOptions):
     .. math:: \text{reward} = \sum_{i<k} \gamma^i\, r_{i+1}, \qquad \text{duration} = k,
 
     the done flags, and observation and state after the last base step. Every batch element has its
-    own option and its own end; an element that has ended does not step any more.
+    own option and its own end. An element whose option has ended waits for the others.
 
-    The base env's ``"action_mask"`` forbids base actions and no options: worker and termination
-    read it by its name, above it is ``"base_action_mask"``. A transform behind this one may write
-    the options' own ``"action_mask"``, e.g. :class:`SkillMaskTransform`.
+    The base env's ``"action_mask"`` forbids base actions, not options. Worker and termination read
+    it by this name; above, it is ``"base_action_mask"``. A transform behind this one may write a
+    mask of the options as ``"action_mask"``, e.g. :class:`SkillMaskTransform`.
 
     TorchRL's estimators discount by ``gamma ** steps_to_next_obs``. With
     ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
     ``make_value_estimator``, any TorchRL loss is correct for the SMDP.
 
-    Where the env below counts base steps itself, as one with an OptionTransform does, k is their
-    sum and the rewards are discounted by it: options of options have any number of levels.
+    If the env below counts base steps itself, as one with an OptionTransform does, k is their sum,
+    and the rewards are discounted by it. So options of options can have any number of levels.
 
-    Append it last of the transforms that must see base steps, each of which they see once; what is
-    appended after it sees macro-steps. The worker is not registered as a sub-module: its owner
-    moves, trains and saves it. What a recurrent worker writes under ``"next"`` is its memory; it is
-    carried from base step to base step. TorchRL's ``LowLevelController`` is such a worker: append
-    its ``make_tensordict_primer()`` before this transform, and name its decision ``skill_key``.
+    Append it after all transforms that must see base steps; they see each once. Transforms appended
+    after it see macro-steps. The worker is not registered as a sub-module: its owner moves, trains
+    and saves it. The memory of a recurrent worker is what it writes under ``"next"``; it is passed
+    from base step to base step. TorchRL's ``LowLevelController`` is such a worker: append its
+    ``make_tensordict_primer()`` before this transform, and name its decision ``skill_key``.
 
     With a group of agents and ``option_key=("agents", "option")`` each agent has an option. Their
     options begin and end together: at the termination, after ``max_steps`` or as soon as any
-    ``done`` below is true, an agent's own included. Each agent's rewards are discounted and summed
-    by themselves.
+    ``done`` below is true, also that of one agent. The rewards of each agent are discounted and
+    summed separately.
 
     Args:
         worker (TensorDictModuleBase): reads observation or state entries and ``skill_key``, writes
@@ -77,19 +84,19 @@ class OptionTransform(HasOptions):
             a vector of ``skills``, ``[*B, D]``. Default ``"skill"``.
         duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
         one_hot (bool): options are one-hot instead of categorical. Default ``False``.
-        trajectory_keys (sequence of NestedKey, optional): base transitions to hand out, e.g. to
-            train the worker: entries of the env or of the worker, as ``"position"``, ``"skill"``,
-            ``"action_log_prob"`` or ``("next", "reward")``, are handed out as
+        trajectory_keys (sequence of NestedKey, optional): entries of base transitions to return,
+            e.g. to train the worker. Entries of the env or of the worker, as ``"position"``,
+            ``"skill"``, ``"action_log_prob"`` or ``("next", "reward")``, are returned as
             ``("next", "trajectory", ...)`` of shape ``[*B, T]``, zero after the option's end, with
             ``("next", "trajectory", "mask")``. Default: none.
         base_duration_key (NestedKey, optional): the entry, int64 ``[*B, 1]``, in which the env
             below counts the base steps of each of its steps. Default: that of its
             ``OptionTransform``, else ``duration_key`` or ``"duration"``, if the env has it; without
             one each step is a base step.
-        worker_memory (str): ``"reset"`` (default), so that a recurrent worker begins each option
-            with what its primer says, zeros without one, and the state of the macro env is that of
-            the env alone, or ``"keep"``, so that it begins where the option before ended; the env
-            must then hand its memory on, by a ``TensorDictPrimer`` before this transform.
+        worker_memory (str): memory of a recurrent worker at the start of an option. ``"reset"``
+            (default): the values of its primer, or zeros, so that the state of the macro env is
+            that of the env alone. ``"keep"``: the memory at the end of the last option; the env
+            must then keep it, by a ``TensorDictPrimer`` before this transform.
         skills (Tensor, optional): ``[num_options, D]``, the vector that the worker gets for each
             option, e.g. of :func:`~torchrl_hmcts.modules.spread_skills`. Default: the option's
             number.
@@ -137,6 +144,7 @@ class OptionTransform(HasOptions):
         skills: Tensor | None = None,
     ) -> None:
         for name, part in (("worker", worker), ("termination", termination)):
+            no_class("OptionTransform", name, part)
             if not callable(part) and (part is not None or name == "worker"):
                 raise ValueError(
                     f"OptionTransform needs a {name} that it can call on a tensordict; got "

@@ -110,7 +110,8 @@ def with_constant_specs(env: EnvBase) -> EnvBase:
 
 
 def check_env(transform: HasOptions, env: TransformedEnv) -> None:
-    """Refuse an env in which an option cannot be summed, or whose parts read what is not there."""
+    """Refuse an env whose rewards or steps cannot be summed, or whose parts read missing
+    entries."""
     base = env_name(env)
     if len(env.reward_keys) != 1:
         raise ValueError(
@@ -265,7 +266,7 @@ def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
 
 
 def _check_skills(name: str, transform: HasOptions) -> None:
-    """Refuse a worker that gets numbers and knows vectors, or gets vectors and knows numbers."""
+    """Refuse a worker that needs vectors and gets numbers, or needs numbers and gets vectors."""
     spec, table = getattr(transform.worker, "skill_spec", None), transform.skills
     decisions = getattr(transform.worker, "decision_spec", None)  # of TorchRL's LowLevelController
     if isinstance(decisions, Composite):
@@ -302,9 +303,9 @@ def _check_actions(name: str, env: EnvBase, td: TensorDictBase) -> None:
 
 
 def _find_memory(env: EnvBase, td: TensorDictBase) -> dict[NestedKey, Tensor]:
-    """Return with what the memory that the worker wrote under "next" begins; the root has it.
+    """Return the first values of the memory that the worker wrote under "next"; the root has them.
 
-    That is what the env's primers write at a reset, or zeros.
+    They are those that the env's primers write at a reset, or zeros.
     """
     kept, ndim = td.get("next", None), len(env.batch_size)
     below = set(map(unravel_key, innermost(env).full_observation_spec.keys(True, True)))

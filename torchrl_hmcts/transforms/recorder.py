@@ -21,16 +21,16 @@ from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 class OptionRecorder(EnvTransform):
     r"""Keeps the base transitions that options consist of, wherever the options are taken.
 
-    Appended after an :class:`OptionTransform` that hands out its base transitions, it takes them
-    out of the tensordict and stores those that were taken, each with the option as its skill and
-    the displacement since the option began,
+    Append it after an :class:`OptionTransform` that returns its base transitions. It removes them
+    from the tensordict and stores those that were taken, each with the option as its skill and the
+    displacement since the option began,
 
     .. math:: \Delta_t = x_t - x_{t_0}, \qquad t_0 = \text{the option's first base step}
 
-    as :class:`DisplacementTransform` writes it in the env of a skill's training. What is simulated
-    by a planner is recorded like what is executed, so that search itself feeds the training of its
-    worker. The transitions are kept until :meth:`take` is called. The env gives the same as without
-    it.
+    as :class:`DisplacementTransform` writes it when skills are trained. Transitions that a planner
+    simulates are recorded like those that are executed, so the search yields data to train its
+    worker. The transitions are kept until :meth:`take` is called. The env's output is the same as
+    without the recorder.
 
     Args:
         keys (sequence of NestedKey): entries of a base transition to store, e.g. the ``in_keys`` of

@@ -52,10 +52,10 @@ class SkillTransform(EnvTransform):
         skill_step_key (NestedKey): entry of the steps taken. Default ``"skill_step"``.
         prior (sequence of float, Tensor or SkillPrior, optional): probabilities ``[Z]`` of the
             skills, normalised. Default ``None``: uniform, or as the spec of vectors says. Numbers
-            are kept as the buffer ``prior``. A :class:`~torchrl_hmcts.modules.SkillPrior` is asked
-            at every draw, so that what it has become by then counts, and once a step whether the
-            skill in use was switched off, which ends its mini-episode; it stays its owner's, and is
-            no sub-module of the transform.
+            are kept as the buffer ``prior``. A :class:`~torchrl_hmcts.modules.SkillPrior` is read
+            at every draw, so that its present probabilities count. It is also read once a step: if
+            the skill in use was switched off, the mini-episode ends. It is not a sub-module of the
+            transform.
         seed (int, optional): seed of an own generator, whose state is saved in the state dict.
             Default ``None``: torch's global generator.
 

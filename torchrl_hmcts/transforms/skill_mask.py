@@ -1,4 +1,4 @@
-"""Which options a planner may take while skills are switched on and off."""
+"""The mask of options while skills are switched on and off."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class SkillMaskTransform(EnvTransform):
 
     .. math:: \text{mask}(z) = [\,p(z) > 0\,]
 
-    For a macro environment, whose action is a skill: append it after the
+    It is for a macro environment whose action is a skill: append it after the
     :class:`OptionTransform`. :class:`~torchrl_hmcts.planners.MCTSPlanner` reads the entry by its
-    default ``mask_key``; TorchRL's ``ActionMask`` behind it keeps random actions within it, too.
-    The prior is asked at every step and stays its owner's.
+    default ``mask_key``. TorchRL's ``ActionMask`` behind it restricts random actions, too. The
+    prior is read at every step; it is not a sub-module of the transform.
 
     Args:
         prior (SkillPrior): over the skills, one per option, ``Z``.

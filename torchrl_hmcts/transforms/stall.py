@@ -20,11 +20,11 @@ class StallTransform(EnvTransform):
         n_{t+1} = \begin{cases} n_t + 1 & \text{if } \lVert x_{t+1} - x_t \rVert < \epsilon \\
         0 & \text{else} \end{cases}
 
-    Put it before the :class:`OptionTransform`, whose option a
-    :class:`~torchrl_hmcts.modules.StallTermination` then ends when :math:`n` is large enough. The
-    count travels in the tensordict, so the env stays stateless. It is a read-out, not part of the
-    state: where a tensordict has none, e.g. a state to plan from, the count begins at 0, and since
-    the termination never looks behind the beginning of an option, plans are the same with it.
+    Put it before the :class:`OptionTransform`; a :class:`~torchrl_hmcts.modules.StallTermination`
+    then ends an option when :math:`n` is large enough. The count is kept in the tensordict, so the
+    env stays stateless. It is not part of the state: if a tensordict has none, e.g. a state to plan
+    from, the count begins at 0. Plans do not depend on that, since the termination only counts
+    steps of the present option.
 
     Args:
         in_key (NestedKey): entry ``[*B, ...]`` that should move. Default ``"position"``.

@@ -43,8 +43,8 @@ class PlansGoals(Protocol):
     def plan_goals(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return goals ``[m, L, D]`` and how many of them each plan has, int64 ``[m]``, at least 1.
 
-        ``tensordict`` (batch ``[m]``) holds the states to plan from. ``L`` is any number, other in
-        each call; what stands behind the end of a plan is ignored.
+        ``tensordict`` (batch ``[m]``) holds the states to plan from. ``L`` may differ from call to
+        call; goals behind the end of a plan are ignored.
         """
 
 
@@ -66,12 +66,12 @@ class SubgoalTransform(EnvTransform):
     last goal is met though the episode continues, a new plan is made from :math:`x` before the next
     action. All elements of a batch that need a plan at the same base step get it in one call.
 
-    Writes, in the root and under ``"next"`` (all of it state: the env stays stateless and continues
-    from any tensordict): ``goals_key`` (float32 ``[*B, K D]``, the next K goals, the last one
-    repeated), ``"plan"`` (float32 ``[*B, G, D]``), ``"plan_length"`` and ``"goal_index"`` (int64
-    ``[*B, 1]``), and the counters of the episode ``"num_plans"``, ``"num_goals_met"`` and
-    ``"num_divergences"`` (int64 ``[*B, 1]``). Under ``"next"`` also the worker's reward, in place
-    of the env's own, which moves to ``task_reward_key``.
+    It writes these entries in the root and under ``"next"``. They are part of the state, so the env
+    stays stateless and continues from any tensordict: ``goals_key`` (float32 ``[*B, K D]``, the
+    next K goals, the last one repeated), ``"plan"`` (float32 ``[*B, G, D]``), ``"plan_length"``
+    and ``"goal_index"`` (int64 ``[*B, 1]``), and the counters of the episode ``"num_plans"``,
+    ``"num_goals_met"`` and ``"num_divergences"`` (int64 ``[*B, 1]``). Under ``"next"`` also the
+    worker's reward, in place of the env's own, which moves to ``task_reward_key``.
 
     A reset plans where it resets. ``reset(td, set_state=True)`` to a state that holds a plan keeps
     that plan, to one without a plan makes one.
@@ -86,10 +86,9 @@ class SubgoalTransform(EnvTransform):
             half a tile.
         goal_divergence_threshold (float): :math:`d_\text{div}`; must be larger than the distance of
             one goal to the next. ``math.inf`` never plans again. Default 2 tiles.
-        r_tick (float): reward of every base step. The dissertation gives none. Default -0.025:
-            going to and fro around a corner of Waterworld, where a plan pays for the same goals
-            again, earns 0.020 per base step before it, so that with a smaller one it would pay not
-            to arrive.
+        r_tick (float): reward of every base step. The dissertation gives no number. Default -0.025:
+            a worker that moves back and forth around a corner of Waterworld meets the same goals
+            again and earns 0.020 per base step, so with a smaller cost it would pay not to arrive.
         r_goal_met (float): Default 1.
         r_goal_divergence (float): Default -1.
         num_goals (int): K. Default 3.

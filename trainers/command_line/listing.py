@@ -29,8 +29,7 @@ def show(words: Sequence[str]) -> int:
         elif name == "figures":
             print(figures())
         else:
-            known = {**KITS, **ALL_EXPERIMENTS}
-            print(known[name].describe() if name in known else find_experiment(name).describe())
+            print(find_experiment(name, {**EXPERIMENTS, **ALL_EXPERIMENTS, **KITS}).describe())
     return 0
 
 

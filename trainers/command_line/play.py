@@ -31,11 +31,12 @@ def play(words: Sequence[str]) -> int:
     with told("play", ValueError, FileNotFoundError), printing(own.get("log_level", "info")):
         print(f"hmcts play shows the agent of {own['run']}", flush=True)
         from torchrl_hmcts.trainers.agent import HMCTS
-        from torchrl_hmcts.trainers.runs.console import alive
+        from torchrl_hmcts.trainers.runs.console import alive, say
 
         with alive():
             agent = HMCTS.load(home(own["run"]))
             print(agent)
+            say("Planning and acting ...")
             if out:
                 print(agent.play(seed, out=out))
                 print(f"Film: {out}")

@@ -15,7 +15,7 @@ from typing import Any
 from torchrl_hmcts.trainers.command_line.words import with_parts
 from torchrl_hmcts.trainers.experiments.registry import Experiment
 from torchrl_hmcts.trainers.runs.config import ExperimentError
-from torchrl_hmcts.trainers.runs.run import free_folder, open_run
+from torchrl_hmcts.trainers.runs.run import check_folder, free_folder, open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse
 from torchrl_hmcts.trainers.saving.stopping import Stopped, signals_handled
 
@@ -114,6 +114,8 @@ def run_experiment(
     try:
         with told(name, resume=resume), printing(log_level), signals_handled():
             announced = free_folder(config, experiment.name) if fresh else config.out
+            if not (fresh or config.resume):  # before it is said that the run starts
+                check_folder(config, experiment.name)
             if announced != config.out:
                 print(f"{config.out} holds a run already; this one goes to {announced}.")
             from torchrl_hmcts.trainers.runs.console import alive

@@ -36,8 +36,10 @@ def sweep(words: Sequence[str]) -> int:
         with printing(level):
             print(f"hmcts sweep experiment={experiment.name} starts\n  output  {folder}")
             print(f"  watch   hmcts report {shlex.quote(folder)}   (the trials so far)", flush=True)
-        from torchrl_hmcts.trainers.runs.sweep import Sweep, parse_space
+        from torchrl_hmcts.trainers.runs.sweep import Sweep, optuna, parse_space
 
+        own_words = optuna.logging.INFO if level == "debug" else optuna.logging.WARNING
+        optuna.logging.set_verbosity(own_words)
         space, fixed = parse_space(experiment.config_class, rest)
         others = [*_OWN, "log_level"]
         config = parse_config(experiment, [*fixed, f"out={folder}"], others=others)
@@ -62,7 +64,7 @@ def sweep(words: Sequence[str]) -> int:
     line = ["hmcts", "sweep", *words]
     from torchrl_hmcts.trainers.runs.console import alive
 
-    # Optuna reports each trial; what the trials say is for those who ask for it.
+    # Each trial is reported; what the trials say is for those who ask for it.
     quiet = contextlib.redirect_stdout(io.StringIO())
     try:
         with (
@@ -72,7 +74,7 @@ def sweep(words: Sequence[str]) -> int:
             alive(),
             contextlib.nullcontext() if level == "debug" else quiet,
         ):
-            study = plan.start(trials)
+            study = plan.start(trials, lambda _, trial: _report(trial, objective))
     except KeyboardInterrupt as error:
         _page(plan, study, line)
         print(
@@ -83,6 +85,14 @@ def sweep(words: Sequence[str]) -> int:
         return error.status if isinstance(error, Stopped) else 130
     print(_page(plan, study, line))
     return 0
+
+
+def _report(trial: Any, objective: str) -> None:
+    """Print a line about a trial that has ended."""
+    value = "given up" if trial.value is None else f"{objective} = {trial.value:.4g}"
+    value = f"refused: {trial.user_attrs['refused']}" if "refused" in trial.user_attrs else value
+    keys = " ".join(f"{key}={shown}" for key, shown in trial.params.items())
+    print(f"trial {trial.number}: {keys}: {value}", file=sys.stderr, flush=True)
 
 
 def _page(plan: Any, study: Any, line: Sequence[str]) -> str:

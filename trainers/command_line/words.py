@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from difflib import get_close_matches
 from itertools import product
 from typing import Any
@@ -81,16 +81,28 @@ def with_parts(config: Any, chosen: Sequence[str]) -> Any:
         chosen = [word for word in chosen if word not in first]
     from torch.random import fork_rng
 
-    from torchrl_hmcts.trainers.configs import compose_parts, full
+    from torchrl_hmcts.planners import MCTSPlanner, SearchSettings
+    from torchrl_hmcts.testing import ChainEnv
+    from torchrl_hmcts.trainers.configs import COMPONENTS, compose_parts, full
     from torchrl_hmcts.trainers.experiments.kits import make_kit
     from torchrl_hmcts.trainers.parts import build, differences, merged
 
     own = make_kit(config).parts()
     now = {part: merged(node, getattr(config, part)) for part, node in own.items()}
     composed = compose_parts(now, chosen)
-    for part in composed["planner"].values():  # says what is wrong with a part before all work
+    planner = composed["planner"]  # what is wrong with it is said before all work
+    for name, part in planner.items():
         if isinstance(part, dict) and "_component_" in part:
             build(**part)
+        elif name in COMPONENTS and part is not None:
+            raise ValueError(
+                f"planner.{name} is a part; got {part!r}. Write planner/{name}=NAME "
+                f"({', '.join(COMPONENTS[name])}), or planner.{name}.KEY=VALUE for its keywords."
+            )
+    names = {field.name for field in fields(SearchSettings)}
+    settings = {k: value for k, value in planner.items() if k in names and value is not None}
+    build("torchrl_hmcts.planners.SearchSettings", **settings)
+    MCTSPlanner(ChainEnv(length=2), gamma=planner.get("gamma"), seed=planner.get("seed"))
     config = replace(
         config, **{part: differences(full(own[part]), node) for part, node in composed.items()}
     )

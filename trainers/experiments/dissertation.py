@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchrl_hmcts.trainers.runs.config import unknown_key
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder
 
 _LAB_RUNS = "hmcts train experiment=labmaze seed={seed} out=runs/labmaze_{seed}"
@@ -35,7 +35,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class SourceFigure:
+class DissertationFigure:
     """A figure or table of the dissertation.
 
     ``draws`` names a function ``draw(figure, sources, path) -> caption`` of the module
@@ -68,8 +68,8 @@ class SourceFigure:
         return MissingData("\n".join(lines))
 
 
-def _loss(number: int, curve: str, name: str) -> SourceFigure:
-    return SourceFigure(
+def _loss(number: int, curve: str, name: str) -> DissertationFigure:
+    return DissertationFigure(
         f"4.{number}",
         f"training loss of the worker's {name} (DIAYN)",
         "draw_loss",
@@ -79,9 +79,9 @@ def _loss(number: int, curve: str, name: str) -> SourceFigure:
     )
 
 
-def _game(number: int, game: str) -> SourceFigure:
+def _game(number: int, game: str) -> DissertationFigure:
     command = f"hmcts train experiment=atari game={game} seed={{seed}} out=runs/{game}_{{seed}}"
-    return SourceFigure(
+    return DissertationFigure(
         f"5.{number}",
         f"running score of the episodes that the agent plays in {game}: mean, least and largest "
         "over the seeds; no worker learns here, the learning curve is learning.png of a run",
@@ -94,28 +94,30 @@ def _game(number: int, game: str) -> SourceFigure:
 
 _GAMES = ("BeamRider", "Breakout", "Enduro", "Pong", "Qbert", "Seaquest", "SpaceInvaders")
 _ALL = (
-    SourceFigure(
+    DissertationFigure(
         "3.1", "Waterworld: a random maze with the player and the target", "draw_environments"
     ),
-    SourceFigure("3.2", "Gridworld: the same maze as the manager's tiles", "draw_environments"),
-    SourceFigure(
+    DissertationFigure(
+        "3.2", "Gridworld: the same maze as the manager's tiles", "draw_environments"
+    ),
+    DissertationFigure(
         "3.4", "the tree search over tiles, and the plan it finds in the maze", "draw_tile_search"
     ),
-    SourceFigure(
+    DissertationFigure(
         "3.5",
         "the manager's goals as dots in an episode",
         "draw_goals",
         "drawn afresh with a scripted worker, or with the worker of a run of waterworld_goals",
     ),
-    SourceFigure(
+    DissertationFigure(
         "3.6",
         "training of the goal-based agent and of A3C alone",
         "draw_learning",
         "docs/results/goals/goal_agent.json, or runs of waterworld_goals and waterworld_a3c",
         (_GOAL_RUNS, _A3C_RUNS, "hmcts report figure=3.6 runs/goals_* runs/a3c_*"),
     ),
-    SourceFigure("4.4", "four random mazes of DeepMind Lab as text", "draw_mazes"),
-    SourceFigure(
+    DissertationFigure("4.4", "four random mazes of DeepMind Lab as text", "draw_mazes"),
+    DissertationFigure(
         "4.5",
         "trajectories of the skills: 10 mini-episodes of 100 frames for each",
         "draw_skills",
@@ -126,7 +128,7 @@ _ALL = (
     _loss(7, "qvalue_loss_0", "critic 1"),
     _loss(8, "qvalue_loss_1", "critic 2"),
     _loss(9, "loss_discriminator", "discriminator"),
-    SourceFigure(
+    DissertationFigure(
         "4.10",
         "mean time to solve a maze while the worker learns",
         "draw_solving",
@@ -134,7 +136,7 @@ _ALL = (
         (_LAB_RUNS, "hmcts report figure=4.10 runs/labmaze_*"),
     ),
     *(_game(number, game) for number, game in enumerate(_GAMES, 1)),
-    SourceFigure(
+    DissertationFigure(
         "table5.1",
         "high scores of the hierarchical agent in seven games; beside it Table A.1's baselines",
         "draw_table",
@@ -149,12 +151,11 @@ _ALL = (
 FIGURES = {figure.name: figure for figure in _ALL}
 
 
-def find_figure(name: str) -> SourceFigure:
+def find_figure(name: str) -> DissertationFigure:
     """Return a figure by its number; ``figure_`` or ``Figure `` before it does no harm."""
     short = name.lower().replace("figure", "").replace(" ", "").strip("_")
     if short not in FIGURES:
-        near = difflib.get_close_matches(short, FIGURES, n=3, cutoff=0.5) or FIGURES
-        raise ValueError(f"Unknown figure {name!r}. Did you mean: {', '.join(near)}?")
+        raise ValueError(unknown_key(short, FIGURES, "figure"))
     return FIGURES[short]
 
 

@@ -15,8 +15,8 @@ from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.trainers.experiments.dissertation import (
     FIGURES,
+    DissertationFigure,
     MissingData,
-    SourceFigure,
     Sources,
     find_figure,
 )
@@ -94,14 +94,14 @@ def draw_all(
     return file, lacking
 
 
-def draw_environments(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_environments(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw a test maze as Waterworld and as Gridworld."""
     env = WaterworldMazeEnv(maze_pool("test"), observation=False)
     plot_macro_env(env, make_starts(env, _MAZES, seed=0)[3], path)
     return "A test maze, drawn afresh: as Waterworld (Figure 3.1) and as Gridworld (Figure 3.2)."
 
 
-def draw_tile_search(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_tile_search(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw the search over tiles in a test maze."""
     env = WaterworldMazeEnv(maze_pool("test"), observation=False)
     state = make_starts(env, _MAZES, seed=0)[3]
@@ -113,7 +113,7 @@ def draw_tile_search(figure: SourceFigure, sources: Sources, path: Path) -> str:
     return "The manager's search over tiles in a test maze, made afresh, and its plan."
 
 
-def draw_goals(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_goals(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw an episode with its goals, of the worker of a run or of the scripted one."""
     runs = sources.of("waterworld_goals")
     worker: Any = ScriptedExpert()
@@ -134,7 +134,7 @@ def draw_goals(figure: SourceFigure, sources: Sources, path: Path) -> str:
     return f"An episode of {whose} in a test maze: the goals (red) that are still to be met."
 
 
-def draw_learning(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_learning(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw the test curves of the agents with and without goals."""
     entries = {"solved_share": "eval_solved_share", "episode_steps": "eval_episode_steps"}
     curves: dict[str, list[dict[str, Any]]] = {}
@@ -164,13 +164,13 @@ def draw_learning(figure: SourceFigure, sources: Sources, path: Path) -> str:
     return caption
 
 
-def draw_mazes(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_mazes(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw four test mazes as text and from above."""
     plot_mazes(make_lab_env(held_out_seeds(4)), path)
     return "Four test mazes, made afresh from their seeds."
 
 
-def draw_skills(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_skills(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw the trajectories of the skills of a run's worker."""
     runs = sources.of("labmaze")
     if runs:
@@ -191,7 +191,7 @@ def draw_skills(figure: SourceFigure, sources: Sources, path: Path) -> str:
     return "The skills of a worker with seed 0 (docs/results): 10 mini-episodes of 100 frames each."
 
 
-def draw_loss(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_loss(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw a loss of the worker while it learns: mean, least and largest over the seeds."""
     runs = [run.curves for run in _alike(sources)]
     measured = sources.result("lab/curves.csv")
@@ -215,7 +215,7 @@ def draw_loss(figure: SourceFigure, sources: Sources, path: Path) -> str:
     )
 
 
-def draw_solving(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_solving(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw frames of an episode in held-out mazes against frames of training."""
     runs = _alike(sources)
     entries = {"frames": "frames", "solved": "solved"}
@@ -241,7 +241,7 @@ def draw_solving(figure: SourceFigure, sources: Sources, path: Path) -> str:
     return f"Frames to solve a held-out maze while the worker learns; {where}."
 
 
-def draw_scores(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_scores(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Draw the scores in a game against emulated steps."""
     caption = draw_game(
         read_scores(sources.of("atari"), sources.result("atari")), path, figure.argument
@@ -251,7 +251,7 @@ def draw_scores(figure: SourceFigure, sources: Sources, path: Path) -> str:
     return caption
 
 
-def draw_table(figure: SourceFigure, sources: Sources, path: Path) -> str:
+def draw_table(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     """Write Table 5.1 with our scores beside the dissertation's."""
     rows = read_scores(sources.of("atari"), sources.result("atari"))
     if not rows:

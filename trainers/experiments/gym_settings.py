@@ -38,7 +38,8 @@ class GymConfig(SkillsConfig):
     option_steps: int = 0  # type: ignore[misc]
     """Base steps of an option; 0: found by a short look at the env."""
     skill_steps: int = 0  # type: ignore[misc]
-    """Base steps of a mini-episode in training; 0: those of an option, so that skills part soon."""
+    """Base steps of a mini-episode in training; 0: those of an option, so that skills soon become
+    different."""
     novelty_radius: float = 0.0
     """Distance between features within which a state counts as visited; 0: half of how far an
     action that is repeated moves them, three quarters of how far a skill does."""

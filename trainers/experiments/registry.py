@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from fnmatch import fnmatch
 from typing import Any
 
-from torchrl_hmcts.trainers.runs.config import config_keys
+from torchrl_hmcts.trainers.runs.config import config_keys, unknown_key
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder
 
 
@@ -94,7 +94,8 @@ class Experiment:
         """Return its keys with their defaults and meaning, a line or two each."""
         lines = []
         for key, (default, meaning) in config_keys(self.config_class).items():
-            lines.append(f"  {key}.KEY=VALUE" if default == {} else f"  {key}={default}")
+            shown = str(default).lower() if isinstance(default, bool) else default
+            lines.append(f"  {key}.KEY=VALUE" if default == {} else f"  {key}={shown}")
             indent = " " * 6
             lines += textwrap.wrap(meaning, 92, initial_indent=indent, subsequent_indent=indent)
         return "\n".join(lines)
@@ -236,9 +237,7 @@ def find_experiment(name: str, among: Mapping[str, Experiment] = EXPERIMENTS) ->
         ValueError: Unknown experiment 'labmaz'. Did you mean: labmaze...
     """
     if name not in among:
-        near = difflib.get_close_matches(name, among, n=3, cutoff=0.4) or among
-        what = "kit" if among is KITS else "experiment"
-        raise ValueError(f"Unknown {what} {name!r}. Did you mean: {', '.join(near)}?")
+        raise ValueError(unknown_key(name, among, "kit" if among is KITS else "experiment"))
     return among[name]
 
 

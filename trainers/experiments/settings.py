@@ -54,10 +54,9 @@ class SkillsConfig(RunConfig):
     planner.KEY=VALUE, planner.PART.KEY=VALUE. They hold for Algorithm 3's training rounds too, but
     the expansions of those are round_expansions."""
     manager: str = "novelty"
-    """Manager: "novelty" (UCT that refuses places it knows), "source" (the
-    dissertation's four stages: UCT with a random simulation from each new node, no novelty test),
-    or "learned" (prior and value learned from searches in training mazes, carried to the test
-    mazes)."""
+    """Manager: "novelty" (UCT with a novelty test), "four_stages" (the dissertation's: UCT with a
+    random simulation from each new node, no novelty test), or "learned" (prior and value, learned
+    from searches in training mazes, guide the search in test mazes)."""
     manager_searches: int = 400
     """Training searches in each of the four iterations of manager=learned."""
     num_skills: int = 4
@@ -115,7 +114,7 @@ class SkillsConfig(RunConfig):
     CHOICES = {
         "options": ("learned", "actions"),
         "algorithm": ("diayn", "hmcts"),
-        "manager": ("novelty", "source", "learned"),
+        "manager": ("novelty", "four_stages", "learned"),
         "features": ("place", "learned", "none"),
         "keep": ("best", "last"),
         "collector": ("local", "ray"),
@@ -177,7 +176,7 @@ class DemoConfig(SkillsConfig):
     task: str = "maze"
     """Task: "maze" (reach the target), "boat" (the same with a body that must turn
     to where it goes), "apples" (collect what is worth most before the fuel is spent) or "key" (the
-    target is shut to who has not taken the key)."""
+    target opens when the key has been taken)."""
     size: int = 9
     """Tiles along a side of the test mazes: 9, 15 or 31. Skills are learned in mazes of 9."""
     search_steps: int = 0
@@ -185,8 +184,8 @@ class DemoConfig(SkillsConfig):
     option_steps: int = 0  # type: ignore[misc]
     """Base steps of an option (the dissertation's N_worker_samples); 0: 25, for a boat 40."""
     skill_steps: int = 0  # type: ignore[misc]
-    """Base steps of a mini-episode in training: long enough for the skills to part; 0: 50, for a
-    boat 40."""
+    """Base steps of a mini-episode in training: long enough that skills become different; 0: 50,
+    for a boat 40."""
     train_base_steps: int = 0
     """Base steps of worker training in the training mazes; 0: 40,000, for a boat 80,000."""
     updates_per_step: float = 0.0
@@ -231,8 +230,10 @@ class DemoConfig(SkillsConfig):
         """Return the configuration that is run: with ``toy`` a small one."""
         if not self.toy:
             return self
-        few = {"mazes": min(3, self.mazes), "manager_searches": min(2, self.manager_searches)}
-        return dataclasses.replace(self, train_base_steps=1_920, **few)
+        searches = min(2, self.manager_searches)
+        return dataclasses.replace(
+            self, train_base_steps=1_920, mazes=min(3, self.mazes), manager_searches=searches
+        )
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -78,7 +79,7 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
     torch.set_num_threads(1)  # the networks are small: threads would only get in each other's way
     kit = make_kit(config)
     if found := kit.describe():
-        print(found)
+        print(textwrap.fill(found, console.WIDTH))
     begin = time.perf_counter()
     logger = make_logger(config)
     learned = learn(
@@ -169,7 +170,7 @@ def learn(
     logger: Logger | None = None,
     resume: bool = False,
 ) -> LearnedSkills:
-    """Train a worker as the configuration of the kit says.
+    """Train a worker by the configuration of the kit.
 
     Args:
         kit: whose env it learns in.
@@ -244,13 +245,19 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
                 f"{folder} holds an agent whose options are given (options={config['options']}), "
                 "not learned: it has no skills. Pass the folder of one that has learned."
             ) from None
+        words = [
+            f"{key} was {config[key]} and is {getattr(kit.config, key)} here."
+            for key in ("num_skills", "hidden")
+            if key in config and config[key] != getattr(kit.config, key, None)
+        ]
         theirs, ours = config.get("id"), getattr(kit.config, "id", None)
-        if isinstance(error, ValueError) and theirs != ours:
-            raise ValueError(
-                f"{error} They were learned in {theirs}; {ours} may have other observations or "
-                "actions."
-            ) from None
-        raise
+        if theirs != ours:
+            words.append(
+                f"They were learned in {theirs}; {ours} may have other observations or actions."
+            )
+        if not words or isinstance(error, FileNotFoundError):
+            raise
+        raise ValueError(" ".join([str(error), *words])) from None
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     step = int("".join(filter(str.isdigit, path.stem)) or 0)
     return LearnedSkills(worker, loss, {}, RoundRecords(), step, step, 0, 0.0)

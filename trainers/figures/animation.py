@@ -53,7 +53,13 @@ def write_gif(
     if last is not None:
         durations[-1] += last - milliseconds
     shown: float | list[float] = durations if len(kept) > 1 else durations[0]
-    import imageio.v3 as iio  # here, so that a run without it loses no more than the picture
+    try:
+        import imageio.v3 as iio  # here, so that a run without it loses no more than the picture
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "Films need imageio, which is not installed: pip install 'torchrl_hmcts[train]'.",
+            name="imageio",
+        ) from error
 
     with replacing(path) as temporary:  # written here: after an error imageio would try again
         content = iio.imwrite("<bytes>", np.stack(kept), extension=".gif", duration=shown, loop=0)

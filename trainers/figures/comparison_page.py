@@ -21,7 +21,14 @@ from torchrl_hmcts.trainers.figures.pages import (
     write_sections,
 )
 from torchrl_hmcts.trainers.figures.pictures import COLORS, refuse_foreign
-from torchrl_hmcts.trainers.figures.run_page import config_tables, damage_of, facts_of, say_damage
+from torchrl_hmcts.trainers.figures.run_page import (
+    config_tables,
+    curve_sections,
+    damage_of,
+    facts_of,
+    say_damage,
+    telling,
+)
 from torchrl_hmcts.trainers.saving.files import left_out
 from torchrl_hmcts.trainers.saving.run_folder import RunFolder, flat, is_run
 
@@ -112,7 +119,7 @@ def _sections(groups: Sequence[RunGroup]) -> list[Section]:
             tables=figures or ([] if alone else [Table([["No run has finished."]])]),
             inside=[Section("Figures that one group alone has", tables=alone, folded=True)],
         ),
-        Section("Curves", words=[lines] * several, panels=_panels(groups)),
+        *curve_sections(_panels(groups), [lines] * several),
         Section("Pictures", inside=_pictures(groups)),
         Section("Config", tables=_differing(groups), inside=[_config(group) for group in groups]),
         Section(
@@ -175,8 +182,7 @@ def _panels(groups: Sequence[RunGroup]) -> list[Picture]:
         from torchrl_hmcts.trainers.figures.curves import panel  # loads matplotlib
 
         found = [c for group in groups for run in group.runs for c in run.curves.values()]
-        labels = {curve.name: curve.step_label for curve in found if len(curve.steps) > 1}
-        for name, label in labels.items():
+        for name, label in telling(found).items():
             curves = [
                 [(c.steps, c.values) for run in group.runs if (c := run.curves.get(name))]
                 for group in groups

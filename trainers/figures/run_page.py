@@ -6,12 +6,13 @@ import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.figures.pages import (
     Cell,
+    Picture,
     Section,
     Table,
     drawing,
@@ -21,7 +22,13 @@ from torchrl_hmcts.trainers.figures.pages import (
 )
 from torchrl_hmcts.trainers.figures.pictures import Pictures, refuse_foreign
 from torchrl_hmcts.trainers.saving.files import left_out, write_json
-from torchrl_hmcts.trainers.saving.run_folder import RunFolder, is_run, read_run, shown_path
+from torchrl_hmcts.trainers.saving.run_folder import (
+    RunCurve,
+    RunFolder,
+    is_run,
+    read_run,
+    shown_path,
+)
 
 _LEADING = 4  # curves that a page leads with; the others are folded
 _DECIDING = (  # the first of these that a run has
@@ -105,18 +112,32 @@ def say_damage(*runs: RunFolder) -> None:
             print(sentence, file=sys.stderr)
 
 
+def telling(curves: Iterable[RunCurve]) -> dict[str, str]:
+    """Return names of curves worth a panel, those that decide first, and labels of their steps."""
+    from torchrl_hmcts.trainers.figures.curves import says_something
+
+    labels = {c.name: c.step_label for c in curves if says_something(c.steps, c.values)}
+    rank = {name: i for i, name in enumerate(_DECIDING)}
+    return {name: labels[name] for name in sorted(labels, key=lambda n: rank.get(n, len(rank)))}
+
+
+def curve_sections(panels: Sequence[Picture], words: Sequence[str] = ()) -> list[Section]:
+    """Return the leading panels, and the others folded."""
+    return [
+        Section("Curves", words=list(words) if panels else [], panels=panels[:_LEADING]),
+        Section("All other curves", panels=panels[_LEADING:], folded=True),
+    ]
+
+
 def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
     """Return what stands on the page of a run."""
     panels = []
     with left_out("the curves of the page"):
-        from torchrl_hmcts.trainers.figures.curves import panel, says_something  # loads matplotlib
+        from torchrl_hmcts.trainers.figures.curves import panel  # loads matplotlib
 
-        told = {n: c for n, c in run.curves.items() if says_something(c.steps, c.values)}
-        rank = {name: i for i, name in enumerate(_DECIDING)}
-        panels += [
-            drawing(panel(name, [[(curve.steps, curve.values)]], curve.step_label), name)
-            for name, curve in sorted(told.items(), key=lambda item: rank.get(item[0], len(rank)))
-        ]
+        for name, label in telling(run.curves.values()).items():
+            curve = run.curves[name]
+            panels.append(drawing(panel(name, [[(curve.steps, curve.values)]], label), name))
     files = run.pictures.items()
     facts = {**facts_of(run), "status": run.status}
     resume = []
@@ -130,8 +151,7 @@ def run_sections(run: RunFolder, *, embed: bool = False) -> list[Section]:
         ),
         Section("Figures", columns=result_tables(run.metrics)),
         Section("Evaluated again", inside=[_evaluation(e) for e in run.evaluations]),
-        Section("Curves", panels=panels[:_LEADING]),
-        Section("All other curves", panels=panels[_LEADING:], folded=True),
+        *curve_sections(panels),
         Section("Config", tables=config_tables(run)),
         Section("Continue it with", code=resume),
         Section(

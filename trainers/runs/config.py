@@ -10,7 +10,7 @@ import math
 import numbers
 import os
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, ClassVar, TypeVar
 
@@ -253,19 +253,21 @@ def read_value(key: str, value: str, kind: str) -> Any:
         raise ValueError(f"{key} must be {_NUMBERS[kind][2]}; got {value!r}.") from None
 
 
-def unknown_key(key: str, known: Sequence[str]) -> str:
-    """Return the sentence that refuses a key and names the nearest ones.
+def unknown_key(key: str, known: Iterable[str], what: str = "key") -> str:
+    """Return the sentence that refuses a word and names the nearest ones.
 
     Args:
         key: what was typed.
         known: all keys.
+        what: the words are, e.g. ``"kit"``.
 
     Example:
         >>> unknown_key("sede", ["seed", "out"])
         "Unknown key 'sede'. Did you mean: seed?"
     """
-    near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or list(known)
-    return f"Unknown key {key!r}. Did you mean: {', '.join(near)}?"
+    known = list(known)
+    near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or known
+    return f"Unknown {what} {key!r}. Did you mean: {', '.join(near)}?"
 
 
 def key_kinds(config_class: type) -> dict[str, str]:

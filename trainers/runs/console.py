@@ -19,10 +19,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-INTERVAL = 10.0  # seconds between two signs of life
+INTERVAL = 9.0  # seconds between two signs of life; looked at every second
 WIDTH = 79
 _NAME_WIDTH = 46
 
+_BAR = (
+    "{desc}: {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt}{unit} [{elapsed}<{remaining}{postfix}]"
+)
+_BAR_WIDTH = 12  # at least
 _LINE = "{desc}: {percentage:.0f} % ({n_fmt} of {total_fmt}{unit}) in {elapsed}{postfix}"
 
 
@@ -57,8 +61,8 @@ class Bar(tqdm):
         self.scale, self.shown = scale, True  # before tqdm shows it for the first time
         self.lines = not sys.stderr.isatty()
         options: dict[str, Any] = {"file": io.StringIO(), "mininterval": 1.0} if self.lines else {}
-        if self.lines and total is not None:
-            options["bar_format"] = _LINE
+        if total is not None:
+            options["bar_format"] = _LINE if self.lines else _BAR
         super().__init__(
             total=None if total is None else total * scale,
             desc=desc,
@@ -80,8 +84,14 @@ class Bar(tqdm):
         return super().update(moved)
 
     def set_postfix(self, *_: Any, refresh: bool = True, **figures: Any) -> None:
-        """Show figures beside it; those that are no number yet are left out."""
-        shown = {name: value for name, value in figures.items() if _is_known(value)}
+        """Show the first figures beside it, as many as fit; unknown numbers are left out."""
+        room = WIDTH - _BAR_WIDTH - len(f"{self.desc}{self.unit}: 100 %|| [00:00<00:00]")
+        room -= 2 * len(str(self.total)) + 2
+        shown = {}
+        for name, value in figures.items():
+            room -= len(f", {name}={value}")
+            if _is_known(value) and room >= 0:
+                shown[name] = value
         super().set_postfix(refresh=refresh, **shown)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:

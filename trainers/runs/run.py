@@ -192,11 +192,11 @@ def _take(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool
         chosen = dataclasses.replace(config, out=out) if fresh else config
         try:
             with contextlib.ExitStack() as locked:
-                _check_folder(chosen, experiment)
+                check_folder(chosen, experiment)
                 # `resume` has one: a folder that it would make is refused above.
                 Path(out).mkdir(parents=True, exist_ok=True)
                 locked.enter_context(folder_locked(out))
-                _check_folder(chosen, experiment)  # another may have written there meanwhile
+                check_folder(chosen, experiment)  # another may have written there meanwhile
                 stack.push(locked.pop_all())
             return chosen
         except (FolderRefused, FolderInUse):
@@ -214,7 +214,7 @@ def free_folder(config: Any, experiment: str) -> str:
     """
     for out in _names(config.out):
         try:
-            _check_folder(dataclasses.replace(config, out=out), experiment)
+            check_folder(dataclasses.replace(config, out=out), experiment)
         except FolderRefused:
             continue
         return out
@@ -240,8 +240,13 @@ def next_free(out: str) -> str:
     return str(next(p for p in paths if not (p.is_file() or (p.is_dir() and any(p.iterdir())))))
 
 
-def _check_folder(config: Any, experiment: str) -> None:
-    """Refuse a folder in which a run of this configuration would lose or mix up something."""
+def check_folder(config: Any, experiment: str) -> None:
+    """Refuse a folder in which a run of this configuration would lose or mix up something.
+
+    Args:
+        config: of the run; its folder is ``out``.
+        experiment: its name.
+    """
     path = Path(config.out)
     if path.exists() and not path.is_dir():
         raise FolderRefused(
@@ -271,8 +276,9 @@ def _check_folder(config: Any, experiment: str) -> None:
         )
     seed = "" if run.seed is None else f", seed {run.seed}"
     status = f"{run.status or ('finished' if run.metrics else 'unfinished')} run"
+    status = f"{'an' if status[0] in 'aeiou' else 'a'} {status}"
     raise FolderRefused(
-        f"{path} holds a {status}{f' of {run.experiment}' if run.experiment else ''}{seed} "
+        f"{path} holds {status}{f' of {run.experiment}' if run.experiment else ''}{seed} "
         f"({_some(there)}). Continue it with: {resume_command(config.out)}; replace it with "
         f"overwrite=true; or choose another folder, e.g. {_word('out', other)}."
     )

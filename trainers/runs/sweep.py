@@ -221,18 +221,21 @@ class Sweep:
             noted = json.loads((self.folder / "sweep.json").read_text()).get("study", "")
         return noted if noted in names else f"{self.name}-{self.folder.name}"
 
-    def start(self, trials: int) -> optuna.Study:
+    def start(
+        self, trials: int, ended: Callable[[optuna.Study, FrozenTrial], None] | None = None
+    ) -> optuna.Study:
         """Run trials until so many are finished, those of earlier calls included.
 
         A trial that was stopped, or whose process died, is continued first.
 
         Args:
             trials: finished ones in all.
+            ended: called after each trial.
         """
         study = self.study()
         self._take_up(study)
         while sum(t.state in _FINISHED for t in study.get_trials(deepcopy=False)) < trials:
-            study.optimize(self._trial, n_trials=1)
+            study.optimize(self._trial, n_trials=1, callbacks=[ended] if ended else None)
         return study
 
     def _take_up(self, study: optuna.Study) -> None:

@@ -264,7 +264,7 @@ class DurableRotation(CheckpointRotation):
         return _newest_whole(self.directory)
 
     def prune(self) -> tuple[Path, ...]:
-        """Remove what is older than the ``keep_last`` newest whole checkpoints; return it."""
+        """Remove checkpoints older than the ``keep_last`` newest whole ones; return them."""
         whole, removed = 0, []
         for path in reversed(self.checkpoints()):
             if whole == self.keep_last:

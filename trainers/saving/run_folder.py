@@ -122,9 +122,12 @@ def read_run(path: str | Path) -> RunFolder:
     record = _json(path / "run.json", damage, config=dict, commands=list, versions=dict)
     metrics = _json(path / "metrics.json", damage, config=dict, versions=dict)
     if not record and not metrics and not damage:
+        why = "has neither run.json nor metrics.json" if path.exists() else "does not exist"
+        runs = sorted(str(file.parent) for file in path.glob("*/run.json"))
+        inside = f" It holds the runs {', '.join(runs)}." if runs else ""
         raise ValueError(
-            f"{path} is no folder of a run: it has neither run.json nor metrics.json. Pass the "
-            "folder that was given as out=DIR."
+            f"{str(path)!r} is no folder of a run: it {why}. Pass the folder that was given as "
+            f"out=DIR, or to HMCTS.save.{inside}"
         )
     if not record:  # of a run that was not started by the command line
         record = {name: metrics.get(name, {}) for name in ("config", "versions")}

@@ -72,7 +72,7 @@ class RunningEpisodes:
         return bool(env._supports_set_state or not env.batch_locked)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the episodes as they stand: their entries, and what the collector counts."""
+        """Return the present episodes: their entries, and the collector's counts."""
         carrier = self.collector._carrier  # nothing public says where the episodes stand
         state: dict[str, Any] = {
             "batch_size": list(carrier.batch_size),

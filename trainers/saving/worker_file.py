@@ -6,6 +6,7 @@ The page of the run shows them, and ``hmcts evaluate`` tests them.
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 from torchrl.checkpoint import CheckpointError
@@ -49,8 +50,8 @@ def save_worker(run: str | Path, loss_module: LossModule, step: int) -> Path:
 def find_worker(run: str | Path) -> Path:
     """Return the file that holds a run's networks: its worker, or its newest checkpoint.
 
-    A run that has not finished, or is of an older version, has no worker file; nor is one taken
-    that is damaged.
+    A run that has not finished, or is of an older version, has no worker file. A line on stderr
+    names one that is damaged.
 
     Args:
         run: the run's folder.
@@ -65,9 +66,14 @@ def find_worker(run: str | Path) -> Path:
         over = True
     if over and (run / "worker").is_dir():
         workers = [p for p in (run / "worker").iterdir() if _NAME.fullmatch(p.name)]
-        whole = [path for path in workers if find_damage(path) is None]
-        if whole:
-            return max(whole)
+        for path in sorted(workers, reverse=True):
+            damage = find_damage(path)
+            if damage is None:
+                return path
+            print(
+                f"{path} is damaged ({damage}). Taking the networks of the newest checkpoint.",
+                file=sys.stderr,
+            )
     return newest_checkpoint(run / "checkpoints")
 
 
@@ -91,7 +97,6 @@ def load_networks(loss_module: LossModule, run: str | Path) -> Path:
     except CheckpointError as error:
         raise ValueError(
             f"The networks of {path} are not those of this configuration. Leave the keys that "
-            "shape them (num_skills, hidden, ...) as they were. "
-            + str(error).partition(" in tensordict")[0]
-        ) from None
+            "shape them (num_skills, hidden, ...) as they were."
+        ) from error
     return path

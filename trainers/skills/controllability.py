@@ -118,7 +118,7 @@ def probe_controllability(
     neutral: int = 0,
     **thresholds: float,
 ) -> Controllability:
-    r"""Take every action in every state and look which features it changed.
+    r"""Take every action in every state and compare which features it changes.
 
     .. math:: e_{a f} = \frac{1}{S} \sum_s \Delta_f(s, a) - \Delta_f(s, a_0)
 

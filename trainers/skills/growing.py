@@ -96,7 +96,7 @@ def _num_places(search: Search) -> np.ndarray:
 
 
 class GrowSkills(TrainerHookBase):
-    r"""Switches on one skill after the other while they add coverage, then goes back to the best.
+    r"""Switches on one skill after the other while they add coverage, then returns to the best.
 
     .. math:: C_n \ge (1 + g_{\min})\, C_{n^*} \;\Rightarrow\; n^* \leftarrow n
 
@@ -235,7 +235,7 @@ class GrowSkills(TrainerHookBase):
         return {"num_active_skills": float(self.prior.active().sum())}
 
     def saturated(self) -> bool:
-        """Returns whether the accuracy has stopped to rise."""
+        """Returns whether the accuracy no longer rises."""
         if len(self._accuracies) < self.window:
             return False
         half = self.window // 2
@@ -310,7 +310,7 @@ class GrowSkills(TrainerHookBase):
             self.dropped.append(useless)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the prior's state, how far growing has come, the best weights, the history."""
+        """Returns the prior's state, the progress of growing, the best weights, the history."""
         return {
             "prior": self.prior.state_dict(),
             "finished": self.finished,

@@ -11,7 +11,7 @@ from torchrl_hmcts.transforms import SkillReward
 
 
 class SkillRewardHook(TrainerHookBase):
-    r"""Rewards what a trainer samples with the objective of the trainer's own loss.
+    r"""Rewards a trainer's samples by the objective of its own loss.
 
     It appends a :class:`~torchrl_hmcts.transforms.SkillReward` to the trainer's replay buffer. Use
     it where loss and buffer are built apart, as TorchRL's trainer configs do; where both are at

@@ -81,7 +81,7 @@ class AtariSearch:
         return max(1, round(self.ratio * option_steps))
 
     def settings(self, reward_scale: float = 1.0) -> SearchSettings:
-        """Return what a search is set to.
+        """Return the settings of a search.
 
         Args:
             reward_scale: what there is to gain, in units of which UCT explores.

@@ -34,7 +34,7 @@ from torchrl_hmcts.transforms import SkillReward
 
 
 class OptionGoals(SkillObjective):
-    r"""Rewards an option for doing what it is for. Nothing is learned.
+    r"""Rewards an option for its own goal. Nothing is learned.
 
     .. math:: r(s, z, a, s') = \begin{cases}
         \max(0,\; 1 - |x'_c - x'_b - o| / \kappa) & \text{z brings byte c to byte b plus o} \\

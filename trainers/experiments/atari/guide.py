@@ -38,7 +38,7 @@ class _TwoHeads(nn.Module):
 
 
 class SearchGuide:
-    r"""Learns from every search of an agent, and guides the ones after it.
+    r"""Learns from every search of an agent, and guides the later ones.
 
     A network reads the RAM and gives the prior of PUCT and the values of leaves. After every
     decision the nodes of the tree with ``min_visits`` become examples: visits as the policy's

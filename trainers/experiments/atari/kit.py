@@ -23,7 +23,7 @@ _STICKY_SEED = 7_654_321  # of emulators to play in, which the planner must not 
 
 @dataclass(frozen=True)
 class AtariKit:
-    """An Atari game: what a search for options, a training and an agent make of it.
+    """An Atari game: its pools, training envs and starts.
 
     An episode begins with some frames of doing nothing, up to four seconds, and five random
     actions. The frames are an odd number in the split ``"train"``, where options are probed,

@@ -34,7 +34,7 @@ class Training:
 
 @dataclass
 class Options:
-    """The options a source has found.
+    """The options that a source has found.
 
     Attributes:
         worker: executes them.
@@ -60,7 +60,7 @@ class Options:
     training: Training | None = field(default=None, repr=False, compare=False)
 
     def plain(self) -> dict[str, Any]:
-        """Return the options as plain data and tensors, without what they were trained with.
+        """Return the options as plain data and tensors, without their training data.
 
         Raises:
             TypeError: if the worker is of a kind of your own.

@@ -22,6 +22,7 @@ from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import LossModule
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.planners import PUCT, MCTSPlanner, PolicyValueEvaluator
 from torchrl_hmcts.trainers.diayn import worker_losses
 from torchrl_hmcts.trainers.evaluation import (
@@ -210,12 +211,12 @@ class Kit:
                 self.config = replace(self.config, novelty_radius=RADIUS_SHARE * reach)
 
     def reach(self, simulator: EnvBase, starts: TensorDictBase) -> float:
-        """Return how far options move what the novelty test compares, see :func:`option_reach`."""
+        """Return how far options move the novelty test's features, see :func:`option_reach`."""
         novelty: Any = self.make_planner(simulator).novelty
         return option_reach(simulator, starts, novelty.features, self.config.num_skills)
 
     def note(self, loss: LossModule) -> None:
-        """Take note of the networks that are learned: what ``features="learned"`` compares."""
+        """Take note of the learned networks, which ``features="learned"`` compares."""
         objective: Any = getattr(loss, "objective", None)
         network = getattr(objective, "encoder", getattr(objective, "discriminator", None))
         self._encoder = network
@@ -258,7 +259,7 @@ class Kit:
     def planner_part(self) -> dict[str, Any]:
         """Return the entries of the planner at the kit's defaults, by keyword."""
         config = self.config
-        if config.manager == "source":
+        if config.manager == "four_stages":
             return four_stages(config.expansions)
         return {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
@@ -307,7 +308,7 @@ class Kit:
 
     @property
     def manager_keys(self) -> Sequence[NestedKey]:
-        """Entries of the states of which a network for the manager can learn; none: none."""
+        """Entries of the states that a network for the manager reads; empty if there is none."""
         return ()
 
     def make_round_planner(self, simulator: EnvBase, **own: Any) -> MCTSPlanner:
@@ -317,7 +318,7 @@ class Kit:
             simulator: the macro env to plan in.
             **own: what the trainer sets; another ``tree_policy`` of the configuration goes first.
         """
-        bare = {
+        bare: dict[str, Any] = {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
             "novelty": self.planner_part().get("novelty"),
             "budget": {"_component_": "torchrl_hmcts.planners.SearchBudget"},
@@ -330,7 +331,7 @@ class Kit:
         return planner
 
     def second_try(self) -> Kit | None:
-        """Return the kit with which starts are searched again that have no plan; None for none."""
+        """Return the kit with which starts without a plan are searched again; None for none."""
         return None
 
     def manager_network(
@@ -379,7 +380,7 @@ class Kit:
         )
 
     def describe(self) -> str:
-        """Return what the kit has found out of the env by itself, for the beginning of a run."""
+        """Return what the kit found out about the env, to print at the beginning of a run."""
         return ""
 
     def act_by(self, policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase) -> Results:
@@ -435,7 +436,7 @@ class Kit:
         }
 
     def map(self, env: EnvBase) -> Any:
-        """Return what draws the states of a base env; None where there is no map.
+        """Return a map that draws the states of a base env; None if there is none.
 
         See :class:`~torchrl_hmcts.trainers.figures.maps.MapDrawing`.
         """
@@ -511,6 +512,7 @@ def make_kit(config: SkillsConfig, *env: Any) -> Kit:
         >>> type(make_kit(DemoConfig())).__name__
         'WaterworldKit'
     """
+    instance("make_kit", "config", config, SkillsConfig)
     path = f"{__name__}.{KITS[config.KIT]}"
     module, _, name = path.rpartition(".")
     kit: Kit = getattr(importlib.import_module(module), name)(config, *env)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
@@ -37,6 +39,7 @@ from torchrl_hmcts.trainers.experiments.kits import RADIUS_SHARE, Kit, Trial
 from torchrl_hmcts.trainers.experiments.kits.feature_goals import find_goals
 from torchrl_hmcts.trainers.experiments.kits.film import Film
 from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
+from torchrl_hmcts.trainers.runs.console import WIDTH
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 _PLAYED = 1_000_003  # added to the seed of envs to act in
@@ -422,12 +425,16 @@ class GymKit(Kit):
     def _draws_itself(self) -> bool:
         """Whether the env can draw here; what hinders it is printed."""
         try:
-            env = self._env(**{**self.config.make, "render_mode": "rgb_array"})
-            env.reset(seed=0)
-            picture = env.render()
-            env.close()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # GLFW's, where there is no display
+                env = self._env(**{**self.config.make, "render_mode": "rgb_array"})
+                env.reset(seed=0)
+                picture = env.render()
+                env.close()
         except Exception as error:
-            print(f"{self.gym_env} cannot draw itself here ({error}): its features are drawn.")
+            name, why = self.config.id or self.gym_env, str(error).partition(",")[0]
+            words = f"{name} cannot draw itself here ({why}): its features are drawn."
+            print(textwrap.fill(words, WIDTH))
             return False
         return isinstance(picture, np.ndarray)
 

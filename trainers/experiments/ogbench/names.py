@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import NamedTuple
+
+from torchrl_hmcts.trainers.runs.config import unknown_key
 
 
 class Recipe(NamedTuple):
@@ -65,6 +66,5 @@ def split_name(name: str) -> Recipe:
         ('pointmaze-giant-v0', 'navigate', 500, 2001)
     """
     if name not in RECIPES:
-        near = difflib.get_close_matches(name, RECIPES, n=3, cutoff=0.4) or RECIPES
-        raise ValueError(f"Unknown dataset {name!r}. Did you mean: {', '.join(near)}?")
+        raise ValueError(unknown_key(name, RECIPES, "dataset"))
     return RECIPES[name]

@@ -110,7 +110,7 @@ def play_mazes(
 
 @dataclass
 class GoalTrack:
-    """One episode to draw: where the player was, and the plans it was given.
+    """One episode to draw: the player's positions and plans.
 
     Attributes:
         positions (array): float ``[L + 1, 2]``, before and after each base step, in tiles.

@@ -16,7 +16,7 @@ from torchrl_hmcts.checks import real_number
 
 
 class ScriptedExpert(TensorDictModuleBase):
-    r"""Thrusts along the axis on which the velocity is furthest from what the goals ask for.
+    r"""Thrusts along the axis on which the velocity is furthest from the wanted one.
 
     With the goals :math:`g_0, g_1, g_2` relative to the disc and its velocity :math:`v`
 
