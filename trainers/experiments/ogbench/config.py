@@ -8,6 +8,8 @@ from pathlib import Path
 from torchrl_hmcts.trainers.experiments.ogbench.names import Recipe, split_name
 from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
+FOLDER = Path("data") / "ogbench"  # of recorded episodes
+
 
 @dataclass
 class OGBenchConfig(RunConfig):
@@ -100,3 +102,8 @@ class OGBenchConfig(RunConfig):
         need_package("ogbench")
         if self.data and not Path(self.data).exists():
             raise ExperimentError(f"data={self.data} does not exist; record it: hmcts data.")
+        if not self.data and self.id.startswith("ant") and not (FOLDER / self.id).exists():
+            raise ExperimentError(
+                f"{FOLDER / self.id} does not exist, and ants are recorded by one that can walk: "
+                f"hmcts data id={self.id} walker=DIR, with a run of kit=ant in DIR."
+            )

@@ -22,7 +22,7 @@ from torchrl_hmcts.trainers.experiments.ogbench.agent import (
     make_agent,
     make_loss,
 )
-from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
+from torchrl_hmcts.trainers.experiments.ogbench.config import FOLDER, OGBenchConfig
 from torchrl_hmcts.trainers.experiments.ogbench.data import load, quiet, record, save
 from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.figures.intervals import wilson
@@ -31,7 +31,6 @@ from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, plain_checkpoint
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 
-_FOLDER = Path("data") / "ogbench"
 _TASKS = 5
 
 
@@ -114,7 +113,7 @@ def recorded(config: OGBenchConfig) -> TensorDictBase:
     Args:
         config: of the run.
     """
-    path = Path(config.data) if config.data else _FOLDER / config.id
+    path = Path(config.data) if config.data else FOLDER / config.id
     if not config.data and not path.exists():
         print(f"Recording {config.id} in {path} ...", flush=True)
         save(record(config.id, progress=counted("record", "episodes")), path)
