@@ -87,7 +87,7 @@ def test_episodes_of_ants_are_recorded_by_a_walker(
     assert main(words) == 2
     assert "hmcts train kit=ant" in capsys.readouterr().err
     assert not out.exists()
-    assert main(["train", "kit=ogbench", f"env.id={NAME}", f"out={tmp_path / 'run'}"]) == 2
+    assert main(["train", "kit=ogbench", f"env.id={NAME}", f"out={tmp_path / 'run'}"]) == 1
     assert "hmcts data id=antmaze-medium-stitch-v0 walker=DIR" in capsys.readouterr().err
     assert main([*words, f"walker={folder}"]) == 0
     data = load(out)
