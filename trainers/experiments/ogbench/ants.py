@@ -10,8 +10,10 @@ import numpy as np
 
 from torchrl_hmcts.envs.gym.ant import body_of, seen_from, turns
 from torchrl_hmcts.envs.gym.skill_worker import SkillWorker
-from torchrl_hmcts.trainers.agent import HMCTS
+from torchrl_hmcts.trainers.experiments.gym_settings import AntConfig
+from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.ant import open_arena
+from torchrl_hmcts.trainers.experiments.skills import load_skills
 
 _MAZE = "antmaze-medium-v0"  # all have the same ant
 _TRIAL = 100  # steps in which a skill shows its direction
@@ -30,8 +32,8 @@ class AntWalker:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        agent = HMCTS(_MAZE, kit="ant", worker=str(folder))
-        self._skills = SkillWorker(agent.worker.actor, deterministic=True)
+        learned = load_skills(make_kit(AntConfig(id=_MAZE)), folder)
+        self._skills = SkillWorker(learned.loss.actor_network, deterministic=True)
         self._body, self._action, _ = turns()
         self._draws = np.random.default_rng(0)  # not used: the most probable action
         arena, skills = open_arena(_MAZE), range(self._skills.num_options)
