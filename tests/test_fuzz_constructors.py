@@ -296,8 +296,8 @@ EXCLUDED = {  # why public names are not fuzzed here
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
     "SkillWorker GridView MujocoBatch HMCTS "
-    "LandmarkEnv LandmarkModel GoalCloningLoss AttributeSnapshot ReplaySnapshot SettableGymEnv "
-    "Snapshot OptionModelEnv TorchRLGymnasiumEnv "
+    "EffectModel LandmarkEnv LandmarkModel GoalCloningLoss AttributeSnapshot ReplaySnapshot "
+    "SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",
     "is the base of configs that are fuzzed": "SkillsConfig",
     "hands its arguments to SkillReward": "SkillRewardHook",

@@ -239,7 +239,7 @@ def test_the_agent_learns_offline_and_acts_from_the_command_line(
 
 def test_the_agent_reads_nothing_of_the_simulator(folder: Path) -> None:
     from torchrl_hmcts.envs.gym.settable import make_gym
-    from torchrl_hmcts.trainers.experiments.ogbench.agent import LandmarkAgent, fit_model, learn
+    from torchrl_hmcts.trainers.experiments.ogbench.agent import fit_model, learn, make_agent
     from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
     from torchrl_hmcts.trainers.experiments.ogbench.data import load
     from torchrl_hmcts.trainers.experiments.ogbench.run import act_once
@@ -256,7 +256,8 @@ def test_the_agent_reads_nothing_of_the_simulator(folder: Path) -> None:
 
     config = OGBenchConfig(id=NAME, updates=800)
     data = load(folder)
-    agent = LandmarkAgent(fit_model(data, config), learn(data, config).loss.actor_network, config)
+    model = fit_model(data, config)
+    agent = make_agent(model, learn(data, model, config).loss.actor_network, config)
     episode = act_once(Blind(), agent, 1, [0, 1])  # type: ignore[arg-type]
     assert episode["solved"]
     assert episode["options"] > 5

@@ -1,5 +1,6 @@
 """Networks of the worker: actors and critics conditioned on skills, and what tells skills apart."""
 
+from torchrl_hmcts.modules.effects import EffectModel
 from torchrl_hmcts.modules.landmarks import LandmarkEnv, LandmarkModel, find_jumps
 from torchrl_hmcts.modules.objective_networks import (
     SkillDiscriminator,
@@ -30,6 +31,7 @@ from torchrl_hmcts.modules.termination import (
 __all__ = [
     "AnyTermination",
     "ConcatSkillMLP",
+    "EffectModel",
     "FixedSkillPrior",
     "GrowingSkillPrior",
     "LandmarkEnv",

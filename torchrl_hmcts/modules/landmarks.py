@@ -16,6 +16,7 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.checks import real_number, whole_number
+from torchrl_hmcts.modules.effects import EffectModel
 
 _SAMPLES = 20_000  # states among which landmarks are chosen
 _SHARE = 0.2  # quantile of the times between two landmarks: recorded ways are not the straightest
@@ -188,6 +189,47 @@ class LandmarkModel(nn.Module):
         return self.targets.shape[1]
 
     @property
+    def num_features(self) -> int:
+        """F."""
+        return self.places.shape[1]
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the model."""
+        return self.places.device
+
+    def position(self, landmark: Tensor) -> Tensor:
+        """Return the places of landmarks, float32 ``[*B, F]``."""
+        return self.places[landmark]
+
+    def mask(self, landmark: Tensor) -> Tensor:
+        """Return which options there are, bool ``[*B, A]``."""
+        return self.targets[landmark] >= 0
+
+    def lead(
+        self, landmark: Tensor, option: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return where options lead, drawn where there is chance, and their base steps.
+
+        Args:
+            landmark: int64 ``[*B]``.
+            option: int64 ``[*B]``.
+            generator: of the draws. Default: torch's global one.
+
+        Returns:
+            int64 ``[*B]`` and float32 ``[*B]``.
+        """
+        shares = self.probabilities[landmark, option]
+        if shares.shape[-1] == 1:
+            which = torch.zeros_like(landmark)
+        else:
+            draws = torch.rand((*landmark.shape, 1), generator=generator).to(self.device)
+            most = (shares > 0.0).sum(-1) - 1
+            which = torch.minimum((shares.cumsum(-1) <= draws).sum(-1), most)
+        after = self.outcomes[landmark, option].gather(-1, which[..., None]).squeeze(-1)
+        return after, self.durations[landmark, option]
+
+    @property
     def has_chance(self) -> bool:
         """True if an option has more outcomes than one."""
         return bool((self.probabilities > 0.0).sum(-1).max() > 1)
@@ -306,15 +348,15 @@ def _passages(labels: np.ndarray, ends: np.ndarray, most: int) -> dict[tuple[int
 
 
 class LandmarkEnv(EnvBase):
-    r"""The macro environment of a :class:`LandmarkModel`, to plan in.
+    r"""The macro environment of a :class:`LandmarkModel` or :class:`EffectModel`, to plan in.
 
-    A step goes to a landmark; at the goal's it pays 1 and ends. With chance an outcome is drawn.
-    Stateless, batched and settable: ``"landmark"`` and ``"goal"`` (int64 ``[*B]``) are its state.
-    It writes ``"position"`` (float32 ``[*B, F]``), ``"action_mask"`` (bool ``[*B, A]``) and
-    ``"duration"`` (int64 ``[*B, 1]``, base steps) too.
+    A step goes to a landmark (a setting); at the goal's it pays 1 and ends. With chance an outcome
+    is drawn. Stateless, batched and settable: ``"landmark"`` and ``"goal"`` (int64 ``[*B]``) are
+    its state. It writes ``"position"`` (float32 ``[*B, F]``), ``"action_mask"`` (bool ``[*B, A]``)
+    and ``"duration"`` (int64 ``[*B, 1]``, base steps) too.
 
     Args:
-        model (LandmarkModel): read live.
+        model (LandmarkModel or EffectModel): read live.
         gamma (float): discount per base step; the planner takes it over. Default 0.99.
         seed (int, optional): of the draws. Default: from torch's global generator.
 
@@ -339,9 +381,9 @@ class LandmarkEnv(EnvBase):
     _supports_set_state = True
 
     def __init__(
-        self, model: LandmarkModel, *, gamma: float = 0.99, seed: int | None = None
+        self, model: LandmarkModel | EffectModel, *, gamma: float = 0.99, seed: int | None = None
     ) -> None:
-        super().__init__(device=model.places.device, batch_size=[])
+        super().__init__(device=model.device, batch_size=[])
         self.model = model
         self.gamma = real_number("LandmarkEnv", "gamma", gamma, above=0.0, most=1.0)
         n, a = model.num_landmarks, model.num_options
@@ -350,7 +392,7 @@ class LandmarkEnv(EnvBase):
         self.state_spec = Composite(**state)
         self.observation_spec = Composite(
             **{name: spec.clone() for name, spec in state.items()},
-            position=Unbounded((model.places.shape[1],)),
+            position=Unbounded((model.num_features,)),
             action_mask=Binary(a, dtype=torch.bool),
             duration=Unbounded(one, dtype=torch.int64),
         )
@@ -368,8 +410,8 @@ class LandmarkEnv(EnvBase):
         return TensorDict(
             landmark=landmark,
             goal=goal,
-            position=model.places[landmark],
-            action_mask=model.targets[landmark] >= 0,
+            position=model.position(landmark),
+            action_mask=model.mask(landmark),
             duration=duration,
             batch_size=landmark.shape,
         )
@@ -387,18 +429,10 @@ class LandmarkEnv(EnvBase):
         return out.update({"done": flag, "terminated": flag.clone()})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        model = self.model
         landmark, goal = tensordict.get("landmark"), tensordict.get("goal")
         option = tensordict.get("action")
-        shares = model.probabilities[landmark, option]
-        if shares.shape[-1] == 1:
-            which = torch.zeros_like(landmark)
-        else:
-            draws = torch.rand((*landmark.shape, 1), generator=self._generator).to(self.device)
-            most = (shares > 0.0).sum(-1) - 1
-            which = torch.minimum((shares.cumsum(-1) <= draws).sum(-1), most)
-        after = model.outcomes[landmark, option].gather(-1, which[..., None]).squeeze(-1)
-        duration = model.durations[landmark, option].to(torch.int64)[..., None]
+        after, steps = self.model.lead(landmark, option, self._generator)
+        duration = steps.to(torch.int64)[..., None]
         out = self._shown(after, goal, duration)
         reached = (after == goal)[..., None]
         return out.update({"reward": reached.float(), "done": reached, "terminated": reached})

@@ -10,7 +10,7 @@ from torchrl_hmcts.trainers.command_line.words import only_words
 from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.runs.config import home, need_package, read_value
 
-_KEYS = ("id", "out", "seed", "episodes")
+_KEYS = ("id", "out", "seed", "episodes", "walker")
 
 
 def data(words: Sequence[str]) -> int:
@@ -33,7 +33,11 @@ def data(words: Sequence[str]) -> int:
         from torchrl_hmcts.trainers.runs.console import counted
 
         found = record(
-            own["id"], seed=seed, episodes=episodes, progress=counted("record", "episodes")
+            own["id"],
+            seed=seed,
+            episodes=episodes,
+            walker=own.get("walker", ""),
+            progress=counted("record", "episodes"),
         )
         save(found, folder)
         print(f"{len(found):,} steps, {int(found['done'].sum()):,} episodes: {folder}")

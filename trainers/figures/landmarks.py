@@ -9,31 +9,35 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from torchrl_hmcts.modules import LandmarkModel
+from torchrl_hmcts.modules import EffectModel, LandmarkModel
 from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
 _GREY, _PALE = "#71717a", "#d4d8e0"
 
 
-def plot_landmarks(model: LandmarkModel, ways: Sequence[np.ndarray], path: Path) -> None:
-    """Draw landmarks and options, and a way for each task.
+def plot_ways(model: LandmarkModel | EffectModel, ways: Sequence[np.ndarray], path: Path) -> None:
+    """Draw where options lead, and a way for each task.
 
     Args:
-        model: of places with two numbers.
-        ways: places ``[steps, 2]`` of each episode.
+        model: of places, of which the first two numbers are drawn.
+        ways: places ``[steps, F]`` of each episode.
         path: of the picture.
     """
-    places = model.places.numpy()
-    starts, options = np.nonzero(model.targets.numpy() >= 0)
-    lines = places[np.stack([starts, model.targets.numpy()[starts, options]], 1)]
+    places, longest = model.places.numpy()[:, :2], float("inf")
+    jumps = np.zeros(len(places), np.bool_)
     figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.add_subplot()
-    axes.add_collection(LineCollection(list(lines), colors=_PALE, linewidths=0.5, zorder=0))
-    jumps = model.is_jump.numpy()
-    axes.scatter(places[~jumps, 0], places[~jumps, 1], s=6, color=_GREY, zorder=1)
-    axes.scatter(places[jumps, 0], places[jumps, 1], s=90, color="black", marker="*", zorder=3)
+    if isinstance(model, LandmarkModel):
+        starts, options = np.nonzero(model.targets.numpy() >= 0)
+        lines = places[np.stack([starts, model.targets.numpy()[starts, options]], 1)]
+        axes.add_collection(LineCollection(list(lines), colors=_PALE, linewidths=0.5, zorder=0))
+        jumps, longest = model.is_jump.numpy(), float(model.jump)
+    size = 6 if isinstance(model, LandmarkModel) else 90
+    axes.scatter(*places[~jumps].T, s=size, color=_GREY, zorder=1)
+    axes.scatter(*places[jumps].T, s=90, color="black", marker="*", zorder=3)
     for task, (way, color) in enumerate(zip(ways, COLORS, strict=False), 1):
-        broken = np.linalg.norm(np.diff(way, axis=0), axis=1) > float(model.jump)
+        way = way[:, :2]
+        broken = np.linalg.norm(np.diff(way, axis=0), axis=1) > longest
         shown = np.insert(way, np.flatnonzero(broken) + 1, np.nan, axis=0)
         axes.plot(*shown.T, color=color, linewidth=1.8, zorder=2)
         axes.annotate(f"{task}", way[0], color=color, fontsize=13, fontweight="bold", zorder=4)

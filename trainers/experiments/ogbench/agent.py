@@ -18,7 +18,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_hmcts.modules import LandmarkEnv, LandmarkModel, find_jumps
+from torchrl_hmcts.envs.gym.ant import body_of
+from torchrl_hmcts.modules import EffectModel, LandmarkEnv, LandmarkModel, find_jumps
 from torchrl_hmcts.objectives import GoalCloningLoss
 from torchrl_hmcts.planners import (
     UCT,
@@ -42,33 +43,51 @@ class _ToGoal(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(
-        self, observations: Tensor, num_places: int, num_actions: int, unit: float
-    ) -> None:
+    def __init__(self, observations: Tensor, num_actions: int, config: OGBenchConfig) -> None:
         super().__init__()
-        self.num_places, self.unit = num_places, unit
-        self.register_buffer("mean", observations.mean(0))
-        self.register_buffer("std", observations.std(0).clamp_min(1e-6))
-        inputs = observations.shape[-1] + num_places
+        self.place, self.unit = config.place, config.radius
+        self.columns = slice(*config.recipe.seen)
+        place = self.place
+        ahead = torch.ones_like(observations[:, place])
+        seen, where = self.view(observations, ahead)
+        self.register_buffer("mean", seen.mean(0))
+        self.register_buffer("std", seen.std(0).clamp_min(1e-6))
+        inputs = seen.shape[-1] + where.shape[-1]
         self.layers = MLP(inputs, num_actions, num_cells=_HIDDEN, activation_class=nn.GELU)
 
+    def view(self, observation: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network sees of the agent and of the goal."""
+        return observation[..., self.columns], ahead
+
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
-        ahead = (goal - observation[..., : self.num_places]) / self.unit
-        seen = (observation - self.mean) / self.std
-        return self.layers(torch.cat([seen, ahead], -1)).tanh()
+        ahead = (goal - observation[..., self.place]) / self.unit
+        seen, where = self.view(observation, ahead)
+        return self.layers(torch.cat([(seen - self.mean) / self.std, where], -1)).tanh()
 
 
-def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel:
-    """Return the option model of recorded episodes.
+class _AntToGoal(_ToGoal):
+    """Sees the body from the direction of the goal: the plane has no north."""
+
+    def view(self, observation: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        length = ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        body, _ = body_of(observation.double().numpy(), (ahead / length).numpy().T)
+        return torch.from_numpy(body).float(), length
+
+
+def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel | EffectModel:
+    """Return the option model of recorded episodes: of effects in puzzles, of places in mazes.
 
     Args:
         data: as of :func:`~torchrl_hmcts.trainers.experiments.ogbench.data.record`.
         config: of the run.
     """
-    places = data["observation"][..., : config.num_places]
+    seen, ends = data["observation"].float(), data["done"][:, 0]
+    places = seen[:, config.place]
+    if config.recipe.kind == "play":
+        return EffectModel.fit(seen, ends, places)
     return LandmarkModel.fit(
         places,
-        data["done"][:, 0],
+        ends,
         radius=config.radius,
         min_count=config.min_count,
         max_steps=config.goal_steps,
@@ -114,18 +133,26 @@ def make_loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         actions, seen = data["action"].shape[-1], data["observation"].float()
-        network = _ToGoal(seen, config.num_places, actions, config.radius)
+        kind = _AntToGoal if config.id.startswith("ant") else _ToGoal
+        network = kind(seen, actions, config)
     worker = TensorDictModule(network, ["observation", "goal"], ["action"])
-    return GoalCloningLoss(worker, progress_coeff=config.progress_coeff)
+    coeff = config.progress_coeff if config.progress_coeff >= 0.0 else config.recipe.progress_coeff
+    return GoalCloningLoss(worker, progress_coeff=coeff)
 
 
 def learn(
-    data: TensorDictBase, config: OGBenchConfig, *, progress: Callable[[Any], Any] = iter
+    data: TensorDictBase,
+    model: LandmarkModel | EffectModel,
+    config: OGBenchConfig,
+    *,
+    progress: Callable[[Any], Any] = iter,
 ) -> Learned:
-    """Train the worker to reach places that lie ahead in recorded episodes, but behind no jump.
+    """Train the worker to reach places that lie ahead in recorded episodes.
 
     Args:
         data: recorded episodes ``[T]``.
+        model: of the options. With effects, a step's goal is where the next one happens; else it is
+            a place that the episode reached some steps later, but behind no jump.
         config: of the run.
         progress: wraps the range of the updates.
 
@@ -134,17 +161,17 @@ def learn(
     """
     begin, loss = time.process_time(), make_loss(data, config)
     optimizer = torch.optim.Adam(loss.parameters(), config.learning_rate)
-    decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.updates)
-    draw = _Hindsight(data, config)
+    decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.num_updates)
+    draw = (_NextEffect if isinstance(model, EffectModel) else _Ahead)(data, model, config)
     curves: dict[str, list[float]] = {"updates": [], "loss_actor": [], "action_error": []}
-    for update in progress(range(config.updates)):
+    for update in progress(range(config.num_updates)):
         out = loss(draw(config.batch_size))
         optimizer.zero_grad()
         out["loss_actor"].backward()
         nn.utils.clip_grad_norm_(loss.parameters(), _MAX_NORM)
         optimizer.step()
         decay.step()
-        if update % 100 == 99 or update == config.updates - 1:
+        if update % 100 == 99 or update == config.num_updates - 1:
             curves["updates"].append(update + 1)
             for name in ("loss_actor", "action_error"):
                 curves[name].append(out[name].item())
@@ -152,46 +179,73 @@ def learn(
 
 
 class _Hindsight:
-    """Draws transitions, each with a place to which the same episode led within some steps.
+    """Draws transitions, each with a place to which the same episode led.
 
     TorchRL's ``HERReplayBuffer`` draws goals from all the rest of an episode.
     """
 
-    def __init__(self, data: TensorDictBase, config: OGBenchConfig) -> None:
+    def __init__(self, data: TensorDictBase, config: OGBenchConfig, ends: Tensor) -> None:
         self.seen = data["observation"].float().contiguous()
         self.actions = data["action"].float().contiguous()
-        self.num_places, self.most = config.num_places, config.goal_steps
-        ends = data["done"][:, 0].clone()
-        ends[-1] = True
-        ends |= find_jumps(self.seen[:, : self.num_places], ends, config.jump_factor)
+        self.place, self.most = config.place, config.goal_steps
         last = torch.nonzero(ends).flatten()
         steps = torch.arange(len(ends))
-        self.left = last[torch.searchsorted(last, steps)] - steps
+        behind = torch.searchsorted(last, steps)
+        self.end = torch.cat([last, last[-1:]])[behind]
+        self.left = torch.where(behind < len(last), self.end - steps, 0)
         self.rows = torch.nonzero(self.left > 0).flatten()
         self.generator = torch.Generator().manual_seed(config.seed)
+
+    def goals(self, at: Tensor, draws: Tensor) -> Tensor:
+        """Goals of steps, ``[B, F]``."""
+        ahead = torch.minimum(1 + (draws * self.most).long(), self.left[at])
+        return self.seen[at + ahead, self.place]
 
     def __call__(self, count: int) -> TensorDict:
         draws = torch.rand(2, count, generator=self.generator)
         at = self.rows[(draws[0] * len(self.rows)).long()]
-        ahead = torch.minimum(1 + (draws[1] * self.most).long(), self.left[at])
-        seen, after, goal = self.seen[at], self.seen[at + 1], self.seen[at + ahead]
-        f = self.num_places
+        seen, after = self.seen[at], self.seen[at + 1]
         return TensorDict(
             observation=seen,
             action=self.actions[at],
-            position=seen[:, :f],
-            goal=goal[:, :f],
-            next=TensorDict(position=after[:, :f], batch_size=[count]),
+            position=seen[:, self.place],
+            goal=self.goals(at, draws[1]),
+            next=TensorDict(position=after[:, self.place], batch_size=[count]),
             batch_size=[count],
         )
 
 
-class LandmarkAgent:
+class _Ahead(_Hindsight):
+    """A goal lies some steps ahead, but behind no jump."""
+
+    def __init__(self, data: TensorDictBase, model: LandmarkModel, config: OGBenchConfig) -> None:
+        ends = data["done"][:, 0].clone()
+        ends[-1] = True
+        places = data["observation"][:, config.place].float()
+        ends |= find_jumps(places, ends, config.jump_factor)
+        super().__init__(data, config, ends)
+
+
+class _NextEffect(_Hindsight):
+    """The goal is where the next effect happens."""
+
+    def __init__(self, data: TensorDictBase, model: EffectModel, config: OGBenchConfig) -> None:
+        ends, settings = data["done"][:, 0].clone(), model.settings(data["observation"])
+        self.effects = torch.full_like(settings, -1)
+        self.effects[1:] = model.effect(settings[:-1], settings[1:])
+        self.effects[1:][ends[:-1]] = -1
+        super().__init__(data, config, ends | (settings != settings.roll(1)))
+        self.rows = self.rows[self.effects[self.end[self.rows]] >= 0]
+        self.places = model.places
+
+    def goals(self, at: Tensor, draws: Tensor) -> Tensor:
+        return self.places[self.effects[self.end[at]]]
+
+
+class OptionAgent:
     """Acts towards a goal: a search before every option, and a worker that takes it.
 
-    It sees observations and a goal, and nothing of the env. An option ends near its landmark, after
-    a jump, or when it has taken three times its base steps; then it is thought longer by these for
-    the rest of the episode, so that the next search may find another way.
+    It sees observations and a goal, and nothing of the env.
 
     Args:
         model: of the options.
@@ -201,15 +255,11 @@ class LandmarkAgent:
     Attributes:
         planner: of type :class:`MCTSPlanner`.
         num_options: options taken in this episode.
-        path: landmarks to which they led.
     """
 
-    def __init__(
-        self, model: LandmarkModel, worker: TensorDictModule, config: OGBenchConfig
-    ) -> None:
-        self._given, self.worker, self.config = model, worker, config
-        self.model = copy.deepcopy(model)
-        self._env = LandmarkEnv(self.model, gamma=config.gamma, seed=config.seed)
+    def __init__(self, model: Any, worker: TensorDictModule, config: OGBenchConfig) -> None:
+        self.model, self.worker, self.config = model, worker, config
+        self._env = LandmarkEnv(model, gamma=config.gamma, seed=config.seed)
         self._table = torch.zeros(0)  # values of landmarks on the way to the goal
         values = TensorDictModule(lambda at: self._table[at], ["landmark"], ["state_value"])
         self.planner = MCTSPlanner(
@@ -228,16 +278,9 @@ class LandmarkAgent:
         Args:
             goal: an observation of it.
         """
-        self.model.load_state_dict(self._given.state_dict())
-        self._goal = torch.from_numpy(goal[: self.config.num_places]).float()
-        self._goal_landmark = self.model.nearest(self._goal[None], goal=True)
-        self._table = self.model.values(self._goal_landmark, self.config.gamma)
+        self._begin(torch.from_numpy(goal).float())
         self._target: Tensor | None = None
-        self._last: Tensor | None = None
-        self._steps, self._limit, self._chosen = 0, 0, (0, -1)
-        self._arrived: int | None = None  # at the landmark of the last option
-        self.num_options = 0
-        self.path: list[int] = []
+        self._steps, self._limit, self.num_options = 0, 0, 0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return an action.
@@ -246,20 +289,82 @@ class LandmarkAgent:
             observation: of the env.
         """
         seen = torch.from_numpy(observation).float()
-        here = seen[: self.config.num_places]
-        if self._is_over(here):
-            self._choose(here)
-        self._last, self._steps = here, self._steps + 1
-        td = TensorDict(observation=seen, goal=self._target)
+        if self._target is None or self._is_over(seen):
+            self._steps = 0
+            self._target, self._limit = self._choose(seen)
+        self._steps += 1
         with torch.no_grad():
-            action: np.ndarray = self.worker(td)["action"].numpy()
+            td = self.worker(TensorDict(observation=seen, goal=self._target))
+        action: np.ndarray = td["action"].numpy()
         return action
 
-    def _is_over(self, here: Tensor) -> bool:
+    def search(self, landmark: Tensor) -> int:
+        """Return the option with which a search begins.
+
+        Args:
+            landmark: of the agent, int64 ``[1]``.
+        """
+        self.num_options += 1
+        state = TensorDict(landmark=landmark, goal=self._goal_landmark, batch_size=[1])
+        return int(self.planner(self._env.reset(state, set_state=True))["action"])
+
+    def _begin(self, goal: Tensor) -> None:
+        """Take a goal."""
+        raise NotImplementedError
+
+    def _is_over(self, seen: Tensor) -> bool:
         """Whether another option is due."""
-        if self._target is None or self._last is None:
-            return True
-        if float((here - self._last).norm()) > float(self.model.jump):
+        raise NotImplementedError
+
+    def _choose(self, seen: Tensor) -> tuple[Tensor, int]:
+        """The next place to go to, and the steps after which this has failed."""
+        raise NotImplementedError
+
+
+def _limit(duration: Tensor) -> int:
+    return max(_LEAST_STEPS, int(_LATE * float(duration)))
+
+
+class LandmarkAgent(OptionAgent):
+    """Goes from landmark to landmark.
+
+    An option ends near its landmark, after a jump, or when it has taken three times its base steps;
+    then it is thought longer by these for the rest of the episode, so that the next search may find
+    another way.
+
+    Args:
+        model: of the options, a :class:`LandmarkModel`.
+        worker: reads ``"observation"`` and ``"goal"``, writes ``"action"``.
+        config: of the run.
+
+    Attributes:
+        path: landmarks to which the options of this episode led.
+    """
+
+    def __init__(
+        self, model: LandmarkModel, worker: TensorDictModule, config: OGBenchConfig
+    ) -> None:
+        super().__init__(copy.deepcopy(model), worker, config)
+        self._given = model
+
+    def _begin(self, goal: Tensor) -> None:
+        self.model.load_state_dict(self._given.state_dict())
+        self._goal = goal[self.config.place]
+        self._goal_landmark = self.model.nearest(self._goal[None], goal=True)
+        self._table = self.model.values(self._goal_landmark, self.config.gamma)
+        self._last: Tensor | None = None
+        self._chosen = (0, -1)
+        self._arrived: int | None = None  # at the landmark of the last option
+        self.path: list[int] = []
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        action = super().act(observation)
+        self._last = torch.from_numpy(observation[self.config.place]).float()
+        return action
+
+    def _is_over(self, seen: Tensor) -> bool:
+        here = seen[self.config.place]
+        if self._last is not None and float((here - self._last).norm()) > float(self.model.jump):
             return True
         if self._steps >= self._limit:
             landmark, option = self._chosen
@@ -273,20 +378,57 @@ class LandmarkAgent:
         self._arrived = self.path[-1]
         return True
 
-    def _choose(self, here: Tensor) -> None:
-        landmark = self.model.nearest(here[None])
+    def _choose(self, seen: Tensor) -> tuple[Tensor, int]:
+        landmark = self.model.nearest(seen[None, self.config.place])
         if self._arrived is not None and bool((self.model.targets[self._arrived] >= 0).any()):
             landmark = torch.tensor([self._arrived])  # another one may be nearer by a little
-        self._arrived, self._steps = None, 0
+        self._arrived, at = None, int(landmark)
         if bool(landmark == self._goal_landmark):
-            self._target, self._chosen, self._limit = self._goal, (int(landmark), -1), _LEAST_STEPS
-            return
-        state = TensorDict(landmark=landmark, goal=self._goal_landmark, batch_size=[1])
-        root = self._env.reset(state, set_state=True)
-        option = int(self.planner(root)["action"])
-        at = int(landmark)
+            self._chosen = (at, -1)
+            return self._goal, _LEAST_STEPS
+        option = self.search(landmark)
         target = int(self.model.targets[at, option])
-        self._target, self._chosen = self.model.places[target], (at, option)
-        self._limit = max(_LEAST_STEPS, int(_LATE * float(self.model.durations[at, option])))
-        self.num_options += 1
+        self._chosen = (at, option)
         self.path.append(target)
+        return self.model.places[target], _limit(self.model.durations[at, option])
+
+
+class EffectAgent(OptionAgent):
+    """Makes one effect after another: it goes where it happens, until switches change.
+
+    When nothing has changed after three times the base steps of an option, it searches again.
+
+    Args:
+        model: of the options, an :class:`EffectModel`.
+        worker: reads ``"observation"`` and ``"goal"``, writes ``"action"``.
+        config: of the run.
+    """
+
+    def _begin(self, goal: Tensor) -> None:
+        landmark = self.model.settings(goal)[None]
+        if not len(self._table) or bool(landmark != self._goal_landmark):
+            self._goal_landmark = landmark
+            self._table = self.model.values(landmark, self.config.gamma)
+
+    def _is_over(self, seen: Tensor) -> bool:
+        changed = bool(self.model.settings(seen) != self._setting)
+        return changed or self._steps >= self._limit
+
+    def _choose(self, seen: Tensor) -> tuple[Tensor, int]:
+        self._setting = self.model.settings(seen)
+        option = self.search(self._setting[None])
+        return self.model.places[option], _limit(self.model.duration)
+
+
+def make_agent(
+    model: LandmarkModel | EffectModel, worker: TensorDictModule, config: OGBenchConfig
+) -> OptionAgent:
+    """Return the agent that plans in a model.
+
+    Args:
+        model: of :func:`fit_model`.
+        worker: of :func:`learn`.
+        config: of the run.
+    """
+    kind = EffectAgent if isinstance(model, EffectModel) else LandmarkAgent
+    return kind(model, worker, config)

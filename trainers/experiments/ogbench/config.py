@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
+from torchrl_hmcts.trainers.experiments.ogbench.names import Recipe, split_name
 from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
+
+FOLDER = Path("data") / "ogbench"  # of recorded episodes
 
 
 @dataclass
@@ -21,26 +23,26 @@ class OGBenchConfig(RunConfig):
     """
 
     id: str = "pointmaze-medium-navigate-v0"
-    """Name of OGBench's dataset: the maze, and how it was recorded (navigate or stitch)."""
+    """Name of OGBench's dataset: the env, and how it was recorded (navigate, stitch or play)."""
     data: str = ""
     """Recorded episodes: a folder of `hmcts data`, or OGBench's own NAME.npz. Default:
-    data/ogbench/NAME, recorded there (minutes) if it is not yet."""
+    data/ogbench/NAME, recorded there (minutes; puzzles an hour) if it is not yet."""
     out: str = "runs/ogbench"
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
-    num_places: int = 2
-    """Numbers of an observation, its first ones, that say where the agent is."""
     radius: float = 1.5
-    """Least distance of two landmarks, in units of the maze, whose corridors are 4 wide."""
+    """Least distance of two landmarks, in units of the maze, whose corridors are 4 wide; the unit
+    of distances that the worker sees."""
     min_count: int = 1
     """Recorded passages from a landmark to another that make an option."""
     jump_factor: float = 10.0
     """Median steps from which on a recorded step is a jump, whose outcomes are left to chance."""
     goal_steps: int = 30
-    """Base steps by which a goal of the worker lies ahead, at most, and of an option."""
-    progress_coeff: float = 2.0
-    """Weight of actions that led to the goal fast in the worker's cloning; 0: none."""
-    updates: int = 4_000
-    """Updates of the worker."""
+    """Base steps by which a goal of the worker lies ahead, at most, and of an option; in mazes."""
+    progress_coeff: float = -1.0
+    """Weight of actions that led to the goal fast in the worker's cloning; 0: none. Default -1: 2
+    for points, 0 for ants, and 1 in puzzles, where the arm has to leave a button first."""
+    updates: int = 0
+    """Updates of the worker. Default 0: 4,000 for points, 10,000 for ants and in puzzles."""
     batch_size: int = 512
     """Transitions of an update."""
     learning_rate: float = 1e-3
@@ -68,7 +70,22 @@ class OGBenchConfig(RunConfig):
     )
     PATHS = ("out", "data")
     ABOVE_ZERO = ("radius", "learning_rate", "jump_factor")
-    LEAST = {"progress_coeff": 0}
+    LEAST = {"progress_coeff": -1, "updates": 0}
+
+    @property
+    def recipe(self) -> Recipe:
+        """What is known by hand of the env, and how it was recorded."""
+        return split_name(self.id)
+
+    @property
+    def place(self) -> slice:
+        """Columns of an observation that say where the point, the ant or the hand is."""
+        return slice(*self.recipe.place)
+
+    @property
+    def num_updates(self) -> int:
+        """Updates of the worker."""
+        return self.updates or self.recipe.updates
 
     def check_inputs(self) -> None:
         """Check that there is such a dataset, and OGBench.
@@ -85,3 +102,8 @@ class OGBenchConfig(RunConfig):
         need_package("ogbench")
         if self.data and not Path(self.data).exists():
             raise ExperimentError(f"data={self.data} does not exist; record it: hmcts data.")
+        if not self.data and self.id.startswith("ant") and not (FOLDER / self.id).exists():
+            raise ExperimentError(
+                f"{FOLDER / self.id} does not exist, and ants are recorded by one that can walk: "
+                f"hmcts data id={self.id} walker=DIR, with a run of kit=ant in DIR."
+            )

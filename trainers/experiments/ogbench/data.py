@@ -5,8 +5,10 @@ Letters: T recorded steps.
 
 from __future__ import annotations
 
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,41 +26,70 @@ Cell = tuple[int, int]
 _SIDES = ((-1, 0), (0, -1), (1, 0), (0, 1))
 
 
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Hide that OGBench's arms make a space of float64, each time that they are asked for it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*precision lowered by casting")
+        yield
+
+
+@quiet()
 def record(
-    name: str, *, seed: int = 0, episodes: int = 0, progress: Callable[[Any], Any] = iter
+    name: str,
+    *,
+    seed: int = 0,
+    episodes: int = 0,
+    walker: str | Path = "",
+    progress: Callable[[Any], Any] = iter,
 ) -> TensorDict:
     """Record a dataset as OGBench's script does; its draws are other ones.
 
-    An episode begins in a cell that is drawn from all. The point walks to the centre of the next
-    cell on the shortest way to a goal, with noise on every action. ``"navigate"`` draws a new goal
-    among crossings, corners and dead ends wherever one is reached; ``"stitch"`` has one goal, four
-    cells away.
+    A maze's episode begins in a cell that is drawn from all. The point or ant walks to the centre
+    of the next cell on the shortest way to a goal, with noise on every action. ``"navigate"`` draws
+    a new goal among crossings, corners and dead ends wherever one is reached; ``"stitch"`` has one
+    goal, four cells away; ``"explore"`` has a drawn direction, for ten steps each. In a puzzle the
+    arm presses one drawn button after another and moves to a drawn place in between, on a noisy
+    path; what the buttons show at first is drawn.
 
     Args:
         name: of the dataset.
         seed: of all draws.
         episodes: number of them. Default 0: as many as OGBench records for training.
+        walker: of ant mazes, the folder of a worker of the kit ``ant``: OGBench's own expert, a
+            policy that SAC trained, is not in its package.
         progress: wraps the range of the episodes, e.g. ``tqdm``.
 
     Returns:
-        ``"observation"`` and ``"action"``, float32 ``[T, 2]``, and ``"done"``, bool ``[T, 1]``: the
-        episode's last step.
+        ``"observation"`` and ``"action"``, float32 ``[T, ...]``, and ``"done"``, bool ``[T, 1]``:
+        the episode's last step.
 
     Raises:
-        ValueError: if the name is unknown, or a number is negative.
+        ValueError: if the name is unknown, a number is negative, or an ant has no walker.
     """
     whole_number("record", "seed", seed, least=0)
     whole_number("record", "episodes", episodes, least=0)
     recipe = split_name(name)
-    env = make_gym(recipe.env, terminate_at_goal=False, max_episode_steps=recipe.steps)
+    if recipe.env.startswith("ant") and not walker:
+        raise ValueError(
+            f"{name} needs an ant that can walk. Train one (hmcts train kit=ant "
+            f"env.id=antmaze-large-v0 out=DIR, five minutes), then: hmcts data id={name} walker=DIR"
+        )
+    mode = {"mode": "data_collection"} if recipe.kind == "play" else {}
+    env = make_gym(recipe.env, terminate_at_goal=False, max_episode_steps=recipe.steps, **mode)
     env.action_space.seed(seed)
-    env.reset(seed=seed)  # the draws of NumPy's global generator too
+    first, _ = env.reset(seed=seed)  # the draws of NumPy's global generator too
     count = episodes or recipe.episodes
-    observations = np.empty((count * recipe.steps, 2), np.float32)
-    actions, ends = np.empty_like(observations), np.zeros((len(observations), 1), np.bool_)
-    at = 0
+    most = count * recipe.steps
+    observations = np.empty((most, *first.shape), np.float32)
+    actions = np.empty((most, *env.action_space.shape), np.float32)
+    ends, at = np.zeros((most, 1), np.bool_), 0
     with env:  # its draws, for all episodes
-        oracle = _Oracle(env.unwrapped, recipe, np.random.default_rng(seed))
+        oracle: _Walks | _Presses = (
+            _Presses(env.unwrapped, recipe)
+            if recipe.kind == "play"
+            else _Walks(env.unwrapped, recipe, np.random.default_rng(seed), walker)
+        )
         for _ in progress(range(count)):
             for observation, action in oracle.episode(env):
                 observations[at], actions[at] = observation, action
@@ -68,16 +99,23 @@ def record(
     return TensorDict({k: torch.from_numpy(v[:at]) for k, v in parts.items()}, [at])
 
 
-class _Oracle:
+class _Walks:
     """Walks from cell to cell towards a goal."""
 
-    def __init__(self, env: Any, recipe: Recipe, draws: np.random.Generator) -> None:
+    def __init__(
+        self, env: Any, recipe: Recipe, draws: np.random.Generator, walker: str | Path
+    ) -> None:
         self.env, self.recipe, self.draws = env, recipe, draws
         free = env.maze_map == 0
         self.cells = [(int(i), int(j)) for i, j in np.argwhere(free)]
         self.corners = [cell for cell in self.cells if not _is_hallway(free, cell)]
         self.steps = {cell: _steps_from(free, cell) for cell in self.cells}
         self.centres: dict[tuple[Cell, Cell], np.ndarray] = {}
+        self.walk: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda seen, way: way
+        if walker:
+            from torchrl_hmcts.trainers.experiments.ogbench.ants import AntWalker
+
+            self.walk = AntWalker(walker)
 
     def episode(self, made: gymnasium.Env) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         env, recipe = self.env, self.recipe
@@ -86,15 +124,18 @@ class _Oracle:
             goal = self._draw([c for c in self.cells if self.steps[begin][c] == 4] or [begin])
         options = {"task_info": {"init_ij": begin, "goal_ij": goal}}
         observation, _ = made.reset(options=options)
-        over = False
+        over, step, way = False, 0, np.zeros(2)
         while not over:
-            place = env.get_xy()
-            way = self.centre(env.xy_to_ij(place), env.xy_to_ij(env.cur_goal_xy)) - place
-            way = way / (np.linalg.norm(way) + 1e-6) + self.draws.normal(0, recipe.noise, 2)
-            action = np.clip(way, -1, 1)
+            if recipe.kind != "explore":
+                place = env.get_xy()
+                way = self.centre(env.xy_to_ij(place), env.xy_to_ij(env.cur_goal_xy)) - place
+            elif step % 10 == 0:
+                way = self.draws.normal(size=2)
+            action = self.walk(observation, way / (np.linalg.norm(way) + 1e-6))
+            action = np.clip(action + self.draws.normal(0, recipe.noise, len(action)), -1, 1)
             after, _, terminated, truncated, info = made.step(action)
             yield observation, action
-            observation, over = after, terminated or truncated
+            observation, over, step = after, terminated or truncated, step + 1
             if info["success"] and recipe.kind == "navigate":
                 env.set_goal(self._draw(self.corners))
 
@@ -109,6 +150,28 @@ class _Oracle:
             best = min((here, *(c for c in near if left[c] >= 0)), key=lambda c: left[c])
             self.centres[here, goal] = np.array(self.env.ij_to_xy(best))
         return self.centres[here, goal]
+
+
+class _Presses:
+    """Presses one button after another."""
+
+    def __init__(self, env: Any, recipe: Recipe) -> None:
+        from ogbench.manipspace.oracles.plan.button_plan import ButtonPlanOracle
+
+        self.env = env
+        self.oracle = ButtonPlanOracle(env=env, noise=recipe.noise, gripper_always_closed=True)
+
+    def episode(self, made: gymnasium.Env) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        observation, info = made.reset()
+        self.oracle.reset(observation, info)
+        over = False
+        while not over:
+            action = np.clip(self.oracle.select_action(observation, info), -1, 1)
+            after, _, terminated, truncated, info = made.step(action)
+            yield observation, action
+            observation, over = after, terminated or truncated
+            if self.oracle.done:
+                self.oracle.reset(*self.env.set_new_target())
 
 
 def _is_hallway(free: np.ndarray, cell: Cell) -> bool:

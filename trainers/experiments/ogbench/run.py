@@ -15,14 +15,15 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.trainers.evaluation import spread
 from torchrl_hmcts.trainers.experiments.ogbench.agent import (
-    LandmarkAgent,
     Learned,
+    OptionAgent,
     fit_model,
     learn,
+    make_agent,
     make_loss,
 )
-from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
-from torchrl_hmcts.trainers.experiments.ogbench.data import load, record, save
+from torchrl_hmcts.trainers.experiments.ogbench.config import FOLDER, OGBenchConfig
+from torchrl_hmcts.trainers.experiments.ogbench.data import load, quiet, record, save
 from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.figures.intervals import wilson
 from torchrl_hmcts.trainers.runs.console import counted, table
@@ -30,7 +31,6 @@ from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, plain_checkpoint
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
 
-_FOLDER = Path("data") / "ogbench"
 _TASKS = 5
 
 
@@ -50,36 +50,36 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
         config = run.config.sized()
         torch.set_num_threads(1)
         data = recorded(config)
+        model = fit_model(data, config)
         learned = Learned(make_loss(data, config))
         if run.resumes:
             path = newest_checkpoint(run.checkpoints)
             plain_checkpoint(loss_module=learned.loss, training=learned).load(path)
         else:
-            learned = learn(data, config, progress=counted("learn", "updates"))
+            learned = learn(data, model, config, progress=counted("learn", "updates"))
             run.checkpoints.mkdir(exist_ok=True)
-            path = run.checkpoints / f"checkpoint-{config.updates:012d}.torchrl"
+            path = run.checkpoints / f"checkpoint-{config.num_updates:012d}.torchrl"
             plain_checkpoint(loss_module=learned.loss, training=learned).save(path)
-        save_worker(run.path, learned.loss, config.updates)
+        save_worker(run.path, learned.loss, config.num_updates)
         steps = learned.curves["updates"]
         curves = {k: (steps, values) for k, values in learned.curves.items() if k != "updates"}
         run.write_curves(curves, "updates")
-        agent = LandmarkAgent(fit_model(data, config), learned.loss.actor_network, config)
+        agent = make_agent(model, learned.loss.actor_network, config)
         episodes = play_tasks(agent, config, progress=counted("act", "episodes"))
         metrics: dict[str, Any] = {
             "seed": config.seed,
             "recorded_steps": len(data),
-            "landmarks": agent.model.num_landmarks,
+            "landmarks": model.num_landmarks,
+            "options": model.num_options,
             "train_cpu_seconds": round(learned.cpu_seconds, 1),
             "test": summary(episodes),
         }
         with run.finish(metrics, config, title=f"Offline: {config.id}") as pictures:
-            words = "Landmarks and options (grey), places before jumps (stars), an episode a task."
-            with pictures.one("search.png", words) as path:
-                from torchrl_hmcts.trainers.figures.landmarks import plot_landmarks
+            from torchrl_hmcts.trainers.figures.landmarks import plot_ways
 
-                plot_landmarks(
-                    agent.model, [e["places"] for e in episodes[:: config.episodes]], path
-                )
+            words = "Where options lead (grey; stars: before jumps), and an episode of each task."
+            with pictures.one("search.png", words) as path:
+                plot_ways(model, [e["places"] for e in episodes[:: config.episodes]], path)
     test = metrics["test"]
     rows = [
         ("episodes solved, mean of five tasks", f"{100 * test['solved']:.1f} %"),
@@ -102,7 +102,7 @@ def evaluate_ogbench(config: OGBenchConfig) -> dict[str, Any]:
     data = recorded(config)
     loss = make_loss(data, config)
     checkpoint = load_networks(loss, config.out)
-    agent = LandmarkAgent(fit_model(data, config), loss.actor_network, config)
+    agent = make_agent(fit_model(data, config), loss.actor_network, config)
     episodes = play_tasks(agent, config, progress=counted("act", "episodes"))
     return {"checkpoint": checkpoint.name, "test": summary(episodes)}
 
@@ -113,15 +113,16 @@ def recorded(config: OGBenchConfig) -> TensorDictBase:
     Args:
         config: of the run.
     """
-    path = Path(config.data) if config.data else _FOLDER / config.id
+    path = Path(config.data) if config.data else FOLDER / config.id
     if not config.data and not path.exists():
         print(f"Recording {config.id} in {path} ...", flush=True)
         save(record(config.id, progress=counted("record", "episodes")), path)
     return load(path)
 
 
+@quiet()
 def play_tasks(
-    agent: LandmarkAgent,
+    agent: OptionAgent,
     config: OGBenchConfig,
     *,
     progress: Callable[[Any], Any] = iter,
@@ -135,7 +136,7 @@ def play_tasks(
 
     Returns:
         Of each episode ``task``, ``solved``, ``steps``, ``options``, ``cpu_seconds``,
-        ``plan_seconds`` (of each option) and ``places`` (``[steps + 1, 2]``).
+        ``plan_seconds`` (of each option) and ``places`` (``[steps + 1, F]``).
     """
     env = make_gym(split_name(config.id).env)
     numbers = [(task, i) for task in range(1, _TASKS + 1) for i in range(config.episodes)]
@@ -146,7 +147,7 @@ def play_tasks(
 
 
 def act_once(
-    env: gymnasium.Env, agent: LandmarkAgent, task: int, seeds: Sequence[int]
+    env: gymnasium.Env, agent: OptionAgent, task: int, seeds: Sequence[int]
 ) -> dict[str, Any]:
     """Act in one episode.
 
@@ -164,14 +165,15 @@ def act_once(
     begin = time.process_time()
     observation, info = env.reset(seed=seed, options={"task_id": task})
     agent.begin(info["goal"])
-    places, plans, over, info = [observation[:2]], [], False, {"success": 0.0}
+    place = agent.config.place
+    places, plans, over, info = [observation[place]], [], False, {"success": 0.0}
     while not over:
         options, before = agent.num_options, time.process_time()
         action = agent.act(observation)
         if agent.num_options > options:
             plans.append(time.process_time() - before)
         observation, _, terminated, truncated, info = env.step(action)
-        places.append(observation[:2])
+        places.append(observation[place])
         over = terminated or truncated
     return {
         "solved": bool(info["success"]),
