@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -355,3 +357,11 @@ def test_minigrid_keeps_the_types_of_the_agents_place(kind: Any) -> None:
     inner.agent_pos = (1.5, 1)
     with pytest.raises(SnapshotError, match=r"\(1\.5, 1\).*not whole numbers"):
         snapshot.read()
+
+
+def test_making_a_maze_does_not_print_the_news_of_other_envs() -> None:
+    pytest.importorskip("gymnasium_robotics")
+    code = "from torchrl_hmcts.envs.gym.settable import make_gym; make_gym('PointMaze_UMaze-v3')"
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    assert "Adroit" not in ran.stdout + ran.stderr
