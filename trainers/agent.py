@@ -359,8 +359,8 @@ class HMCTS:
             folder: of the agent, or of a run of the kits ``gym``, ``waterworld`` and ``labmaze``.
 
         Raises:
-            FileNotFoundError: if there is none, or it has no networks yet.
-            ValueError: if it is another kind of run, or damaged.
+            FileNotFoundError: if it has no networks yet.
+            ValueError: if there is none, it is another kind of run, or damaged.
         """
         _, config = load_config(read_run(folder))
         if not isinstance(config, SkillsConfig):
@@ -413,8 +413,8 @@ def load_worker(folder: str | Path) -> SkillPolicy:
         The policy, in evaluation mode, with its most probable actions.
 
     Raises:
-        FileNotFoundError: if there is none, or it has no networks yet.
-        ValueError: if its options are given, not learned.
+        FileNotFoundError: if it has no networks yet.
+        ValueError: if there is none, or its options are given, not learned.
 
     Example:
         >>> import tempfile

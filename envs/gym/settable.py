@@ -113,7 +113,7 @@ def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords:
     if not isinstance(made, gymnasium.Env):
         raise TypeError(
             "The env must be an id such as 'CartPole-v1', a gymnasium.Env or a function that "
-            f"makes one; got a {type(made).__name__}."
+            f"makes one; got {made!r}."
         )
     made = _with_arrays(made)
     return PrivateRandom(made) if _draws_globally(made) else made

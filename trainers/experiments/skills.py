@@ -232,7 +232,7 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
 
     Raises:
         FileNotFoundError: if it has no networks yet.
-        ValueError: if they are other ones, or of another env.
+        ExperimentError: if they are other ones, or of another env.
     """
     loss = make_loss(kit)
     try:
@@ -240,17 +240,20 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
     except (ValueError, FileNotFoundError) as error:
         config = read_run(folder).config
         if config.get("options", "learned") != "learned":
-            raise ValueError(
+            raise ExperimentError(
                 f"{folder} holds an agent whose options are given (options={config['options']}), "
                 "not learned: it has no skills. Pass the folder of one that has learned."
             ) from None
+        if isinstance(error, FileNotFoundError):
+            raise
         theirs, ours = config.get("id"), getattr(kit.config, "id", None)
-        if isinstance(error, ValueError) and theirs != ours:
-            raise ValueError(
-                f"{error} They were learned in {theirs}; {ours} may have other observations or "
-                "actions."
-            ) from None
-        raise
+        if theirs == ours:
+            raise ExperimentError(str(error)) from None
+        raise ExperimentError(
+            f"The skills of {folder} were learned in {theirs or 'another kit'}; their networks do "
+            f"not fit {ours or 'this kit'}. Observations, actions and the keys that shape networks "
+            "(num_skills, hidden, ...) must be alike."
+        ) from None
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     step = int("".join(filter(str.isdigit, path.stem)) or 0)
     return LearnedSkills(worker, loss, {}, RoundRecords(), step, step, 0, 0.0)
