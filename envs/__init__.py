@@ -13,6 +13,7 @@ from torchrl_hmcts.envs.gym.mujoco_batch import MujocoBatch
 from torchrl_hmcts.envs.gym.mujoco_tasks import MujocoTask
 from torchrl_hmcts.envs.gym.option_pool import OptionPool
 from torchrl_hmcts.envs.gym.option_run import OptionWorker
+from torchrl_hmcts.envs.gym.policy_worker import PolicyWorker
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv
 from torchrl_hmcts.envs.gym.skill_worker import SkillWorker
 from torchrl_hmcts.envs.gym.snapshots import ReplaySnapshot, Snapshot, SnapshotError
@@ -66,6 +67,7 @@ __all__ = [
     "OccasionalAction",
     "OptionPool",
     "OptionWorker",
+    "PolicyWorker",
     "RepeatActions",
     "ReplaySnapshot",
     "SettableGymEnv",

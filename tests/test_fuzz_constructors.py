@@ -295,7 +295,7 @@ EXCLUDED = {  # why public names are not fuzzed here
     "a base class": "Kit SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",
     "takes an env, a folder, transitions or callables, and has its own tests": "StatelessSimulator "
-    "SkillWorker GridView MujocoBatch HMCTS "
+    "SkillWorker PolicyWorker GridView MujocoBatch HMCTS "
     "EffectModel LandmarkEnv LandmarkModel GoalCloningLoss AttributeSnapshot ReplaySnapshot "
     "SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
     "DurableRotation AnyTermination",

@@ -323,7 +323,7 @@ def test_goals_are_found_on_features_that_actions_control() -> None:
         HMCTS("FrozenLake-v1", options="goals")
 
 
-def test_keys_and_skills_that_do_not_fit_are_told(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(TypeError, match="no key 'option_step'. Nearest: option_steps"):
         HMCTS("CartPole-v1", option_step=3)
     given = HMCTS("MountainCar-v0", option_steps=14).save(tmp_path / "given")
@@ -331,8 +331,19 @@ def test_keys_and_skills_that_do_not_fit_are_told(tmp_path: Path) -> None:
         HMCTS("MountainCar-v0", worker=given)
     agent = HMCTS("MountainCar-v0", option_steps=14).learn(64, progress=False)
     learned = agent.save(tmp_path / "learned")
-    with pytest.raises(ValueError, match="not those .* learned in MountainCar-v0; CartPole-v1 may"):
+    with pytest.raises(ValueError, match="learned in MountainCar-v0; .* do not fit CartPole-v1"):
         HMCTS("CartPole-v1", worker=learned)
+    words = ["kit=gym", "env.id=CartPole-v1", f"worker={learned}", f"out={tmp_path / 'run'}"]
+    assert main(["train", *words]) == 1
+    assert "do not fit CartPole-v1" in capsys.readouterr().err
+
+    class Wide(Line):
+        def reset(self, **keywords: Any) -> Any:
+            self.memory = np.zeros(10_000)
+            return super().reset(**keywords)
+
+    with pytest.raises(ValueError, match="80,.* bytes.* OptionPool, and plan in it by MCTSPlanner"):
+        HMCTS(lambda: Wide())
 
 
 def test_no_skills_no_worker() -> None:

@@ -19,12 +19,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import NormalParamExtractor
-from torch import nn
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical
+from torchrl.modules import GRUModule
 
 from torchrl_hmcts.envs import (
     OptionPool,
+    PolicyWorker,
     RepeatActions,
     ReplaySnapshot,
     SettableGymEnv,
@@ -401,6 +403,38 @@ def test_a_skill_worker_draws_from_the_policy_of_its_actor() -> None:
     loc, scale = (part.item() for part in NormalParamExtractor()(outputs))
     assert np.arctanh(actions).mean() == pytest.approx(loc, abs=0.05)
     assert np.arctanh(actions).std() == pytest.approx(scale, rel=0.05)
+
+
+def torque(features: Tensor, skill: Tensor) -> Tensor:
+    return (features[..., :1] + skill).tanh()
+
+
+def test_a_recurrent_policy_remembers_its_option_in_any_process() -> None:
+    torch.manual_seed(0)
+    keys = ["observation", "memory", "is_init"]
+    memory = GRUModule(3, 8, in_keys=keys, out_keys=["features", ("next", "memory")])
+    policy = TensorDictSequential(
+        memory, TensorDictModule(torque, ["features", "skill"], ["action"])
+    )
+    worker, draws = PolicyWorker(policy, 2), np.random.default_rng(0)
+    seen = torch.randn(4, 3)
+    for _ in range(2):  # options
+        worker.begin(seen[0].numpy(), 1)
+        hidden = torch.zeros(1, 1, 8)
+        for x in seen:
+            features, hidden = memory.gru(x.view(1, 1, 3), hidden)
+            wanted = torque(features.flatten(), torch.tensor(1)).detach()
+            acts = worker.act(x.double().numpy(), 1, draws)
+            np.testing.assert_allclose(acts, wanted, atol=1e-6)
+    alone, other = (local(worker, "Pendulum-v1", num_processes=n) for n in (0, 1))
+    start = every_option(alone)
+    here, there = (pool.step(start.clone())["next"] for pool in (alone, other))
+    assert all(here[key].equal(there[key]) for key in OUTCOME)
+    with torch.no_grad():
+        policy[0].gru.bias_ih_l0.add_(1.0)
+    worker.load(policy)
+    assert not other.step(start.clone())["next", "observation"].equal(there["observation"])
+    other.close()
 
 
 def test_new_weights_are_used_by_the_running_processes() -> None:

@@ -30,22 +30,21 @@ class Seen(NamedTuple):
     dicts: list[dict[Any, Any]]
     lists: list[list[Any]]
     keys: list[tuple[Any, ...]]
-    read: list[bool]  # which values of the dicts are state
     sizes: list[int]
-    parts: list[Any]  # these values, and the items of the lists
+    held: list[Any]  # views of the values of the dicts, and the lists
+    read: list[bool]  # which of the items in them are state
+    parts: list[Any]  # these items
     memory: list[Any]  # of arrays and generators: it may change in place
     strided: list[np.ndarray]  # arrays whose memory is in pieces
     arrays: list[np.ndarray]
 
     def still(self) -> bool:
         """Whether all objects are the same, the contents of arrays aside."""
-        dicts = self.dicts
-        values = compress(chain.from_iterable(map(dict.values, dicts)), self.read)
         return (
-            all(map(is_, map(vars, self.owners), dicts))
-            and [*map(tuple, dicts)] == self.keys
+            all(map(is_, map(vars, self.owners), self.dicts))
+            and [*map(tuple, self.dicts)] == self.keys
             and [*map(len, self.lists)] == self.sizes
-            and all(map(is_, chain(values, chain.from_iterable(self.lists)), self.parts))
+            and all(map(is_, compress(chain.from_iterable(self.held), self.read), self.parts))
         )
 
     def contents(self) -> list[Any]:
@@ -115,18 +114,19 @@ class _Look:
             self._memory += memory
             marks.append(len(memory))
         dicts: list[dict[Any, Any]] = [*[vars(owner) for owner in self._owners], *self._dicts]
+        held = [*map(dict.values, dicts), *self._lists]
         flags = [*chain.from_iterable(read)]
-        flags += [True] * (sum(map(len, dicts)) - len(flags))
-        values = compress(chain.from_iterable(map(dict.values, dicts)), flags)
+        flags += [True] * (sum(map(len, held)) - len(flags))
         return Seen(
             marshal.dumps(marks, 2),  # the newest version that does not depend on references
             self._owners,
             dicts,
             self._lists,
             [*map(tuple, dicts)],
-            flags,
             [*map(len, self._lists)],
-            [*values, *chain.from_iterable(self._lists)],
+            held,
+            flags,
+            [*compress(chain.from_iterable(held), flags)],
             self._memory,
             self._strided,
             self._arrays,

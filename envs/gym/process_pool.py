@@ -21,6 +21,7 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_hmcts.checks import real_number, whole_number
+from torchrl_hmcts.direct_calls import put
 from torchrl_hmcts.envs.gym.option_run import OptionRun
 from torchrl_hmcts.envs.gym.processes import NUM_SLOTS, OptionProcesses, fields_of
 
@@ -365,7 +366,7 @@ class ProcessPool(EnvBase):
             out = {key: value.reshape((*shape, *value.shape[1:])) for key, value in out.items()}
         observed = TensorDict({}, shape)
         for key, value in out.items():
-            observed.set(key, torch.from_numpy(value))
+            put(observed, key, torch.from_numpy(value))
         return observed
 
     def render(self, tensordict: TensorDictBase) -> Any:

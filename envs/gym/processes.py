@@ -243,7 +243,7 @@ class OptionProcesses:
         assert self._running is not None
         content, at = b"", 0
         while at < len(slots):
-            most = max(1, min(_MOST, (len(slots) - at) // (2 * self.num_processes)))
+            most = max(1, min(_MOST, (len(slots) - at) // (2 * self.num_processes - 1)))
             part = slots[at : at + most]
             content += _MESSAGE.pack(*part, *(-1,) * (_MOST - len(part)))
             at += len(part)

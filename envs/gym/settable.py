@@ -14,6 +14,7 @@ import gymnasium
 import gymnasium.wrappers
 import numpy as np
 import torch
+from farama_notifications import notifications
 from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
@@ -115,7 +116,7 @@ def make_gym(env: str | gymnasium.Env | Callable[[], gymnasium.Env], **keywords:
     if not isinstance(made, gymnasium.Env):
         raise TypeError(
             "The env must be an id such as 'CartPole-v1', a gymnasium.Env or a function that "
-            f"makes one; got a {type(made).__name__}."
+            f"makes one; got {made!r}."
         )
     made = _with_arrays(made)
     return PrivateRandom(made) if _draws_globally(made) else made
@@ -137,6 +138,8 @@ def _with_arrays(env: gymnasium.Env) -> gymnasium.Env:
 
 def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
     missing = []
+    if not name.startswith("Adroit"):  # of whom gymnasium_robotics has news at every import
+        notifications.pop("gymnasium_robotics", None)
     for package in _PACKAGES:
         try:
             gymnasium.spec(name)

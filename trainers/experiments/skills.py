@@ -233,7 +233,7 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
 
     Raises:
         FileNotFoundError: if it has no networks yet.
-        ValueError: if they are other ones, or of another env.
+        ExperimentError: if they are other ones, or of another env.
     """
     loss = make_loss(kit)
     try:
@@ -241,10 +241,12 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
     except (ValueError, FileNotFoundError) as error:
         config = read_run(folder).config
         if config.get("options", "learned") != "learned":
-            raise ValueError(
+            raise ExperimentError(
                 f"{folder} holds an agent whose options are given (options={config['options']}), "
                 "not learned: it has no skills. Pass the folder of one that has learned."
             ) from None
+        if isinstance(error, FileNotFoundError):
+            raise
         words = [
             f"{key} was {config[key]} and is {getattr(kit.config, key)} here."
             for key in ("num_skills", "hidden")
@@ -253,11 +255,10 @@ def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
         theirs, ours = config.get("id"), getattr(kit.config, "id", None)
         if theirs != ours:
             words.append(
-                f"They were learned in {theirs}; {ours} may have other observations or actions."
+                f"The skills of {folder} were learned in {theirs or 'another kit'}; their networks "
+                f"do not fit {ours or 'this kit'}."
             )
-        if not words or isinstance(error, FileNotFoundError):
-            raise
-        raise ValueError(" ".join([str(error), *words])) from None
+        raise ExperimentError(" ".join([str(error), *words])) from None
     worker = SkillPolicy(loss.actor_network, deterministic=True)
     step = int("".join(filter(str.isdigit, path.stem)) or 0)
     return LearnedSkills(worker, loss, {}, RoundRecords(), step, step, 0, 0.0)

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.envs import FeatureGoal, FollowGoals, OptionPool, RepeatActions
 from torchrl_hmcts.envs.gym.features import Features, whole_observation
 from torchrl_hmcts.envs.gym.task import fixed_actions
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.skills.controllability import probe_controllability, random_states
 
 _STATES = 60  # in which every action is tried
@@ -46,7 +47,7 @@ def find_goals(
         seed: of the walks.
 
     Raises:
-        ValueError: if no action controls a feature.
+        ExperimentError: if no action controls a feature.
     """
     env = make()
     try:
@@ -86,7 +87,7 @@ def find_goals(
         for share in _VALUES
     ]
     if not goals:
-        raise ValueError(
+        raise ExperimentError(
             "options=goals needs a feature that one action raises and another lowers; trying "
             f"{len(actions)} actions in {_STATES} states of {env} found none. Use options=actions."
         )

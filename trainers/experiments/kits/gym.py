@@ -30,6 +30,7 @@ from torchrl_hmcts.envs.gym.families import Box2DSnapshot
 from torchrl_hmcts.envs.gym.features import WithFeatures, achieved_goal, root_place
 from torchrl_hmcts.envs.gym.minigrid import MiniGridSnapshot
 from torchrl_hmcts.envs.gym.settable import make_gym
+from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 from torchrl_hmcts.envs.gym.task import Look, fixed_actions, look_at
 from torchrl_hmcts.modules import SkillPolicy
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, SearchBudget, extract_plans
@@ -39,6 +40,7 @@ from torchrl_hmcts.trainers.experiments.kits import RADIUS_SHARE, Kit, Trial
 from torchrl_hmcts.trainers.experiments.kits.feature_goals import find_goals
 from torchrl_hmcts.trainers.experiments.kits.film import Film
 from torchrl_hmcts.trainers.experiments.kits.table import ValueTable
+from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.runs.console import WIDTH
 from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
@@ -123,7 +125,13 @@ class GymKit(Kit):
         if env is None:
             config.check_inputs()
         self._env = self.maker(config.id if env is None else env)
-        look = look_at(self._env, gamma=config.gamma, **config.make)
+        try:
+            look = look_at(self._env, gamma=config.gamma, **config.make)
+        except SnapshotError as error:
+            raise ExperimentError(
+                f"{error} A kit itself chooses how a state is stored: pass yours to an OptionPool, "
+                "and plan in it by MCTSPlanner."
+            ) from None
         if config.task != "auto":
             look = dataclasses.replace(look, kind=config.task)  # type: ignore[arg-type]
         self.look = look
@@ -267,7 +275,7 @@ class GymKit(Kit):
             moves: Any = space
             return GridMoves(int(moves.n)) if self._moves else RepeatActions(fixed_actions(space))
         if self.look.discrete:
-            raise ValueError(
+            raise ExperimentError(
                 f"options=goals moves a feature to a value; the features of {config.id} are "
                 "categories without an order. Use options=actions."
             )
