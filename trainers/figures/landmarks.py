@@ -33,8 +33,8 @@ def plot_ways(model: LandmarkModel | EffectModel, ways: Sequence[np.ndarray], pa
         axes.add_collection(LineCollection(list(lines), colors=_PALE, linewidths=0.5, zorder=0))
         jumps, longest = model.is_jump.numpy(), float(model.jump)
     size = 6 if isinstance(model, LandmarkModel) else 90
-    axes.scatter(*places[~jumps].T, s=size, color=_GREY, zorder=1)
-    axes.scatter(*places[jumps].T, s=90, color="black", marker="*", zorder=3)
+    axes.scatter(places[~jumps, 0], places[~jumps, 1], s=size, color=_GREY, zorder=1)
+    axes.scatter(places[jumps, 0], places[jumps, 1], s=90, color="black", marker="*", zorder=3)
     for task, (way, color) in enumerate(zip(ways, COLORS, strict=False), 1):
         way = way[:, :2]
         broken = np.linalg.norm(np.diff(way, axis=0), axis=1) > longest

@@ -162,7 +162,9 @@ def learn(
     begin, loss = time.process_time(), make_loss(data, config)
     optimizer = torch.optim.Adam(loss.parameters(), config.learning_rate)
     decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.num_updates)
-    draw = (_NextEffect if isinstance(model, EffectModel) else _Ahead)(data, model, config)
+    draw = (
+        _NextEffect(data, model, config) if isinstance(model, EffectModel) else _Ahead(data, config)
+    )
     curves: dict[str, list[float]] = {"updates": [], "loss_actor": [], "action_error": []}
     for update in progress(range(config.num_updates)):
         out = loss(draw(config.batch_size))
@@ -218,7 +220,7 @@ class _Hindsight:
 class _Ahead(_Hindsight):
     """A goal lies some steps ahead, but behind no jump."""
 
-    def __init__(self, data: TensorDictBase, model: LandmarkModel, config: OGBenchConfig) -> None:
+    def __init__(self, data: TensorDictBase, config: OGBenchConfig) -> None:
         ends = data["done"][:, 0].clone()
         ends[-1] = True
         places = data["observation"][:, config.place].float()
@@ -260,6 +262,7 @@ class OptionAgent:
     def __init__(self, model: Any, worker: TensorDictModule, config: OGBenchConfig) -> None:
         self.model, self.worker, self.config = model, worker, config
         self._env = LandmarkEnv(model, gamma=config.gamma, seed=config.seed)
+        self._goal_landmark, self._target = torch.tensor([-1]), torch.zeros(0)
         self._table = torch.zeros(0)  # values of landmarks on the way to the goal
         values = TensorDictModule(lambda at: self._table[at], ["landmark"], ["state_value"])
         self.planner = MCTSPlanner(
@@ -279,7 +282,7 @@ class OptionAgent:
             goal: an observation of it.
         """
         self._begin(torch.from_numpy(goal).float())
-        self._target: Tensor | None = None
+        self._has_begun = False
         self._steps, self._limit, self.num_options = 0, 0, 0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -289,8 +292,8 @@ class OptionAgent:
             observation: of the env.
         """
         seen = torch.from_numpy(observation).float()
-        if self._target is None or self._is_over(seen):
-            self._steps = 0
+        if not self._has_begun or self._is_over(seen):
+            self._has_begun, self._steps = True, 0
             self._target, self._limit = self._choose(seen)
         self._steps += 1
         with torch.no_grad():
@@ -406,7 +409,7 @@ class EffectAgent(OptionAgent):
 
     def _begin(self, goal: Tensor) -> None:
         landmark = self.model.settings(goal)[None]
-        if not len(self._table) or bool(landmark != self._goal_landmark):
+        if bool(landmark != self._goal_landmark):
             self._goal_landmark = landmark
             self._table = self.model.values(landmark, self.config.gamma)
 
@@ -430,5 +433,6 @@ def make_agent(
         worker: of :func:`learn`.
         config: of the run.
     """
-    kind = EffectAgent if isinstance(model, EffectModel) else LandmarkAgent
-    return kind(model, worker, config)
+    if isinstance(model, EffectModel):
+        return EffectAgent(model, worker, config)
+    return LandmarkAgent(model, worker, config)

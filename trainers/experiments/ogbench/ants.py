@@ -33,6 +33,7 @@ class AntWalker:
 
     def __init__(self, folder: str | Path) -> None:
         learned = load_skills(make_kit(AntConfig(id=_MAZE)), folder)
+        assert learned.loss is not None
         self._skills = SkillWorker(learned.loss.actor_network, deterministic=True)
         self._body, self._action, _ = turns()
         self._draws = np.random.default_rng(0)  # not used: the most probable action
