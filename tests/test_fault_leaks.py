@@ -102,7 +102,7 @@ def test_a_trainer_that_is_gone_frees_its_memory() -> None:
 def test_the_check_notices_a_leak() -> None:
     kept: list[Any] = []
     # Blocks so large that each is asked of the system, though other tests have given some back.
-    grown, _ = growth(lambda: kept.append(torch.ones(2**24)), 4, warm_up=1)
+    grown, _ = growth(lambda: kept.append(torch.ones(2**24)), 6, warm_up=1)
     assert grown > 200.0
     assert growth(lambda: kept.append(TensorDict(a=torch.ones(1))), 400, 2)[1] > 500
 
