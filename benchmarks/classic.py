@@ -67,7 +67,7 @@ def measure(name: str, episodes: int, distill: bool) -> dict[str, Any]:
     returns = [solution.reward for solution in solutions]
     reached = None if kit.threshold is None else bool(np.mean(returns) >= kit.threshold)
     return {
-        "id": f"{name}, distilled" if distill else name,
+        "id": f"{name} distilled" if distill else name,
         **learned,
         "look": str(kit.look),
         "episodes": episodes,
