@@ -1,10 +1,12 @@
 """Classic control, toy text and LunarLander: ``HMCTS(id).solve()`` at its defaults.
 
     python benchmarks/classic.py --out docs/results/settable/classic.json
+    python benchmarks/classic.py LunarLander-v3 --distill --out docs/results/settable/classic.json
 
 Nothing is set by env: the look at each env and one rule for each kind of task choose the search.
 An episode is acted in another instance of the env, whose dice the planner does not know. Beside it
-stands a policy that draws each action uniformly. Seconds are of the processor, in one process.
+stands a policy that draws each action uniformly. With ``--distill`` the search is guided by what
+``agent.distill()`` learned, at its defaults. Seconds are of the processor, in one process.
 """
 
 from __future__ import annotations
@@ -49,9 +51,13 @@ def random_returns(name: str, episodes: int) -> list[float]:
     return returns
 
 
-def measure(name: str, episodes: int) -> dict[str, Any]:
+def measure(name: str, episodes: int, distill: bool) -> dict[str, Any]:
     agent = HMCTS(name)
     kit: Any = agent.kit
+    begin = time.process_time()
+    if distill:
+        agent.distill(progress=False)
+    learned = {"training_cpu_seconds": round(time.process_time() - begin, 1)} if distill else {}
     agent.kit.make_planner(agent.env).plan(agent.env.reset())  # compiles what is compiled
     solutions, seconds = [], []
     for seed in range(episodes):
@@ -61,7 +67,8 @@ def measure(name: str, episodes: int) -> dict[str, Any]:
     returns = [solution.reward for solution in solutions]
     reached = None if kit.threshold is None else bool(np.mean(returns) >= kit.threshold)
     return {
-        "id": name,
+        "id": f"{name} distilled" if distill else name,
+        **learned,
         "look": str(kit.look),
         "episodes": episodes,
         "mean": round(float(np.mean(returns)), 3),
@@ -82,13 +89,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=list(EPISODES))
     parser.add_argument("--episodes", type=int, help="default: as many as EPISODES says")
+    parser.add_argument("--distill", action="store_true", help="learn from searches first")
     parser.add_argument("--out", type=Path, help="rows of other envs stay")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     logging.disable(logging.WARNING)
     torch.set_num_threads(1)
     for name in args.names:
-        row = measure(name, args.episodes or EPISODES[name])
+        row = measure(name, args.episodes or EPISODES[name], args.distill)
         print(row, flush=True)
         if args.out:
             add_row(args.out, row, "id", command=COMMAND)
