@@ -33,7 +33,7 @@ FOLDERS = {
 MAX_WHEEL_BYTES = 1_000_000
 EXTRAS = {
     "envs": ("atari", "gym"),
-    "trainers": ("train", "atari", "scale", "wandb"),
+    "trainers": ("train", "atari", "gym", "scale", "wandb"),
     "torchrl_hmcts/notebook.py": ("train",),
     "torchrl_hmcts/planners/drawing.py": ("train",),
 }

@@ -345,7 +345,7 @@ def test_a_novelty_test_that_answers_in_indices_is_refused() -> None:
             return np.flatnonzero(super().accept(*args))
 
     env = ChainEnv(length=6)
-    with pytest.raises(ValueError, match="accepted int64 .*in bool"):
+    with pytest.raises(ValueError, match="returned int64 .*a bool for each"):
         MCTSPlanner(env, novelty=Indices("state", 0.5)).search(env.reset())
 
 
@@ -624,7 +624,7 @@ def test_a_planner_and_its_search_hold_the_same_settings_which_cannot_be_changed
     [
         ("tree_policy", Gumbel(), "Gumbel needs a fixed number"),
         ("leaves_per_wave", 0, "leaves_per_wave from 1 to 255; got 0"),
-        ("expand", "some", "expand is 'all' or 'one'; got 'some'"),
+        ("expand", "some", "expand must be 'all' or 'one'; got 'some'"),
         ("settings", UCT(), "SearchSettings for settings"),
     ],
 )

@@ -63,7 +63,9 @@ class PolicyWorker:
         action_key: NestedKey = "action",
     ) -> None:
         self.num_options = whole_number("PolicyWorker", "num_options", num_options, least=1)
-        self._policy: Any = copy.deepcopy(policy).cpu().eval().requires_grad_(False)
+        own: Any = copy.deepcopy(policy).cpu().requires_grad_(False)
+        own.eval()
+        self._policy = own
         share([*self._policy.parameters(), *self._policy.buffers()], "PolicyWorker")
         self._option_key, self._action_key = option_key, action_key
         self._memory: TensorDictBase | None = None

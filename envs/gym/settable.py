@@ -14,7 +14,6 @@ import gymnasium
 import gymnasium.wrappers
 import numpy as np
 import torch
-from farama_notifications import notifications
 from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
@@ -138,8 +137,6 @@ def _with_arrays(env: gymnasium.Env) -> gymnasium.Env:
 
 def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
     missing = []
-    if not name.startswith("Adroit"):  # of whom gymnasium_robotics has news at every import
-        notifications.pop("gymnasium_robotics", None)
     for package in _PACKAGES:
         try:
             gymnasium.spec(name)
