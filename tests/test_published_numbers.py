@@ -178,6 +178,7 @@ TABLES = [
     ("docs/results/README.md", "## MiniGrid", "settable/minigrid.json"),
     ("docs/results/README.md", "## AntMaze", "antmaze/results.json"),
     ("docs/results/README.md", "## OGBench's point mazes", "ogbench/mazes.json"),
+    ("docs/results/README.md", "## OGBench's puzzles and ants", "ogbench/puzzles.json"),
     ("docs/results/README.md", "## Point mazes", "settable/point_mazes.json"),
 ]
 
