@@ -213,7 +213,7 @@ def test_specs_of_any_kind(spec: Any, num_skills: int) -> None:
 
 
 KEYS = st.sampled_from(
-    ["seed", "out", "mazes", "gamma", "num_skills", "expansions", "toy", "novelty_radius", "x"]
+    ["seed", "out", "mazes", "gamma", "num_skills", "objective", "toy", "novelty_radius", "x"]
 )
 
 
@@ -240,7 +240,7 @@ def test_words_of_the_command_line(config: Any, words: list[str]) -> None:
         made = parse_overrides(config, words)
     except (ValueError, TypeError) as error:
         parts = [part for word in words for part in (word, *word.split("="))]
-        refused(error, *(part for part in parts if part), "''", *map(repr, words))
+        refused(error, *(part for part in parts if part), "''", *map(repr, words + parts))
     else:
         for name, value in vars(made).items():
             assert not (isinstance(value, float) and math.isnan(value)), name

@@ -239,6 +239,8 @@ def read_value(key: str, value: str, kind: str) -> Any:
         return value.lower() in _TRUE
     if kind == "str":
         return value
+    if kind not in _NUMBERS:
+        raise ValueError(f"{key} is a group of keys: write {key}.NAME=VALUE; got {value!r}.")
     try:
         if kind == "float":
             return float(value)
