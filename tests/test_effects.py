@@ -96,8 +96,10 @@ def test_what_has_no_effects_is_refused() -> None:
     ends = torch.zeros(10, dtype=torch.bool)
     with pytest.raises(ValueError, match="of 3 columns 0 have two values"):
         EffectModel.fit(still, ends)
-    with pytest.raises(ValueError, match=r"ends \[T\]; got \[10, 3\] and \[9\]"):
+    with pytest.raises(ValueError, match=r"got \[10, 3\], \[9\] and \[10, 0\]"):
         EffectModel.fit(still, ends[:9])
+    with pytest.raises(ValueError, match=r"got \[10, 3\], \[10\] and \[10\]"):
+        EffectModel.fit(still, ends, still[:, 0])
     with pytest.raises(ValueError, match="at most 24 switches; got 25"):
         EffectModel(25, 1)
 

@@ -120,8 +120,10 @@ Record the episodes of a dataset as OGBench's script does, with draws of our own
 
     hmcts data id=pointmaze-giant-stitch-v0                in data/ogbench/pointmaze-giant-stitch-v0
     hmcts data id=pointmaze-giant-stitch-v0 seed=1 out=DIR episodes=100
+    hmcts data id=antmaze-teleport-navigate-v0 walker=RUN  RUN: a folder of hmcts train kit=ant
 
-needs   the extra `gym`; about two minutes for a million steps
+needs   the extra `gym`; a million steps take two minutes (points), a quarter of an hour (ants) or
+        an hour (puzzles)
 writes  memory-mapped tensors (observation, action, done), which TorchRL's storages read
 
   {LOG_LEVEL_HELP}"""

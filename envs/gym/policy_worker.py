@@ -75,10 +75,11 @@ class PolicyWorker:
 
         Args:
             policy: as that of the constructor.
+
+        Raises:
+            RuntimeError: if its weights have other names or shapes.
         """
-        with torch.no_grad():
-            for name, value in self._policy.state_dict().items():
-                value.copy_(policy.state_dict()[name])
+        self._policy.load_state_dict(policy.state_dict())  # copies, into the shared memory
 
     def begin(self, observation: Any, option: int) -> None:
         """Forget what came before the option."""

@@ -154,8 +154,8 @@ def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
         hint = f"Nearest: {', '.join(near)}." if near else "gymnasium.pprint_registry() lists all."
         if missing:
             hint += (
-                f" Not installed here: {', '.join(missing)}. pip install 'torchrl_hmcts[gym]' adds "
-                "mazes, MiniGrid and OGBench, 'torchrl_hmcts[atari]' Atari."
+                f" Could not be imported here: {', '.join(missing)}. "
+                "pip install 'torchrl_hmcts[gym]' adds mazes, MiniGrid and OGBench, 'torchrl_hmcts[atari]' Atari."
             )
         raise ValueError(f"No env has the id {name!r}. {hint}") from None
     except gymnasium.error.DependencyNotInstalled as error:

@@ -98,10 +98,13 @@ class EffectModel(nn.Module):
             ValueError: if the sizes do not fit, or no effect is found.
         """
         real_number("EffectModel.fit", "min_share", min_share, above=0.0, most=1.0)
-        if observations.dim() != 2 or ends.shape != observations.shape[:1]:
+        if places is None:
+            places = observations.new_zeros(len(observations), 0)
+        shapes = [list(x.shape) for x in (observations, ends, places)]
+        if [len(shape) for shape in shapes] != [2, 1, 2] or len({n for n, *_ in shapes}) > 1:
             raise ValueError(
-                f"EffectModel.fit needs observations [T, D] and ends [T]; got "
-                f"{list(observations.shape)} and {list(ends.shape)}."
+                "EffectModel.fit needs observations [T, D], ends [T] and places [T, F]; got "
+                f"{shapes[0]}, {shapes[1]} and {shapes[2]}."
             )
         columns, middles = _switches(observations)
         settings = _number(observations, columns, middles)
@@ -114,8 +117,6 @@ class EffectModel(nn.Module):
                 f"{len(columns)} have two values, and none changes within an episode."
             )
         effects = effects[counts >= min_share * counts.max()]
-        if places is None:
-            places = observations.new_zeros(len(observations), 0)
         model = cls(len(columns), len(effects), places.shape[1])
         model.columns.copy_(columns)
         model.middles.copy_(middles)

@@ -1,3 +1,3 @@
-"""OGBench's point mazes from recorded episodes alone: options, their model and plans, offline."""
+"""OGBench's mazes and puzzles from recorded episodes alone: options and plans, offline."""
 
 __all__: list[str] = []  # `hmcts train kit=ogbench` and `hmcts data` are its face

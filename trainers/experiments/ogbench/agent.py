@@ -133,7 +133,7 @@ def make_loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         actions, seen = data["action"].shape[-1], data["observation"].float()
-        kind = _AntToGoal if config.id.startswith("ant") else _ToGoal
+        kind = _AntToGoal if config.recipe.is_ant else _ToGoal
         network = kind(seen, actions, config)
     worker = TensorDictModule(network, ["observation", "goal"], ["action"])
     coeff = config.progress_coeff if config.progress_coeff >= 0.0 else config.recipe.progress_coeff

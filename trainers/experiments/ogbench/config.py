@@ -15,7 +15,8 @@ FOLDER = Path("data") / "ogbench"  # of recorded episodes
 class OGBenchConfig(RunConfig):
     """Keys of ``hmcts train kit=ogbench env.id=NAME``: learn from recorded episodes, then act.
 
-    The defaults were chosen on pointmaze-teleport-navigate, seed 0, and are the same everywhere.
+    The defaults were chosen on pointmaze-teleport-navigate, seed 0; what differs for ants and in
+    puzzles is in the recipe of the dataset.
 
     Example:
         >>> OGBenchConfig(id="pointmaze-giant-stitch-v0").episodes
@@ -23,7 +24,8 @@ class OGBenchConfig(RunConfig):
     """
 
     id: str = "pointmaze-medium-navigate-v0"
-    """Name of OGBench's dataset: the env, and how it was recorded (navigate, stitch or play)."""
+    """Name of OGBench's dataset: the env, and how it was recorded (navigate, stitch,
+    explore or play)."""
     data: str = ""
     """Recorded episodes: a folder of `hmcts data`, or OGBench's own NAME.npz. Default:
     data/ogbench/NAME, recorded there (minutes; puzzles an hour) if it is not yet."""
@@ -102,7 +104,7 @@ class OGBenchConfig(RunConfig):
         need_package("ogbench")
         if self.data and not Path(self.data).exists():
             raise ExperimentError(f"data={self.data} does not exist; record it: hmcts data.")
-        if not self.data and self.id.startswith("ant") and not (FOLDER / self.id).exists():
+        if not self.data and self.recipe.is_ant and not (FOLDER / self.id).exists():
             raise ExperimentError(
                 f"{FOLDER / self.id} does not exist, and ants are recorded by one that can walk: "
                 f"hmcts data id={self.id} walker=DIR, with a run of kit=ant in DIR."

@@ -70,7 +70,7 @@ def record(
     whole_number("record", "seed", seed, least=0)
     whole_number("record", "episodes", episodes, least=0)
     recipe = split_name(name)
-    if recipe.env.startswith("ant") and not walker:
+    if recipe.is_ant and not walker:
         raise ValueError(
             f"{name} needs an ant that can walk. Train one (hmcts train kit=ant "
             f"env.id=antmaze-large-v0 out=DIR, five minutes), then: hmcts data id={name} walker=DIR"

@@ -20,6 +20,11 @@ class Recipe(NamedTuple):
     progress_coeff: float = 2.0  # of the worker's loss
     updates: int = 4_000  # of the worker
 
+    @property
+    def is_ant(self) -> bool:
+        """Whether an ant walks in it."""
+        return self.env.startswith("ant")
+
 
 _EPISODES = {"navigate": (1_000, 1_001), "stitch": (5_000, 201), "explore": (10_000, 501)}
 _GIANT = {"navigate": (500, 2_001), "stitch": (5_000, 201)}
