@@ -155,7 +155,8 @@ def _make_id(name: str, keywords: dict[str, Any]) -> gymnasium.Env:
         if missing:
             hint += (
                 f" Could not be imported here: {', '.join(missing)}. "
-                "pip install 'torchrl_hmcts[gym]' adds mazes, MiniGrid and OGBench, 'torchrl_hmcts[atari]' Atari."
+                "pip install 'torchrl_hmcts[gym]' adds mazes, MiniGrid and OGBench, "
+                "'torchrl_hmcts[atari]' Atari."
             )
         raise ValueError(f"No env has the id {name!r}. {hint}") from None
     except gymnasium.error.DependencyNotInstalled as error:
