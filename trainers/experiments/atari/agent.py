@@ -34,8 +34,8 @@ class AtariSearch:
 
     Attributes:
         ratio: simulated base steps per base step of an option, after which no new leaf is selected;
-            ρ. 0: the guide chooses, without search. The leaves and rollouts under way are finished: with 4 leaves and 25, about 38
-            in Breakout.
+            ρ. 0: the guide chooses, without search. The leaves and rollouts under way are finished:
+            with 4 leaves and 25, about 38 in Breakout.
         tree_policy: ``"puct"`` over values scaled to [0, 1], or ``"uct"``, its c times the greatest
             reward seen.
         backup: ``"max"``, ``"mean"`` or ``"default"``: the max for PUCT, the mean for UCT.

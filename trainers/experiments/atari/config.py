@@ -38,9 +38,10 @@ class AtariConfig(RunConfig):
     ("action_sets", "actions" or "goals", with which a planner's trials score best), "goals"
     (found by a probe and trials), "repeat" (one for each action), "actions" (some of these,
     chosen by trials), "action_sets" (all of these, those that fire or those that do not, chosen
-    by trials), "screened" (goals found by a probe, and all actions, without any trial). Networks: "goals_network" (has learned the goals), "goals_fine_tuned" (that
-    network, trained further by SAC on its goals and the game), "diayn" (the dissertation's
-    worker), "diayn_displacement", "diayn_controllable" (with other discriminators), "metra".
+    by trials), "screened" (goals found by a probe, and all actions, without any trial).
+    Networks: "goals_network" (has learned the goals), "goals_fine_tuned" (that network, trained
+    further by SAC on its goals and the game), "diayn" (the dissertation's worker),
+    "diayn_displacement", "diayn_controllable" (with other discriminators), "metra".
     With "_retrained" behind its name ("goals_retrained" for "goals_network") a network is
     retrained on what the manager's searches simulate, Algorithm 3."""
     episodes: int = 10
@@ -143,16 +144,31 @@ class AtariConfig(RunConfig):
         "skill_base_steps": 512,
     }
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.ratio >= 0.0 or (self.ratio == 0.0 and self._guide != "reactive"):
+            raise ValueError(
+                f"ratio must be above 0; got {self.ratio}. With guide=reactive ratio=0 plays "
+                f"without search; here it is guide={self.guide}."
+            )
+        if not 0.0 <= self.practice < 1.0:
+            raise ValueError(
+                f"practice is a share of the frames, 0 to below 1; got {self.practice}."
+            )
+
     @property
     def KEPT(self) -> tuple[str, ...]:  # type: ignore[override]  # noqa: N802
         """Keys that a run keeps when it is resumed: all but those that may change on the way."""
         return tuple(field.name for field in fields(self) if field.name not in self.FREE)
 
+    @property
+    def _guide(self) -> str:
+        auto = "reactive" if self.protocol == "sticky" else "none"
+        return auto if self.guide == "auto" else self.guide
+
     def resolved(self) -> AtariConfig:
         """Return the configuration with what "auto" stands for."""
-        guide = self.guide
-        if guide == "auto":
-            guide = "reactive" if self.protocol == "sticky" else "none"
+        guide = self._guide
         source = self.source
         if source == "auto":
             source = "screened" if guide == "reactive" else "best"
@@ -169,15 +185,6 @@ class AtariConfig(RunConfig):
             ExperimentError: if there is no such game, or no run of it in ``options_from``.
         """
         super().check_inputs()
-        if not self.ratio >= 0.0 or (self.ratio == 0.0 and self.resolved().guide != "reactive"):
-            raise ExperimentError(
-                f"ratio must be above 0; got {self.ratio}. With guide=reactive ratio=0 plays without "
-                f"search; here it is guide={self.guide}."
-            )
-        if not 0.0 <= self.practice < 1.0:
-            raise ExperimentError(
-                f"practice is a share of the frames, 0 to below 1; got {self.practice}."
-            )
         if not 0.0 <= self.fire < 1.0:
             raise ExperimentError(f"fire is a share of steps, 0 to below 1; got {self.fire}.")
         need_package("ale_py")

@@ -55,6 +55,7 @@ class AtariRun:
     tuned: Tuned
 
     def __init__(self, config: AtariConfig) -> None:
+        self._asked = config
         self.config = config = config.resolved()
         self.kit = AtariKit(
             config.game,
@@ -63,8 +64,6 @@ class AtariRun:
             num_processes=None if config.num_processes < 0 else config.num_processes,
             seed=config.seed,
         )
-        names = [field.name for field in dataclasses.fields(AtariSearch)]
-        self.search = AtariSearch(**{name: getattr(config, name) for name in names})
         self.sticky = config.protocol == "sticky"
         self.scores: list[dict[str, float]] = []
         self.points: list[tuple[int, float]] = []
@@ -79,6 +78,12 @@ class AtariRun:
         self._learned: dict[str, Any] | None = None  # what another run's guide knew
         self._practice: AtariOptionPool | None = None
         self._practised = 0  # frames before the pool was made
+
+    @property
+    def search(self) -> AtariSearch:
+        """How the agent plans."""
+        names = [field.name for field in dataclasses.fields(AtariSearch)]
+        return AtariSearch(**{name: getattr(self.config, name) for name in names})
 
     @property
     def num_frames(self) -> int:
@@ -146,6 +151,9 @@ class AtariRun:
                 f"{self.config.game}, whose actions are others."
             )
         self._take_options(other)
+        if self._asked.guide == "auto":
+            guide = other["config"].get("guide", "none")
+            self.config = dataclasses.replace(self._asked, guide=guide).resolved()
         if other["config"].get("guide", "none") == self.config.guide:
             self._learned = other["agent"].get("guide")
         self._frames_before += self.options.num_frames + self.tuned.num_frames
@@ -396,7 +404,7 @@ class AtariRun:
 
 
 def score_at(episodes: Sequence[Mapping[str, float]], last: int = 10) -> dict[str, float]:
-    """Return the mean score of the ``last`` episodes that were over at 2, 5, 10 and 40 million frames.
+    """Return the mean score of the ``last`` episodes over by 2, 5, 10 and 40 million frames.
 
     Example:
         >>> score_at([{"frames": 1e6, "score": 2.0}, {"frames": 4e6, "score": 6.0}], last=1)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
@@ -32,22 +31,12 @@ from torchrl_hmcts.planners import Evaluation, Search
 _STATE = ("emulator_state", "ram")
 
 
-class RAMFeatures(nn.Module):
-    """Features of the RAM, uint8 ``[K, 128]``: each byte from -2 to 2, and its bits, ``[K, 1152]``.
-
-    Example:
-        >>> import torch
-        >>> from torchrl_hmcts.trainers import RAMFeatures
-        >>> ram = torch.tensor([[255, 1] + [0] * 126], dtype=torch.uint8)
-        >>> features = RAMFeatures()(ram)
-        >>> features[0, 0].item(), features[0, 128 + 8].item(), features[0, 128 + 9].item()
-        (2.0, 1.0, 0.0)
-    """
+class _RAMFeatures(nn.Module):
+    """Features of the RAM, ``[K, 1152]``: each byte from -2 to 2, and its bits."""
 
     width = 128 * 9
 
     def forward(self, ram: Tensor) -> Tensor:
-        """Return the features ``[K, 1152]``."""
         bits = (ram.to(torch.int32).unsqueeze(-1) >> torch.arange(8, device=ram.device)) & 1
         return torch.cat([ram.float() / 63.75 - 2.0, bits.flatten(-2).float()], -1)
 
@@ -141,11 +130,11 @@ class ReactiveManager:
         widths = list(hidden)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            actor = MLP(RAMFeatures.width, num_options, num_cells=widths, activation_class=nn.ReLU)
-            critic = MLP(RAMFeatures.width, 1, num_cells=widths, activation_class=nn.ReLU)
+            actor = MLP(_RAMFeatures.width, num_options, num_cells=widths, activation_class=nn.ReLU)
+            critic = MLP(_RAMFeatures.width, 1, num_cells=widths, activation_class=nn.ReLU)
         for parameter in actor[-1].parameters():  # at first a uniform policy
             nn.init.zeros_(parameter)
-        features = TensorDictModule(RAMFeatures(), ["ram"], ["features"])
+        features = TensorDictModule(_RAMFeatures(), ["ram"], ["features"])
         self.policy = ProbabilisticTensorDictSequential(
             features,
             TensorDictModule(actor, ["features"], ["logits"]),
