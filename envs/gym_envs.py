@@ -192,14 +192,6 @@ def register_envs() -> None:
 
     ``import torchrl_hmcts.envs`` does it already. Keywords of ``gymnasium.make`` go to the TorchRL
     env.
-
-    Example:
-        >>> import gymnasium
-        >>> from torchrl_hmcts.envs.gym_envs import register_envs
-        >>> register_envs()
-        >>> env = gymnasium.make("torchrl_hmcts/GridworldMaze-v0", max_steps=50)
-        >>> env.reset(seed=1)[0].shape
-        (66,)
     """
     for name in _MAZES:
         env_id = f"torchrl_hmcts/{name}-v0"

@@ -16,11 +16,7 @@ _TYPES = (tuple, np.dtype(np.float64), np.dtype(np.float32))
 
 
 class ClassicSnapshot(Snapshot):
-    """Stores the state and the time limit's clock; no step of these envs draws.
-
-    Args:
-        env (gymnasium.Env): one of Gymnasium's classic control, under its own wrappers.
-    """
+    """Stores the state and the time limit's clock; no step of these envs draws."""
 
     width = _ROW.size
 

@@ -9,11 +9,7 @@ import numpy as np
 
 
 def generator_state(generator: Any) -> bytes | Any:
-    """Return the state of a generator: 40 bytes for NumPy's default one, else itself.
-
-    Args:
-        generator (np.random.Generator, optional): of an env.
-    """
+    """Return the state of a generator: 40 bytes for NumPy's default one, else itself."""
     if generator is None or type(generator.bit_generator) is not np.random.PCG64:
         return generator
     state = generator.bit_generator.state
@@ -27,12 +23,7 @@ def generator_state(generator: Any) -> bytes | Any:
 
 
 def set_generator_state(generator: np.random.Generator, stored: bytes) -> None:
-    """Put a generator into a state.
-
-    Args:
-        generator (np.random.Generator): NumPy's default one.
-        stored: 40 bytes, as :func:`generator_state` returned them.
-    """
+    """Put NumPy's default generator into a state of :func:`generator_state`, 40 bytes."""
     number = [int.from_bytes(stored[a:b], "little") for a, b in ((0, 16), (16, 32))]
     generator.bit_generator.state = {
         "bit_generator": "PCG64",
@@ -48,9 +39,6 @@ def generator_memory(generator: Any) -> tuple[memoryview, memoryview] | None:
     None where it is not NumPy's default one, or keeps it in another way than NumPy has done since
     1.17: a pointer to two numbers of 128 bits, then the rest. The address is of NumPy's public
     interface, ``bit_generator.ctypes``; the bytes are compared with the public state.
-
-    Args:
-        generator (np.random.Generator, optional): lives as long as what is returned is used.
     """
     bits: Any = getattr(generator, "bit_generator", None)
     if type(bits) is not np.random.PCG64:

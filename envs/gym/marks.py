@@ -62,17 +62,11 @@ def look_through(
     fixed: dict[int, int],
     packages: frozenset[str],
 ) -> Seen | None:
-    """Walk through the attributes of all layers.
+    """Walk through the attributes of all layers; None if objects are met of which nothing is known.
 
-    Args:
-        layers: of an env.
-        read: for each attribute of each layer, whether another object in its place matters.
-        is_state: whether an attribute is stored, by layer, name and value.
-        fixed: numbers of objects that are no state, by their id.
-        packages: of the env, whose objects hold nothing but attributes.
-
-    Returns:
-        What was found; None if there are objects of which nothing is known.
+    ``read`` says of each attribute whether another object in its place matters, ``is_state``
+    whether it is stored, by layer, name and value. ``fixed`` numbers objects that are no state by
+    their id; objects of ``packages``, the env's, hold nothing but attributes.
     """
     try:
         return _Look(layers, fixed, packages).seen(read, is_state)

@@ -45,13 +45,6 @@ class MiniGridSnapshot(AttributeSnapshot):
     A copy of the whole grid takes milliseconds. Between two states of an episode only the agent, a
     few cells and objects differ, and restoring changes only these. The reference is part of the
     row, so that a row fits other instances too.
-
-    Args:
-        env (gymnasium.Env): a MiniGrid or BabyAI env with its wrappers.
-        cap (int): bytes of the reference at most. Default 65,536.
-
-    Raises:
-        SnapshotError: if an attribute cannot be stored.
     """
 
     skipped_attributes = AttributeSnapshot.skipped_attributes | {*_AGENT}

@@ -119,12 +119,7 @@ class OptionRun(ABC):
         return np.dtype(fields, align=True)
 
     def run(self, slots: dict[str, np.ndarray], index: int) -> None:
-        """Run the option in one slot to its end and write the outcome.
-
-        Args:
-            slots: the fields of the slots, each ``[S, ...]``.
-            index: which slot.
-        """
+        """Run the option in one slot, of fields ``[S, ...]``, to its end and write the outcome."""
         option = int(slots["option"][index])
         observation, generator = self.begin(slots, index)
         if self._begun is not None:
@@ -216,15 +211,9 @@ class OptionRun(ABC):
 
 
 class GymRun(OptionRun):
-    """Runs options in a Gymnasium env, whose state a snapshot stores.
+    """Runs options in a Gymnasium env, whose state a snapshot stores; arguments as of OptionPool.
 
-    Args:
-        env: an id, or a function that makes the env.
-        keywords: of ``gymnasium.make``, or the function.
-        snapshot, cap: as in :func:`snapshot_of`.
-        worker, max_steps, gamma: as in :class:`OptionPool`.
-        redrawing: whether the env's own generators begin every option with new draws.
-        features: as in :class:`OptionPool`.
+    With ``redrawing`` the env's own generators begin every option with new draws.
     """
 
     def __init__(

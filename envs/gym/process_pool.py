@@ -40,13 +40,7 @@ class PendingStep:
 
 
 class ProcessPool(EnvBase):
-    """What all pools share: slots, tickets, processes, threads, copies and specs.
-
-    Args:
-        run: runs options in the calling process, and tells the processes how.
-        num_processes, determinised, start_method, step_seconds, batch_size, seed: as in
-            :class:`OptionPool`.
-    """
+    """What all pools share: slots, tickets, processes, threads, copies and specs."""
 
     batch_locked = False
     _supports_set_state = True

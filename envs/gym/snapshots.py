@@ -120,14 +120,6 @@ def env_layers(env: gymnasium.Env) -> list[gymnasium.Env]:
     """Return the wrappers from the outside, the env itself, and envs that it holds as attributes.
 
     Wrappers with a class attribute ``is_stateless = True`` are left out: they hold no state.
-
-    Args:
-        env (gymnasium.Env): any env.
-
-    Example:
-        >>> import gymnasium
-        >>> [type(layer).__name__ for layer in env_layers(gymnasium.make("CartPole-v1"))]
-        ['TimeLimit', 'OrderEnforcing', 'PassiveEnvChecker', 'CartPoleEnv']
     """
     layers: list[gymnasium.Env] = []
     waiting = [env]
@@ -157,21 +149,12 @@ def _held_by(layer: Any) -> list[gymnasium.Env]:
 
 
 def time_limits(env: gymnasium.Env) -> list[Any]:
-    """Return the wrappers of an env that count its steps, from the outside.
-
-    Args:
-        env (gymnasium.Env): any env.
-    """
+    """Return the wrappers of an env that count its steps, from the outside."""
     return [layer for layer in env_layers(env) if type(layer) is TimeLimit]
 
 
 def redraw(layers: Sequence[gymnasium.Env], seed: int) -> None:
-    """Give all generators of an env other numbers.
-
-    Args:
-        layers: of :func:`env_layers`.
-        seed: of the numbers.
-    """
+    """Give all generators of the :func:`env_layers` other numbers."""
     for number, layer in enumerate(layers):
         generator = getattr(layer, "_np_random", None)
         if generator is not None and type(generator.bit_generator) is np.random.PCG64:
@@ -285,10 +268,8 @@ def _same(taken: list[np.ndarray], other: list[np.ndarray]) -> bool:
 class FunctionSnapshot(Snapshot):
     """Stores what two functions of yours read and restore.
 
-    Args:
-        env (gymnasium.Env): the env with its wrappers.
-        read (callable): ``read(env) -> bytes`` or an array, the same size every time.
-        restore (callable): ``restore(env, row)`` with uint8 ``[width]``.
+    ``read(env)`` gives bytes or an array, of one size every time; ``restore(env, row)`` takes uint8
+    ``[width]``.
     """
 
     @classmethod

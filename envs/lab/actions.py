@@ -34,18 +34,7 @@ NATIVE_ACTIONS: Mapping[str, tuple[int, int]] = {
 
 
 def action_table(actions: Mapping[str, Sequence[int]]) -> np.ndarray:
-    """Return discrete actions as int64 ``[A, 4]``.
-
-    Args:
-        actions: by name, each (look right, look down, strafe right, move forward).
-
-    Raises:
-        ValueError: if there is none, or one is not four integers within the engine's bounds.
-
-    Example:
-        >>> action_table({"turn": (20, 0, 0, 0)}).tolist()
-        [[20, 0, 0, 0]]
-    """
+    """Return discrete actions as int64 ``[A, 4]``: look right, look down, strafe right, forward."""
     if not actions:
         raise ValueError("At least one action is needed; got none. Leave the default LAB_ACTIONS.")
     bounds = list(NATIVE_ACTIONS.values())[:4]

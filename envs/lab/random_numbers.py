@@ -14,16 +14,9 @@ _UPPER, _LOWER = 0xFFFFFFFF80000000, 0x7FFFFFFF
 class MersenneTwister64:
     """The 64-bit Mersenne Twister, with uniform integers and reals as libstdc++ draws them.
 
-    Args:
-        seed: 0 to 2**64 - 1.
-
     Reference:
         Nishimura, "Tables of 64-bit Mersenne Twisters", 2000; Lemire, "Fast random integer
         generation in an interval", 2019 (the integers of libstdc++ since gcc 11).
-
-    Example:
-        >>> MersenneTwister64(5489).next()
-        14514284786278117030
     """
 
     def __init__(self, seed: int) -> None:

@@ -8,13 +8,7 @@ import numpy as np
 def heading_degrees(turned: np.ndarray, spawn_heading: np.ndarray) -> np.ndarray:
     """Return the heading as the engine reports it, from -180 to 180 in 65,536 steps.
 
-    Args:
-        turned: float32, degrees of yaw since the spawn.
-        spawn_heading: int64, 65,536 to a full turn.
-
-    Example:
-        >>> heading_degrees(np.float32([90.0]), np.array([16384])).tolist()
-        [-180.0]
+    ``turned`` has the degrees of yaw since the spawn, ``spawn_heading`` has 65,536 to a turn.
     """
     units = np.floor(turned * np.float32(65536.0 / 360.0) + np.float32(0.5)).astype(np.int64)
     units = (units + spawn_heading + 32768) % 65536 - 32768

@@ -202,18 +202,7 @@ def _pool() -> Tensor:
 
 
 def check_mazes(mazes: Tensor) -> None:
-    """Raise unless ``mazes`` can serve an environment: equal wall counts, connected free tiles.
-
-    Args:
-        mazes (Tensor): candidate, should be bool ``[M, H, W]`` with M >= 1.
-
-    Raises:
-        ValueError: if it is not a bool tensor of three dimensions, or a maze has another number of
-            walls than the first, fewer than two free tiles, or free tiles that are not connected.
-
-    Example:
-        >>> check_mazes(maze_pool("test"))
-    """
+    """Raise unless mazes ``[M, H, W]`` can serve an env: equal wall counts, connected free tiles."""
     is_tensor = isinstance(mazes, Tensor)
     if not is_tensor or mazes.dtype != torch.bool or mazes.ndim != 3 or not mazes.numel():
         got = f"{mazes.dtype} {list(mazes.shape)}" if is_tensor else f"a {type(mazes).__name__}"
@@ -311,18 +300,7 @@ def maze_to_text(
 
 
 def wall_centers(mazes: Tensor) -> Tensor:
-    """Return the centres of the wall tiles, (x, y) in tiles, in row-major order.
-
-    Args:
-        mazes (Tensor): bool ``[*B, H, W]`` with the same number K of walls in each.
-
-    Returns:
-        float32 Tensor ``[*B, K, 2]``.
-
-    Example:
-        >>> wall_centers(torch.tensor([[False, True], [True, False]])).tolist()
-        [[1.5, 0.5], [0.5, 1.5]]
-    """
+    """Return the centres of the K walls of ``[*B, H, W]``, (x, y) in tiles, float32 ``[*B, K, 2]``."""
     rows_cols = mazes.nonzero()[:, -2:].reshape(*mazes.shape[:-2], -1, 2)
     return rows_cols.flip(-1).to(torch.float32) + 0.5
 

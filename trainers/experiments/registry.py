@@ -69,11 +69,7 @@ class Experiment:
 
     @property
     def evaluation(self) -> Callable[[Any], dict[str, Any]]:
-        """The function that evaluates a run again.
-
-        Raises:
-            ValueError: if the experiment has nothing of the kind.
-        """
+        """The function that evaluates a run again."""
         self.check_evaluation()
         evaluate: Callable[[Any], dict[str, Any]] = _load(self.evaluate)
         return evaluate
@@ -218,36 +214,16 @@ KITS = {e.kit: e for e in ALL_EXPERIMENTS.values() if e.kit}
 
 
 def find_experiment(name: str, among: Mapping[str, Experiment] = EXPERIMENTS) -> Experiment:
-    """Return an experiment by name.
-
-    Args:
-        name: one of ``EXPERIMENTS``.
-        among: experiments by name, or by kit.
-
-    Returns:
-        Where its configuration, its run and its evaluation are.
-
-    Raises:
-        ValueError: if there is none of that name; the nearest are named.
-
-    Example:
-        >>> find_experiment("labmaz")
-        Traceback (most recent call last):
-        ...
-        ValueError: Unknown experiment 'labmaz'. Did you mean: labmaze...
-    """
+    """Return an experiment by name; the nearest are named where there is none."""
     if name not in among:
         raise ValueError(unknown_key(name, among, "kit" if among is KITS else "experiment"))
     return among[name]
 
 
 def recognise(run: RunFolder) -> RunFolder:
-    """Return a run with what its experiment says of its keys, for its page.
+    """Return a run with what its experiment says of its keys, for its page; changed in place.
 
     The experiment of a run without ``run.json`` is the one that has the keys of its config.
-
-    Args:
-        run: of :func:`~torchrl_hmcts.trainers.saving.run_folder.read_run`; changed in place.
     """
     if not run.experiment and run.config:
         known = (
@@ -264,12 +240,7 @@ def recognise(run: RunFolder) -> RunFolder:
 def load_config(run: RunFolder) -> tuple[Experiment, Any]:
     """Return the experiment of a run and its configuration, with ``out`` at the folder.
 
-    Args:
-        run: of :func:`read_run`.
-
-    Raises:
-        ValueError: if ``run.json`` is damaged, or the experiment is unknown or no longer has one of
-            the keys.
+    A ValueError if ``run.json`` is damaged, or the experiment is unknown or lacks one of the keys.
     """
     for sentence in run.damage:
         if "run.json" in sentence:

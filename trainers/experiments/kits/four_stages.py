@@ -13,9 +13,6 @@ def four_stages(expansions: int) -> dict[str, Any]:
     Selection by UCT, expansion of one option, a simulation of ten random options from the new node,
     backup of the mean.
 
-    Args:
-        expansions: options that a search tries, each with its simulation.
-
     Reference:
         Dissertation, section 2.4.2.
     """

@@ -28,12 +28,7 @@ CAPTIONS: Mapping[str, str] = {
 
 
 def start_to_show(trial: Trial, lengths: np.ndarray) -> int:
-    """Return a start that was solved, if any, with a rather long way.
-
-    Args:
-        trial: the episodes.
-        lengths: how far each start is from its goal, ``[M]``.
-    """
+    """Return a start that was solved, if any, with a rather long way, by their lengths ``[M]``."""
     solved = np.flatnonzero(trial.results.solved)
     among = solved if len(solved) else np.arange(len(trial.starts))
     by_length = among[np.argsort(lengths[among], kind="stable")]
@@ -41,14 +36,7 @@ def start_to_show(trial: Trial, lengths: np.ndarray) -> int:
 
 
 def draw_run(kit: Any, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
-    """Draw the pictures of a run.
-
-    Args:
-        kit: the :class:`Kit` of the run.
-        pictures: receives them.
-        learned: the skills.
-        trial: the episodes.
-    """
+    """Draw the pictures of a run."""
     config, captions = kit.config, kit.captions
     shown, episode, search = kit.replay(learned.worker, trial)
     drawing = kit.map(kit.make_env("test"))
@@ -83,13 +71,7 @@ def draw_run(kit: Any, pictures: Pictures, learned: LearnedSkills, trial: Trial)
 
 
 def write_film(drawing: Any, episode: Results, path: str | Path) -> None:
-    """Write an episode as a GIF, and as a video beside it.
-
-    Args:
-        drawing: draws the states of the env, see ``Kit.map``; the env's own pictures go first.
-        episode: with its states and options, or frames.
-        path: of the GIF.
-    """
+    """Write an episode as a GIF, and as a video beside it, of the env's own pictures if there are."""
     from torchrl_hmcts.trainers.figures import animation, maps
 
     if episode.frames or drawing is None:

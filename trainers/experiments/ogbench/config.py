@@ -17,10 +17,6 @@ class OGBenchConfig(RunConfig):
 
     The defaults were chosen on pointmaze-teleport-navigate, seed 0; what differs for ants and in
     puzzles is in the recipe of the dataset.
-
-    Example:
-        >>> OGBenchConfig(id="pointmaze-giant-stitch-v0").episodes
-        50
     """
 
     id: str = "pointmaze-medium-navigate-v0"
@@ -90,12 +86,7 @@ class OGBenchConfig(RunConfig):
         return self.updates or self.recipe.updates
 
     def check_inputs(self) -> None:
-        """Check that there is such a dataset, and OGBench.
-
-        Raises:
-            ExperimentError: if the name is unknown, or the recorded episodes are missing.
-            ModuleNotFoundError: if OGBench is not installed.
-        """
+        """Check that there is such a dataset, and OGBench."""
         super().check_inputs()
         try:
             split_name(self.id)

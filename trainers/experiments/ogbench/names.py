@@ -58,18 +58,7 @@ RECIPES = _POINTS | _ANTS | _PUZZLES
 
 
 def split_name(name: str) -> Recipe:
-    """Return how a dataset is recorded.
-
-    Args:
-        name: as OGBench names it.
-
-    Raises:
-        ValueError: if there is none of that name; the nearest are named.
-
-    Example:
-        >>> split_name("pointmaze-giant-navigate-v0")[:4]
-        ('pointmaze-giant-v0', 'navigate', 500, 2001)
-    """
+    """Return how a dataset is recorded."""
     if name not in RECIPES:
         raise ValueError(unknown_key(name, RECIPES, "dataset"))
     return RECIPES[name]

@@ -29,15 +29,7 @@ class MazeTest:
     last: TensorDictBase  # [S] last state of each episode, with the counters that it has
 
     def summary(self) -> dict[str, float | None]:
-        """Return how many were solved, and the base steps of these episodes and of all.
-
-        Example:
-            >>> from tensordict import TensorDict
-            >>> solved, steps = torch.tensor([True, False]), torch.tensor([30, 100])
-            >>> summary = MazeTest(solved, steps, TensorDict(batch_size=[2])).summary()
-            >>> summary["solved_share"], summary["base_steps_mean"], summary["base_steps_mean_all"]
-            (0.5, 30.0, 65.0)
-        """
+        """Return how many were solved, and the base steps of these episodes and of all."""
         steps = self.base_steps[self.solved].double()
         some = len(steps) > 0
         return {
@@ -61,19 +53,10 @@ def play_mazes(
     seed: int = 0,
     watch: Callable[[TensorDictBase], Any] | None = None,
 ) -> MazeTest:
-    """Play one episode from each start, all side by side, until it ends by itself or is cut off.
+    """Play one episode from each start ``[S]``, side by side, until it ends or is cut off.
 
-    Args:
-        policy: writes ``"action"``.
-        env: stateless; may be transformed. It is set to the starts.
-        starts: states ``[S]``, as ``make_starts`` gives them.
-        deterministic: take the most probable actions. Default: sample.
-        seed: of the sampling.
-        watch: called after every step with the transitions of the running episodes, which have the
-            entry ``"start"`` (int64, from which of the starts).
-
-    Returns:
-        Their results.
+    ``watch`` is called after every step with the transitions of the running episodes, which have
+    the entry ``"start"`` (int64, from which of the starts).
 
     Example:
         >>> from torchrl_hmcts.envs import WaterworldMazeEnv

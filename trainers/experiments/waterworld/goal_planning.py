@@ -219,19 +219,7 @@ class TilePlanner:
 
 
 def tile_moves(mazes: Tensor) -> np.ndarray:
-    """Read the moves of the Gridworld off by one step with each action from each tile.
-
-    Args:
-        mazes: bool ``[M, H, W]``.
-
-    Returns:
-        int16 array ``[M, T, A]``: the tile that an action leads to.
-
-    Example:
-        >>> import torch
-        >>> tile_moves(torch.zeros(1, 1, 2, dtype=torch.bool))[0].tolist()  # up to right, none
-        [[0, 0, 0, 1, 0], [1, 1, 0, 1, 1]]
-    """
+    """Read off the Gridworld of ``[M, H, W]`` which tile an action leads to, int16 ``[M, T, A]``."""
     env = GridworldMazeEnv(mazes, observation=False, seed=0)
     num_tiles, num_actions = env.height * env.width, int(env.action_spec.space.n)
     state = env.reset().expand(env.num_mazes, num_tiles, num_actions).clone()

@@ -27,36 +27,22 @@ _CACHE_SIZE = 4096
 class MazeNetwork(TensorDictModuleBase):
     r"""Prior and value for mazes of tiles: learned step costs, shortest paths, a small head.
 
-    A convolution over the walls gives each tile the costs :math:`c > 0` of moving to its 8
-    neighbours. Shortest paths by these costs give each tile its distance to the target,
+    A convolution over the walls of ``mazes``, bool ``[M, H, W]``, gives each tile the costs
+    :math:`c > 0` of moving to its 8 neighbours. Shortest paths by these costs give each tile its
+    distance to the target,
 
     .. math:: d(x) = \min\bigl(d_0(x),\ \min_{y \in N(x)} c(x, y) + d(y)\bigr), \qquad
               d_0(x) = \lVert x - x_{target} \rVert_\infty \text{ if below 1, else far,}
 
     through which gradients flow along the shortest paths: value iteration inside the network, in
     logarithms of values. A fully connected head reads the distances and walls of the 3 x 3 tiles
-    around the player, its place in its tile, its velocity and the near target, and writes logits of
-    the options and the base steps :math:`n` to the target; the value is :math:`\gamma^n`.
+    around the player, its place in its tile, its velocity and the near target, and writes
+    ``"logits"`` of the options, ``[*B, A]``, and the base steps :math:`n` to the target; the
+    ``"state_value"``, ``[*B, 1]``, is :math:`\gamma^n`. A tile is ``steps_per_tile`` base steps,
+    what it takes at the speed that thrust reaches.
 
     Without gradients the distances of a maze and its target are computed once and kept until a
     weight changes, so that a planner pays only for the head at each node of a tree.
-
-    Args:
-        mazes: bool ``[M, H, W]``, True = wall, that ``"maze_index"`` counts. Not part of the state
-            dict: see :meth:`on`.
-        num_options: A. Default 4.
-        gamma: discount per base step, as in the macro environment. Default 0.99.
-        channels: C of the convolution. Default 32.
-        hidden: width of the head's two hidden layers. Default 64.
-        steps_per_tile: unit of the distances in base steps. Default 15, what a tile takes at the
-            speed that thrust reaches.
-        keys: entries read: place, velocity, target (float ``[*B, 2]``, in tiles), number of the
-            maze (int64 ``[*B]``). Default: Waterworld's.
-
-    Writes: ``"logits"`` (float ``[*B, A]``), ``"state_value"`` (float ``[*B, 1]``).
-
-    Raises:
-        ValueError: if ``mazes`` has not three dimensions, or a number is out of its range.
 
     Reference:
         Tamar et al., "Value iteration networks", 2016, arXiv 1602.02867, for planning inside a
@@ -171,9 +157,8 @@ class MazeNetwork(TensorDictModuleBase):
     def fields(self, maze: Tensor, target: Tensor) -> Tensor:
         """Return what is known of mazes ``[U]`` and targets ``[U, 2]`` before looking at states.
 
-        Returns:
-            Distance to the target in tiles, and 1 where a tile is free; both with one tile around
-            the maze, ``[U, 2, H + 2, W + 2]``.
+        That is the distance to the target in tiles, and 1 where a tile is free; both with one tile
+        around the maze, ``[U, 2, H + 2, W + 2]``.
         """
         free = self.free[maze]  # [U, H, W]
         costs = F.softplus(self.costs(free[:, None])) + 0.01
@@ -252,22 +237,8 @@ def shortest_distances(costs: Tensor, start: Tensor) -> Tensor:
     .. math:: d(x) = \min\bigl(d_0(x),\ \min_{y \in N(x)} c(x, y) + d(y)\bigr), \qquad
               \frac{\partial d(x)}{\partial c(y, z)} = 1 \text{ if } (y, z) \text{ is on the path}
 
-    Args:
-        costs: of moving from a tile to its 8 neighbours, row by row, float ``[U, 8, H, W]``,
-            positive.
-        start: distance of a tile if a path ends there, float ``[U, H, W]``.
-
-    Returns:
-        Distances, float ``[U, H, W]``.
-
-    Raises:
-        ValueError: if the shapes do not fit each other.
-
-    Example:
-        >>> import torch
-        >>> costs, start = torch.ones(1, 8, 1, 3), torch.tensor([[[0.0, 99.0, 99.0]]])
-        >>> shortest_distances(costs, start)
-        tensor([[[0., 1., 2.]]])
+    of costs of moving to the 8 neighbours, row by row, ``[U, 8, H, W]``, and the distances with
+    which paths may end, ``[U, H, W]``.
     """
     if costs.shape != (start.shape[0], 8, *start.shape[1:]):
         raise ValueError(
