@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from torchrl_hmcts.envs import LabMazeEnv
-from torchrl_hmcts.envs.lab.actions import NATIVE_ACTIONS
-from torchrl_hmcts.envs.lab.view import heading_degrees
+from torchrl_hmcts.envs.lab.states import NATIVE_ACTIONS, heading_degrees
 
 SIZES = {"demos/random_maze": 15, "nine": 9}
 

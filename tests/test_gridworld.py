@@ -11,7 +11,7 @@ from torchrl_hmcts.envs import (
     GridworldMazeEnv,
     maze_from_text,
     maze_pool,
-    shortest_path,
+    shortest_path_lengths,
 )
 from torchrl_hmcts.envs.mazes.layouts import wall_centers
 
@@ -92,15 +92,18 @@ class TestMoves:
         env = GridworldMazeEnv(maze_pool("test"), seed=index)
         td = env.reset()
         maze = env.mazes[td["maze_index"]]
-        tiles = (divmod(td[key].item(), 9) for key in ("player_tile", "target_tile"))
-        path = shortest_path(maze, *tiles)
-        moves = {(-1, 0): UP, (1, 0): DOWN, (0, -1): LEFT, (0, 1): RIGHT}
-        actions = [moves[tuple(move)] for move in (path[1:] - path[:-1]).tolist()]
+        (row, col), target = (divmod(td[key].item(), 9) for key in ("player_tile", "target_tile"))
+        lengths = shortest_path_lengths(maze, target)
+        moves = {UP: (-1, 0), DOWN: (1, 0), LEFT: (0, -1), RIGHT: (0, 1)}
         rewards = []
-        for action in actions:
+        while left := int(lengths[row, col]):
+            after = {a: (row + r, col + c) for a, (r, c) in moves.items()}
+            inside = {a: t for a, t in after.items() if 0 <= min(t) and max(t) < 9}
+            action = next(a for a, t in inside.items() if lengths[t] == left - 1)
+            (row, col) = after[action]
             td = env.step(td.set("action", torch.tensor(action)))["next"]
             rewards.append(td["reward"].item())
-        assert rewards == [0.0] * (len(actions) - 1) + [1.0]
+        assert rewards == [0.0] * (len(rewards) - 1) + [1.0]
 
 
 class TestObservation:

@@ -33,7 +33,7 @@ _ACTUATORS = [6, 7, 0, 1, 2, 3, 4, 5]  # are those of legs 4, 1, 2 and 3
 
 
 def seen_from(frame: Sequence[Any], x: Any, y: Any) -> tuple[Any, Any]:
-    """Return a vector (x, y) as seen in a frame: cosine and sine of its first axis, each ``[*B]``."""
+    """Return (x, y) as seen in a frame: cosine and sine of its first axis, each ``[*B]``."""
     c, s = frame
     return c * x + s * y, c * y - s * x
 

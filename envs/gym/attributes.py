@@ -11,8 +11,13 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.generators import generator_state, set_generator_state
-from torchrl_hmcts.envs.gym.marks import ATOMS, Seen, look_through
+from torchrl_hmcts.envs.gym.marks import (
+    ATOMS,
+    Seen,
+    generator_state,
+    look_through,
+    set_generator_state,
+)
 from torchrl_hmcts.envs.gym.snapshots import (
     DEFAULT_CAP,
     KNOWN_WRAPPERS,

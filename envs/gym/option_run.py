@@ -20,7 +20,7 @@ from torchrl.data.utils import CloudpickleWrapper
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
-from torchrl_hmcts.envs.gym.generators import generator_memory, set_generator_state
+from torchrl_hmcts.envs.gym.marks import generator_memory, set_generator_state
 from torchrl_hmcts.envs.gym.quick import quick_step
 from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
 from torchrl_hmcts.envs.gym.snapshots import (

@@ -17,10 +17,10 @@ from torch import Tensor
 from torchrl.data import Unbounded, UnboundedDiscrete
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 from torchrl_hmcts.envs.lab.kernels import APPLES, FRAME, GOAL_MET, SPAWN_HEADING
 from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
 from torchrl_hmcts.envs.lab.read_outs import READ_OUTS
+from torchrl_hmcts.envs.lab.states import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 
 _MODULE = "deepmind_lab"
 _NUMBERS = ("uint8", "int32", "int64", "float32", "float64")

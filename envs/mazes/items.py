@@ -100,7 +100,7 @@ class PlacedItems:
     def take(
         self, maze: np.ndarray, position: np.ndarray, left: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Take what players touch, of mazes ``[n]``, positions ``[n, 2]`` and items left ``[n, K]``.
+        """Take what players touch: mazes ``[n]``, positions ``[n, 2]``, items left ``[n, K]``.
 
         Returns what is left, bool ``[n, K]``, the worth of what was taken, float32 ``[n]``, and
         whether the target is open, bool ``[n]``.

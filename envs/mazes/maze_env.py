@@ -156,7 +156,7 @@ class MazeEnv(EnvBase):
 
     @abstractmethod
     def draw_map(self, axes: Any, tensordict: TensorDictBase) -> None:
-        """Draw walls and target of a state in axes of matplotlib, in the units of ``"position"``."""
+        """Draw walls and target of a state in matplotlib axes, in the units of ``"position"``."""
 
     def _repr_html_(self) -> str:
         first = TensorDict({"maze_index": torch.tensor(0)})

@@ -25,7 +25,6 @@ from torchrl_hmcts.trainers.experiments.settings import WaterworldA3CConfig, Wat
 from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
     MazeTest,
     play_mazes,
-    run_goal_episodes,
 )
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
     make_goal_env,
@@ -269,7 +268,8 @@ def _draw_episode(
     by_length = among[test.base_steps[among].argsort(stable=True)]
     shown = int(by_length[int(0.85 * (len(by_length) - 1))])
     start = starts[shown]
-    track = run_goal_episodes(env, policy, starts[shown : shown + 1], record=True).tracks[0]
+    one = starts[shown : shown + 1]
+    track = play_mazes(policy, env, one, deterministic=True, record=True).tracks[0]
     words = "A test maze: the player (blue) follows the goals (magenta) to the target (green)."
     if not track.solved:
         steps = len(track.positions) - 1

@@ -31,14 +31,14 @@ from torchrl_hmcts.trainers.evaluation import (
     option_reach,
     plan_and_execute,
 )
-from torchrl_hmcts.trainers.experiments.kits.four_stages import four_stages
 from torchrl_hmcts.trainers.experiments.kits.showing import (
     CAPTIONS,
+    LearnedSkills,
+    Trial,
     draw_run,
     start_to_show,
     write_film,
 )
-from torchrl_hmcts.trainers.experiments.kits.trial import LearnedSkills, Trial
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.manager import make_manager, scale_by
@@ -257,18 +257,26 @@ class Kit:
     # ------------------------------------------------------- the planner
 
     def planner_part(self) -> dict[str, Any]:
-        """Return the entries of the planner at the kit's defaults, by keyword."""
-        config = self.config
-        if config.manager == "four_stages":
-            return four_stages(config.expansions)
-        return {
-            "_component_": "torchrl_hmcts.planners.MCTSPlanner",
-            "novelty": self.novelty_part(),
+        """Return the entries of the planner at the kit's defaults, by keyword.
+
+        With ``manager="four_stages"`` they are the dissertation's (section 2.4.2): UCT, expansion
+        of one option, a simulation of ten random options from there, backup of the mean.
+        """
+        config, planners = self.config, "torchrl_hmcts.planners"
+        part: dict[str, Any] = {
+            "_component_": f"{planners}.MCTSPlanner",
             "budget": {
-                "_component_": "torchrl_hmcts.planners.SearchBudget",
+                "_component_": f"{planners}.SearchBudget",
                 "expansions": config.expansions,
             },
-            "leaves_per_wave": config.leaves_per_wave,
+        }
+        if config.manager != "four_stages":
+            own = {"novelty": self.novelty_part(), "leaves_per_wave": config.leaves_per_wave}
+            return part | own
+        return part | {
+            "tree_policy": {"_component_": f"{planners}.UCT"},
+            "leaf_evaluator": {"_component_": f"{planners}.RolloutEvaluator"},
+            "expand": "one",
         }
 
     def parts(self) -> dict[str, dict[str, Any]]:

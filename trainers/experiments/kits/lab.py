@@ -51,7 +51,7 @@ TURN_ACTIONS = ("forward", "look left", "look right")
 
 
 def make_lab_env(maze_seeds: Sequence[int] = range(TRAINING_MAZES), **kwargs: Any) -> LabMazeEnv:
-    """Build the maze as the experiment plays it: only the goal is rewarded, and ends the episode."""
+    """Build the maze as the experiment plays it: only the goal is rewarded, and ends it."""
     settings: dict[str, Any] = {
         "num_steps": 4,
         "apple_reward": 0.0,  # a search ends with the first reward, which is to be the goal's

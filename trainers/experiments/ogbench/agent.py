@@ -109,7 +109,7 @@ class Learned:
 
 
 def make_loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
-    """Return the loss of a worker that reads ``"observation"`` and ``"goal"``, writes ``"action"``."""
+    """Return the loss of a worker of ``"observation"`` and ``"goal"`` that writes ``"action"``."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         actions, seen = data["action"].shape[-1], data["observation"].float()

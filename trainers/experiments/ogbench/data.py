@@ -19,7 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.gym.settable import make_gym
-from torchrl_hmcts.trainers.experiments.ogbench.names import Recipe, split_name
+from torchrl_hmcts.trainers.experiments.ogbench.config import Recipe, split_name
 from torchrl_hmcts.trainers.saving.files import replacing
 
 Cell = tuple[int, int]

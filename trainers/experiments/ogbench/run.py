@@ -22,9 +22,8 @@ from torchrl_hmcts.trainers.experiments.ogbench.agent import (
     make_agent,
     make_loss,
 )
-from torchrl_hmcts.trainers.experiments.ogbench.config import FOLDER, OGBenchConfig
+from torchrl_hmcts.trainers.experiments.ogbench.config import FOLDER, OGBenchConfig, split_name
 from torchrl_hmcts.trainers.experiments.ogbench.data import load, quiet, record, save
-from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.figures.intervals import wilson
 from torchrl_hmcts.trainers.runs.console import counted, table
 from torchrl_hmcts.trainers.runs.run import open_run
@@ -131,7 +130,7 @@ def play_tasks(
 def act_once(
     env: gymnasium.Env, agent: OptionAgent, task: int, seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Act in one episode of a task, 1 to 5, whose start, goal and chance are drawn from ``seeds``."""
+    """Act in one episode of a task, 1 to 5; start, goal and chance are drawn from ``seeds``."""
     seed = int(np.random.SeedSequence(seeds).generate_state(1)[0])
     env.seed_globals(seed)  # type: ignore[attr-defined]
     begin = time.process_time()

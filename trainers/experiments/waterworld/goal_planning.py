@@ -219,7 +219,7 @@ class TilePlanner:
 
 
 def tile_moves(mazes: Tensor) -> np.ndarray:
-    """Read off the Gridworld of ``[M, H, W]`` which tile an action leads to, int16 ``[M, T, A]``."""
+    """Read off the Gridworld of ``[M, H, W]`` where actions lead, int16 ``[M, T, A]``."""
     env = GridworldMazeEnv(mazes, observation=False, seed=0)
     num_tiles, num_actions = env.height * env.width, int(env.action_spec.space.n)
     state = env.reset().expand(env.num_mazes, num_tiles, num_actions).clone()
