@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium import spaces
 
 from torchrl_hmcts.envs.gym.mujoco import find_physics
@@ -111,21 +112,16 @@ class Turn(NamedTuple):
         return turned * self.sign[quarters].astype(x.dtype)
 
 
-def _joined(*blocks: np.ndarray) -> np.ndarray:
-    size = sum(map(len, blocks))
-    whole, at = np.zeros((size, size)), 0
-    for block in blocks:
-        whole[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return whole
+def _block_diag(*blocks: np.ndarray) -> np.ndarray:
+    return torch.block_diag(*map(torch.from_numpy, blocks)).numpy()
 
 
 def turns() -> tuple[Turn, Turn, Turn]:
     """Return the turns of what :func:`body_of` returns, of an action and of a vector in a plane."""
     one, plane = np.ones((1, 1)), np.array([[0.0, 1.0], [-1.0, 0.0]])
-    space = _joined(plane, one)
+    space = _block_diag(plane, one)
     legs = np.eye(8)[_LEGS] * np.array(_BENDS)[:, None]
-    body = _joined(one, np.kron(space, space), legs, space, space, legs)
+    body = _block_diag(one, np.kron(space, space), legs, space, space, legs)
     order = np.eye(8)[_ACTUATORS]
     return Turn.of(body), Turn.of(order @ legs @ order.T), Turn.of(plane)
 

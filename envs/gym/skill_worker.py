@@ -48,9 +48,6 @@ class SkillWorker:
         ValueError: if ``skills`` does not fit the actor.
         OSError: if there is too little shared memory.
 
-    Reference:
-        This project's; the actors are those of :mod:`torchrl_hmcts.modules`.
-
     Example:
         >>> from torchrl.data import Categorical
         >>> from torchrl_hmcts.envs import OptionPool, SkillWorker
@@ -92,14 +89,7 @@ class SkillWorker:
         self.load(actor)
 
     def load(self, actor: SkillActor) -> None:
-        """Take over the weights of an actor of the same shape, in the processes too.
-
-        Args:
-            actor: as that of the constructor.
-
-        Raises:
-            ValueError: if its network has other sizes.
-        """
+        """Take over the weights of an actor of the same shape, in the processes too."""
         if self._weights is not None:
             self._weights.load(actor.network.parameters())
             return
@@ -200,9 +190,6 @@ class PolicyWorker:
         ValueError: if ``num_options`` is below 1.
         OSError: if there is too little shared memory.
 
-    Reference:
-        This project's; recurrent modules are those of ``torchrl.modules``.
-
     Example:
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential
         >>> from torchrl.modules import GRUModule
@@ -235,14 +222,7 @@ class PolicyWorker:
         self._memory: TensorDictBase | None = None
 
     def load(self, policy: TensorDictModuleBase) -> None:
-        """Take over the weights of a policy of the same shape, in the processes too.
-
-        Args:
-            policy: as that of the constructor.
-
-        Raises:
-            RuntimeError: if its weights have other names or shapes.
-        """
+        """Take over the weights of a policy of the same shape, in the processes too."""
         self._policy.load_state_dict(policy.state_dict())  # copies, into the shared memory
 
     def begin(self, observation: Any, option: int) -> None:

@@ -64,9 +64,6 @@ class Snapshot(ABC):
         ...     width = 4 * 8
         ...     def __init__(self, env):
         ...         self.inner = env.unwrapped
-        ...     @classmethod
-        ...     def fits(cls, env):
-        ...         return type(env.unwrapped).__name__ == "AcrobotEnv"
         ...     def read(self):
         ...         return np.array(self.inner.state, np.float64).view(np.uint8)
         ...     def restore(self, row):
@@ -78,9 +75,9 @@ class Snapshot(ABC):
     width: int
 
     @classmethod
-    @abstractmethod
     def fits(cls, env: gymnasium.Env) -> bool:
         """Return whether this kind of snapshot stores such an env."""
+        return True
 
     @abstractmethod
     def read(self) -> np.ndarray:
@@ -88,32 +85,16 @@ class Snapshot(ABC):
 
     @abstractmethod
     def restore(self, row: np.ndarray) -> None:
-        """Put the env into a state.
-
-        Args:
-            row (ndarray): uint8 ``[width]``, as :meth:`read` returned it.
-        """
+        """Put the env into a state, uint8 ``[width]``, as :meth:`read` returned it."""
 
     def note_reset(self, seed: int | None) -> None:  # noqa: B027  most kinds need no note
-        """Take note that the env is about to be reset; whoever resets it calls this first.
-
-        Args:
-            seed (int, optional): of the reset.
-        """
+        """Take note that the env is about to be reset; whoever resets it calls this first."""
 
     def note_step(self, action: Any) -> None:  # noqa: B027
-        """Take note that the env is about to take a step; whoever steps it calls this first.
-
-        Args:
-            action: of the step.
-        """
+        """Take note that the env is about to take a step; whoever steps it calls this first."""
 
     def note_redraw(self, seed: int) -> None:  # noqa: B027
-        """Take note that the generators were given other numbers; whoever redraws calls this.
-
-        Args:
-            seed: as of :func:`redraw`.
-        """
+        """Take note that :func:`redraw` gave the generators other numbers, of this seed."""
 
 
 def env_layers(env: gymnasium.Env) -> list[gymnasium.Env]:
@@ -191,10 +172,6 @@ class ReplaySnapshot(Snapshot):
             longer.
     """
 
-    @classmethod
-    def fits(cls, env: gymnasium.Env) -> bool:
-        return True
-
     def __init__(self, env: gymnasium.Env, *, max_steps: int | None = None) -> None:
         self.env = env
         limit = env.spec.max_episode_steps if env.spec is not None else None
@@ -246,7 +223,9 @@ class ReplaySnapshot(Snapshot):
         redraws = np.frombuffer(taken[: 8 * steps], np.uint64).tolist()
         actions = list(np.frombuffer(taken[8 * steps :], self._dtype).reshape(steps, *self._shape))
         known = len(self._actions)
-        on_the_way = self._redraws == redraws[:known] and _same(self._actions, actions)
+        on_the_way = self._redraws == redraws[:known] and all(
+            map(np.array_equal, self._actions, actions)
+        )
         if seed != self._seed or self._redraw or not on_the_way:
             self.note_reset(seed)
             self.env.reset(seed=seed)
@@ -255,14 +234,7 @@ class ReplaySnapshot(Snapshot):
         for again, action in zip(redraws[known:], actions[known:], strict=True):
             if again:
                 redraw(self._layers, again)
-            self.env.step(self._plain(action))
-
-    def _plain(self, action: np.ndarray) -> Any:
-        return action if self._shape else action[()]
-
-
-def _same(taken: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(taken, other, strict=False))
+            self.env.step(action if self._shape else action[()])
 
 
 class FunctionSnapshot(Snapshot):
@@ -271,10 +243,6 @@ class FunctionSnapshot(Snapshot):
     ``read(env)`` gives bytes or an array, of one size every time; ``restore(env, row)`` takes uint8
     ``[width]``.
     """
-
-    @classmethod
-    def fits(cls, env: gymnasium.Env) -> bool:
-        return False
 
     def __init__(
         self,

@@ -210,19 +210,15 @@ class ChipmunkMazes:
         """
         if self._process != os.getpid():  # the space may have been in the middle of a step
             self.__setstate__(self.__getstate__())
+        if not len(maze_index):
+            return position.copy(), velocity.copy()
         with self._lock:
             return self._step(maze_index, position, velocity, acceleration)
 
     def _step(
-        self,
-        maze_index: npt.NDArray[np.int64],
-        position: Float32Array,
-        velocity: Float32Array,
-        acceleration: Float32Array,
+        self, maze_index: Any, position: Any, velocity: Any, acceleration: Any
     ) -> tuple[Float32Array, Float32Array]:
         n = len(maze_index)
-        if n == 0:
-            return position.copy(), velocity.copy()
         if n > self._capacity or n * 4 < self._capacity:
             self._resize(n)
         if not self._built[maze_index].all():

@@ -264,8 +264,9 @@ def _large(size: int) -> Tensor:
 
 @lru_cache(maxsize=1)
 def _pool() -> Tensor:
-    bits = np.unpackbits(np.load(Path(__file__).with_name("pool.npy")), count=POOL_SIZE * 81)
-    return torch.from_numpy(bits.astype(np.bool_).reshape(POOL_SIZE, 9, 9))
+    bits = np.fromfile(Path(__file__).with_name("pool.bin"), np.uint8)
+    walls = np.unpackbits(bits, count=POOL_SIZE * 81).astype(np.bool_)
+    return torch.from_numpy(walls.reshape(POOL_SIZE, 9, 9))
 
 
 def check_mazes(mazes: Tensor) -> None:

@@ -16,25 +16,13 @@ from torchrl_hmcts.trainers.saving.run_folder import RunFolder
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment: what it shows, how it is set up, and what runs it.
+    """One experiment: its name and summary, its configuration, and what runs it.
 
-    Args:
-        name: as in ``hmcts train experiment=NAME``.
-        summary: one line for the list.
-        config: dataclass of its keys, as ``".module:Class"``, relative to this package.
-        run: function of that configuration which returns the figures, as ``".module:function"``.
-        evaluate: function of a configuration, whose ``out`` is the folder of a run, that tests the
-            newest checkpoint there and returns the figures; for ``hmcts evaluate``. Default: none.
-        objective: figure that a sweep improves, e.g. ``"test.solved"``, larger is better; with a
-            minus before it, smaller is better. Default: none, the user has to name one.
-        progress: logged value by which a sweep gives up trials early. Default: none.
-        kit: its name in ``hmcts train kit=NAME``. Default: none.
-        figures: names of the figures that a run gives, nested ones joined by dots. Default:
-            unknown.
-
-    Example:
-        >>> find_experiment("waterworld_goals").config_class(seed=3).seed
-        3
+    ``config``, ``run`` and ``evaluate``, which tests the newest checkpoint of the run in ``out``,
+    are paths ``".module:name"`` in this package. ``objective`` is the figure that a sweep improves,
+    larger is better unless a minus precedes it; ``progress`` the logged value by which it gives up
+    trials; ``kit`` the name in ``hmcts train kit=NAME``; ``figures`` the names of a run's figures,
+    nested ones joined by dots, if they are known.
     """
 
     name: str
