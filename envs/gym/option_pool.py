@@ -42,24 +42,30 @@ class OptionPool(ProcessPool):
     Writes, besides the observation: ``"snapshot"`` (uint8 ``[*B, width]``), ``"duration"`` (int64
     ``[*B, 1]``, base steps), and ``"features"`` (``[*B, F]``) where ``features`` are given.
 
-        Args: env (str or callable): an id, or a function that makes the env, called in each
-        process. worker (OptionWorker): e.g. :class:`RepeatActions` or :class:`SkillWorker`. It is
-        sent to each process once; weights in shared memory stay shared, so that updates are seen at
-        once. max_steps (int): base steps after which an option ends. num_processes (int, optional):
-        0 runs the options in the calling process. Default: one for each core. gamma (float):
-        discount per base step; the planner takes it over. Default 0.99. determinised (bool): see
-        above. Default True. snapshot, cap: as in :class:`SettableGymEnv`. features (callable,
-        optional): ``features(env, observation)`` gives an array ``[F]`` of the state at an option's
-        end, e.g. a place for a novelty test that no observation has. still (float): an option ends
-        early when it moves the features less than this within a fifth of ``max_steps``, e.g. at a
-        wall. Default 0: never. start_method ("forkserver" or "spawn"): how processes are started.
-        Default forkserver, or spawn where the path of the temporary folder (``TMPDIR``) is too long
-        for it. As always with :mod:`multiprocessing`, a script needs ``if __name__ ==
-        "__main__":``. step_seconds (float): longest time for one step of the worker and the env,
-        seconds. A process that neither steps nor uses the processor for so long is replaced; one
-        that computes without a step, after ten times as long, at least two minutes. Default 60.
-        batch_size (sequence of int): of ``reset()`` without a tensordict. Default none. seed (int,
-        optional): of starts and of the draws inside options. **keywords: of ``gymnasium.make``.
+    Args:
+        env (str or callable): an id, or a function that makes the env, called in each process.
+        worker (OptionWorker): e.g. :class:`RepeatActions` or :class:`SkillWorker`. It is sent to
+            each process once; weights in shared memory stay shared, so that updates are seen at
+            once.
+        max_steps (int): base steps after which an option ends.
+        num_processes (int, optional): 0 runs the options in the calling process. Default: one for
+            each core.
+        gamma (float): discount per base step; the planner takes it over. Default 0.99.
+        determinised (bool): see above. Default True.
+        snapshot, cap: as in :class:`SettableGymEnv`.
+        features (callable, optional): ``features(env, observation)`` gives an array ``[F]`` of the
+            state at an option's end, e.g. a place for a novelty test that no observation has.
+        still (float): an option ends early when it moves the features less than this within a fifth
+            of ``max_steps``, e.g. at a wall. Default 0: never.
+        start_method ("forkserver" or "spawn"): how processes are started. Default forkserver, or
+            spawn where the path of the temporary folder (``TMPDIR``) is too long for it. As always
+            with :mod:`multiprocessing`, a script needs ``if __name__ == "__main__":``.
+        step_seconds (float): longest time for one step of the worker and the env, seconds. A
+            process that neither steps nor uses the processor for so long is replaced; one that
+            computes without a step, after ten times as long, at least two minutes. Default 60.
+        batch_size (sequence of int): of ``reset()`` without a tensordict. Default none.
+        seed (int, optional): of starts and of the draws inside options.
+        **keywords: of ``gymnasium.make``.
 
     Raises:
         TypeError: if ``env`` is an env, which cannot be sent to processes.
