@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.settings import DemoConfig, SkillsConfig
     from torchrl_hmcts.trainers.experiments.skills import learn, solve
     from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
-        GoalEpisodes,
         GoalTrack,
-        run_goal_episodes,
+        play_mazes,
     )
     from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
         TilePlanner,
