@@ -279,15 +279,14 @@ class AtariRun:
         if not isinstance(manager, ReactiveManager) or pool is None:
             return
         pool.set_seed(_PRACTICE_SEED + self.kit.start_seed(len(self.scores), sticky=self.sticky))
-        rest = self.num_frames - manager.practised
+        before = manager.practised
+        rest = self.num_frames - before
         while (due := rest * share / (1.0 - share) - manager.practised) > 0:
             manager.practise(pool, min(math.ceil(due), _PRACTICE_FRAMES))
             tick()
-        scores = manager.scores
-        mean = sum(scores) / max(1, len(scores))
-        console.note(
-            f"Practice: {manager.practised:,} frames, the latest episodes score {mean:.1f}"
-        )
+        if manager.scores and manager.practised > before:
+            mean = sum(manager.scores) / len(manager.scores)
+            console.note(f"Practice: {manager.practised:,} frames, latest episodes {mean:.1f}")
 
     def _begin_episode(self, agent: AtariAgent) -> None:
         self._seed_episode(agent)

@@ -125,6 +125,9 @@ class ReactiveManager:
         instance(name, "hidden", hidden, Sequence)
         self.imitation_coeff = real_number(name, "imitation_coeff", imitation_coeff, least=0.0)
         self.uniform_share = real_number(name, "uniform_share", uniform_share, least=0.0, most=1.0)
+        real_number(name, "lr", lr, above=0.0)
+        real_number(name, "gamma", gamma, above=0.0, most=1.0)
+        real_number(name, "entropy_coeff", entropy_coeff, least=0.0)
         self.num_options, self.num_envs, self.steps = num_options, num_envs, steps
         self.epochs, self.batch_size = epochs, batch_size
         widths = list(hidden)
