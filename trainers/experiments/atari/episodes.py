@@ -211,7 +211,8 @@ class AtariRun:
     @property
     def _played_enough(self) -> bool:
         config = self.config
-        enough = config.guide != "reactive" and len(self.scores) >= config.episodes
+        practising = config.guide == "reactive" and config.practice > 0.0
+        enough = not practising and len(self.scores) >= config.episodes
         return enough or self.num_frames >= config.frames
 
     def kept(self) -> str:
