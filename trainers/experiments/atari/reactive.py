@@ -52,8 +52,9 @@ class ReactiveManager:
 
     .. math:: -\lambda\, \mathbb{E}_{s, o} \log \pi_\theta(o \mid s)
 
-    over such labels. As the agent's ``guide`` it gives the prior of PUCT, a share of it uniform,
-    and the values of leaves. It plays alone by :meth:`act`, or in an agent with
+    over such labels. As the agent's ``guide`` it is called with the RAM, uint8 ``[K, 128]``, and
+    gives the prior of PUCT ``[K, Z]``, a share of it uniform, and the values of leaves ``[K, 1]``.
+    It plays alone by :meth:`act`, or in an agent with
     ``AtariSearch(ratio=0)``.
 
     Args:
