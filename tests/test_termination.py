@@ -16,7 +16,6 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
 from torchrl_hmcts.modules import (
-    AnyTermination,
     LearnedTermination,
     StallTermination,
     TerminationNetwork,
@@ -197,17 +196,6 @@ class TestStallTermination:
                 ChainEnv(6),
                 OptionTransform(skill_is_action(), 2, 9, termination=StallTermination(2)),
             )
-
-
-class TestAnyTermination:
-    def test_it_ends_where_any_condition_does(self):
-        td = TensorDict(state=torch.arange(4), batch_size=[4])
-        either = AnyTermination(lambda td: td["state"] == 1, lambda td: td["state"][:, None] == 3)
-        assert either(td).tolist() == [False, True, False, True]
-
-    def test_it_reads_what_its_conditions_read(self):
-        either = AnyTermination(StallTermination(2, "a", "k"), StallTermination(3, "b", "k"))
-        assert either.in_keys == ["a", "k", "b"]
 
 
 class Logits(nn.Module):

@@ -22,14 +22,12 @@ from torchrl_hmcts.modules.skill_prior import (
 )
 from torchrl_hmcts.modules.skill_spec import UnitSphere, spread_skills
 from torchrl_hmcts.modules.termination import (
-    AnyTermination,
     LearnedTermination,
     StallTermination,
     TerminationNetwork,
 )
 
 __all__ = [
-    "AnyTermination",
     "ConcatSkillMLP",
     "EffectModel",
     "FixedSkillPrior",
@@ -57,9 +55,3 @@ __all__ = [
     "find_jumps",
     "spread_skills",
 ]
-
-
-def __getattr__(name: str) -> type:
-    if name == "GaussianSkillActor":  # its name until SkillActor took bounded specs too
-        return SkillActor
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

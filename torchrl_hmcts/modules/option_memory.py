@@ -27,8 +27,8 @@ class OptionMemory:
     .. math:: o_i = o, \qquad i = \arg\min_j \lVert \phi(s) - \phi(s_j) \rVert, \qquad
         \lVert \phi(s) - \phi(s_i) \rVert \le r
 
-    A plan that failed because the model erred is else made again and again from the same state:
-    planner, model and env are deterministic. State entries change by what they changed then.
+    A plan that failed because the model erred is else made again and again from the same state.
+    State entries change by what they changed then.
 
     Args:
         model (OptionModel): whose predictions are replaced.

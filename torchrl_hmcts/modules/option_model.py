@@ -27,16 +27,14 @@ class OptionModel(TensorDictModuleBase):
     .. math:: \hat s' = s + \mu + \sigma f_s(s, o), \quad \hat R(s, o), \quad \hat k(s, o), \quad
         \hat p(s, o) = \operatorname{sigmoid} f_p(s, o)
 
-    with :math:`\mu, \sigma` mean and standard deviation in the data (:meth:`fit_normalization`),
-    so that all outputs are of order 1. What is written is the mean over the members; their
-    disagreement about :math:`s'` tells where data were missing. Entries that are not named in
-    ``delta_keys`` are not predicted: an :class:`OptionModelEnv` carries them over.
+    with :math:`\mu, \sigma` mean and standard deviation in the data (:meth:`fit_normalization`).
+    What is written is the mean over the members; their disagreement about :math:`s'` tells where
+    data were missing. An :class:`OptionModelEnv` carries over what ``delta_keys`` do not name.
 
     Args:
         make_network (callable): ``make_network(out_features) -> nn.Module``, called once for each
             member. The module is called with the entries ``in_keys`` in order and returns ``[*B,
-            out_features]``, with ``out_features`` = D + 3. All members must be built alike; their
-            parameters are stacked and they run as one.
+            out_features]``, with ``out_features`` = D + 3. Members are alike and run as one.
         in_keys (sequence of NestedKey): entries the networks read, the option among them if it is
             one of their inputs.
         delta_keys (mapping): the state entries that are predicted, and the shape of each without
@@ -45,8 +43,7 @@ class OptionModel(TensorDictModuleBase):
         max_duration (int): base steps an option takes at most; predictions lie in 1 to this.
         num_models (int): members of the ensemble, K. Default 1: no disagreement is known.
         features (TensorDictModuleBase, optional): run before the networks, once for all members;
-            what it writes can be named in ``in_keys``. It has no part in the ensemble, but is a
-            sub-module. Default: none.
+            what it writes can be named in ``in_keys``. Default: none.
         reward_key, duration_key, terminated_key (NestedKey): names of the outcomes, under
             ``"next"``. Defaults ``"reward"``, ``"duration"``, ``"terminated"``.
 
@@ -122,10 +119,7 @@ class OptionModel(TensorDictModuleBase):
         self.out_keys = [unravel_key(("next", key)) for key in written]
         networks = [make_network(self.num_deltas + 3) for _ in range(num_models)]
         if len({id(network) for network in networks}) < num_models:
-            raise ValueError(
-                "OptionModel calls make_network once for each member of the ensemble; it returned "
-                "the same module twice. Build a new one at each call."
-            )
+            raise ValueError("OptionModel needs a make_network that builds a new one at each call.")
         try:
             self.network_params = TensorDictParams(TensorDict.from_modules(*networks))
         except (RuntimeError, KeyError) as error:
@@ -209,10 +203,7 @@ class OptionModel(TensorDictModuleBase):
     ) -> Tensor:
         """Return the targets of :meth:`outputs` for recorded transitions, ``[*B, D + 3]``.
 
-        Args:
-            tensordict: macro transitions: root entries and ``"next"``.
-            reward_key, duration_key, terminated_key: of the outcomes. Default: the model's names.
-            normalized: subtract the mean and divide by the scale. Default ``True``.
+        Keys default to the model's; ``normalized`` subtracts the mean and divides by the scale.
         """
         after = tensordict.get("next")
         parts = [after.get(key) - tensordict.get(key) for key in self.delta_keys]
@@ -238,9 +229,8 @@ class OptionModel(TensorDictModuleBase):
     def fit_normalization(self, tensordict: TensorDictBase) -> OptionModel:
         """Take mean and standard deviation of the outputs from recorded transitions ``[*B]``.
 
-        An output that never varies (the duration of options of a fixed length) keeps scale 1: what
-        it always was is then what an untrained network predicts. Call it before training; the
-        meaning of the networks' outputs changes with it.
+        An output that never varies keeps scale 1. Call it before training: the meaning of the
+        networks' outputs changes with it.
         """
         values = self.targets(tensordict, normalized=False).flatten(0, -2)
         deltas, rest = values[:, : self.num_deltas], values[:, self.num_deltas : -1]

@@ -164,8 +164,7 @@ class SkillActor(ProbabilisticActor):
         a = \tfrac{h - l}{2} \tanh(u) + \tfrac{h + l}{2}, \qquad
         u \sim \mathcal{N}(\mu, \sigma^2), \qquad (\mu, \sigma) = \mathrm{SkillMLP}(s, z)
 
-    It is the actor TorchRL's losses want (a ``ProbabilisticTensorDictSequential``). Inside options
-    use the lean :class:`SkillPolicy` over the same parameters.
+    Losses take it as it is. Inside options use the lean :class:`SkillPolicy` over its parameters.
 
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
@@ -176,8 +175,7 @@ class SkillActor(ProbabilisticActor):
         num_skills (int or TensorSpec): number of skills, or the spec of one skill that is a vector
             ``[D]``, e.g. :class:`UnitSphere`.
         in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
-        skill_key (NestedKey): entry of the skill, int64 ``[*B]``, or float ``[*B, D]``. Default
-            ``"skill"``.
+        skill_key (NestedKey): entry of the skill, int64 ``[*B]``, or float ``[*B, D]``.
         action_key (NestedKey): entry the action is written to. Default ``"action"``.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
         activation (callable): builds the activations. Default ``torch.nn.ReLU``.
@@ -269,8 +267,7 @@ def _kind_of_action(spec: TensorSpec, action_key: NestedKey) -> _Choice | _Squas
 class SkillPolicy(TensorDictModuleBase):
     """Acts like a skill actor at a fraction of its cost, sharing its parameters.
 
-    No distribution objects, no spec checks, no gradients: the worker to run inside options and the
-    collection policy of the trainer.
+    The worker to run inside options and to collect with: no distributions, spec checks, gradients.
 
     Args:
         actor (SkillActor): the actor whose parameters are used; later updates are seen.

@@ -72,8 +72,7 @@ class SkillActionCritic(SkillNetwork):
         action_features (int): size of the action, ``D``.
         num_skills, in_keys, skill_key, hidden, activation, network: as :class:`SkillActor`'s.
         action_key (NestedKey): entry of the action, ``[*B, D]``. Default ``"action"``.
-        state_action_value_key (NestedKey): entry written, ``[*B, 1]``. Default
-            ``"state_action_value"``.
+        state_action_value_key (NestedKey): entry written, ``[*B, 1]``.
 
     Reference:
         As :class:`SkillCritic`.

@@ -168,9 +168,8 @@ class METRAEncoderLoss(EncoderObjective):
     with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`), or
     the skill itself if it is a vector, as the authors' on the :class:`UnitSphere` are. The distance
     in latent space is thus the number of steps between two states, and skills are the directions in
-    which one can get furthest from elsewhere. :math:`\lambda` is held fixed in the first loss and
-    the encoder in the second; :math:`\log \lambda` is the parameter, so that :math:`\lambda` stays
-    positive, and its gradient does not depend on :math:`\lambda`.
+    which one can get furthest. :math:`\lambda` is held fixed in the first loss and the encoder in
+    the second; :math:`\log \lambda` is the parameter, so that :math:`\lambda` stays positive.
 
     Args:
         encoder (TensorDictModuleBase): reads its ``in_keys`` and writes ``representation``
@@ -242,10 +241,9 @@ class LSDEncoderLoss(EncoderObjective):
         \|\phi(x) - \phi(y)\| \le \|x - y\|
 
     with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`), or
-    the skill itself if it is a vector, as the authors' from a normal distribution are. Spectral
-    normalisation keeps the encoder 1-Lipschitz, so only moving far in the units of what it reads
-    gives a large reward; scale it by the ``intrinsic_coeff`` of
-    :class:`~torchrl_hmcts.transforms.SkillReward`.
+    the skill itself if it is a vector. Spectral normalisation keeps the encoder 1-Lipschitz, so
+    only moving far in the units of what it reads gives a large reward; scale it by the
+    ``intrinsic_coeff`` of :class:`~torchrl_hmcts.transforms.SkillReward`.
 
     Args:
         encoder (TensorDictModuleBase): reads its ``in_keys`` and writes ``representation``

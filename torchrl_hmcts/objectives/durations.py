@@ -34,7 +34,6 @@ def use_durations(
             value estimator is made with it. Default: a loss keeps the estimator it has, or makes
             one with its own defaults.
         duration_key (NestedKey): base steps of a macro-step, int64 ``[*B, 1]``, under ``"next"``.
-            Default ``"duration"``.
 
     Returns:
         The module.

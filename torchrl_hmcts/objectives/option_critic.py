@@ -68,8 +68,7 @@ class OptionTerminationLoss(_OptionLoss):
     there, and end only where continuing costs more than :math:`\xi`.
 
     Each transition is one base step (or several) of an option: root and ``"next"``, with the option
-    that runs at the root. Where the option values come from is not this loss's business: TorchRL's
-    ``DQNLoss`` on a macro env, :class:`IntraOptionQLoss`, or the values of a search tree.
+    that runs at the root. Option values come e.g. from :class:`IntraOptionQLoss`.
 
     Args:
         termination_network (TensorDictModuleBase): writes ``termination_logits`` ``[*B, 1]`` from
@@ -187,8 +186,7 @@ class IntraOptionQLoss(_OptionLoss):
             stays its owner's, and is read as it is at every call. Default: options end (beta = 1).
         gamma (float): discount per base step, in ``(0, 1]``. Default 0.99.
         loss_function (str): ``"l2"`` (default), ``"l1"`` or ``"smooth_l1"``.
-        delay_value (bool): bootstrap from target parameters, to be moved by ``SoftUpdate``. Default
-            ``True``.
+        delay_value (bool): bootstrap from target parameters, to be moved by ``SoftUpdate``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Returns:

@@ -34,8 +34,7 @@ class SkillObjective(Loss):
 
     .. math:: L(\phi; s, z, s'), \qquad r_\phi(s, z, s')
 
-    An objective is everything in which one method of skill discovery differs from another. A
-    :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` trains it beside actor and critics, a
+    A :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` trains it beside actor and critics, a
     :class:`~torchrl_hmcts.transforms.SkillReward` writes its reward; both take any objective.
 
     Sub-classes define :meth:`losses`, :meth:`reward` and three attributes: ``root_features`` and

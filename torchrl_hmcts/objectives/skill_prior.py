@@ -25,9 +25,8 @@ class SkillPriorLoss(Loss):
         \bar r(z) = \mathbb{E}\bigl[\log q(z \mid s') \,\big|\, z\bigr]
 
     With :math:`\beta = 1` that is minus the mutual information of skill and state, the objective of
-    variational intrinsic control. The gradient is exact: the sum over the few skills is written
-    out, and :math:`\bar r(z)` is a running mean over the transitions of each skill. The minimum is
-    :math:`p(z) \propto \exp(\bar r(z) / \beta)`.
+    variational intrinsic control. :math:`\bar r(z)` is a running mean over the transitions of each
+    skill; the minimum is :math:`p(z) \propto \exp(\bar r(z) / \beta)`.
 
     A skill that is drawn more often is trained more, becomes easier to tell and is drawn more often
     still, until one or a few are left; so the authors of DIAYN fix p(z). :math:`\beta > 1` pulls

@@ -219,13 +219,12 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
 
     plus the losses of the objective. The reward :math:`r` is the entry ``("next", "reward")``: put
     a :class:`~torchrl_hmcts.transforms.SkillReward` with the same objective on the replay buffer.
-    Being a :class:`torchrl.objectives.DiscreteSACLoss`, it runs with ``SoftUpdate``, ``Trainer``
-    and ``SACTrainer`` unchanged. No loss sends gradients into the parameters of another. What
-    follows a transition is never read where it terminates, and always where it is truncated.
+    Being a :class:`torchrl.objectives.DiscreteSACLoss`, it runs with ``SoftUpdate`` and ``Trainer``
+    unchanged. No loss sends gradients into the parameters of another. What follows a transition is
+    never read where it terminates, and always where it is truncated.
 
     With a ``policy_prior`` :math:`\pi_0`, :math:`\log \pi` gives way to :math:`\log \pi - \log
-    \pi_0`: the policy is kept near another one instead of near the uniform one, and the best it can
-    do is :math:`\pi \propto \pi_0 \exp(Q / \alpha)`.
+    \pi_0`: the best policy is :math:`\pi \propto \pi_0 \exp(Q / \alpha)`.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy pi(a | s, z), e.g. a
@@ -237,12 +236,11 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
         action_space (str or TensorSpec): ``"categorical"``, ``"one-hot"`` or the action spec.
         num_actions (int, optional): number of actions ``A``. Default: that of the actor; needed
             only for ``target_entropy="auto"``.
-        gamma (float): discount per base step. Default ``0.95``: a horizon of twenty steps, about
-            what it takes a body with momentum to turn round.
+        gamma (float): discount per base step. Default ``0.95``, a horizon of twenty steps.
         alpha_init (float): entropy coefficient at the start, in units of reward. Default ``0.3``:
-            with less, skills settle before they have spread out, and two of them stay together.
+            with less, skills settle before they have spread out.
         fixed_alpha (bool): keep alpha instead of tuning it to a target entropy. Default ``True``:
-            in a run of a few hundred updates a tuned alpha is still far from settling.
+            a run of a few hundred updates is too short to tune it.
         min_alpha, max_alpha (float, optional): bounds of a tuned alpha. Default ``None``.
         target_entropy (float or "auto"): target entropy in nats. Default ``"auto"``.
         target_entropy_weight (float): target entropy as a fraction of ``log A``. Default ``0.5``.

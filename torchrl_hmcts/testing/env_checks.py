@@ -41,9 +41,8 @@ def check_env(
     """Check that an env keeps TorchRL's contract: specs, seeds, episodes, partial resets and steps.
 
     TorchRL's ``check_env_specs``, with episodes that continue after their end; the same seed gives
-    the same rollout; the next step begins where the last one ended, and after the end of an episode
-    in a new one; a reset of some elements leaves the others as they are; of elements of which some
-    are not to step the others step as they do alone, and the former stay where they are.
+    the same rollout; the next step begins where the last one ended, or in a new episode; elements
+    that are not to be reset or stepped stay as they are, and the others do not depend on them.
 
     Args:
         env (EnvBase): any env. Stateless ones (``batch_locked=False``) are tried in batches too.
@@ -98,10 +97,9 @@ def check_macro_env(
 
     All of :func:`check_env`, and: the action is one discrete option; a step takes at least one base
     step; some option may be taken wherever an episode continues; set to the states of a rollout and
-    stepped with its options the env gives what the unbroken rollout gave, for all of them at once
-    if it is stateless; a step leaves its input as it was; transforms of your own keep no tensor to
-    themselves that changes from step to step. With ``step_async``, ``step_wait`` and
-    ``step_abandon``: steps that are under way at the same time do not touch each other.
+    stepped with its options the env gives what the unbroken rollout gave; a step leaves its input
+    as it was; transforms of your own keep no tensor that changes from step to step. With
+    ``step_async``, ``step_wait`` and ``step_abandon``: steps under way do not touch each other.
 
     Args:
         env (EnvBase): stateless, or with ``_supports_set_state = True``; e.g. any env under an

@@ -24,8 +24,7 @@ class DisplacementTransform(EnvTransform):
 
     Args:
         in_key (NestedKey): entry ``[*B, D]`` to measure. Default ``"position"``.
-        out_key (NestedKey): entry ``[*B, D]`` to write, in the units of ``in_key``. Default
-            ``"displacement"``.
+        out_key (NestedKey): entry ``[*B, D]`` to write, in the units of ``in_key``.
         origin_key (NestedKey): entry ``[*B, D]`` of the origin. Default ``"origin"``.
         skill_step_key (NestedKey, optional): the entry :class:`SkillTransform` counts in; an origin
             moves where it is zero. Default ``"skill_step"``. ``None`` measures from the reset.

@@ -25,15 +25,15 @@ from torchrl_hmcts.checks import (
     whole_number,
 )
 from torchrl_hmcts.nesting import parts
-from torchrl_hmcts.transforms.env_transform import zero_count
-from torchrl_hmcts.transforms.option_checks import HasOptions, Termination, check_skill_table
+from torchrl_hmcts.transforms.env_transform import EnvTransform, zero_count
+from torchrl_hmcts.transforms.option_checks import Termination, check_skill_table
 from torchrl_hmcts.transforms.option_rollout import OptionRollout
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
 _ROOT = "_option_root_"
 
 
-class OptionTransform(HasOptions):
+class OptionTransform(EnvTransform):
     r"""Makes each rollout of a worker one macro-step, so that a planner or a loss works on an SMDP.
 
     The action of the transformed env is an **option**. One step runs the worker closed-loop in the
@@ -49,23 +49,18 @@ class OptionTransform(HasOptions):
     it by this name; above, it is ``"base_action_mask"``. A transform behind this one may write a
     mask of the options as ``"action_mask"``, e.g. :class:`SkillMaskTransform`.
 
-    TorchRL's estimators discount by ``gamma ** steps_to_next_obs``. With
-    ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
-    ``make_value_estimator``, any TorchRL loss is correct for the SMDP.
+    :func:`~torchrl_hmcts.objectives.use_durations` makes any TorchRL loss correct for the SMDP.
 
-    If the env below counts base steps itself, as one with an OptionTransform does, k is their sum,
-    and the rewards are discounted by it. So options of options can have any number of levels.
+    If the env below counts base steps itself, as one with an OptionTransform does, k is their sum:
+    options of options can have any number of levels.
 
-    Append it after all transforms that must see base steps; they see each once. Transforms appended
-    after it see macro-steps. The worker is not registered as a sub-module: its owner moves, trains
-    and saves it. The memory of a recurrent worker is what it writes under ``"next"``; it is passed
-    from base step to base step. TorchRL's ``LowLevelController`` is such a worker: append its
+    Append it after all transforms that must see base steps. The worker is not registered as a
+    sub-module: its owner moves, trains and saves it. The memory of a recurrent worker is what it
+    writes under ``"next"``. TorchRL's ``LowLevelController`` is such a worker: append its
     ``make_tensordict_primer()`` before this transform, and name its decision ``skill_key``.
 
-    With a group of agents and ``option_key=("agents", "option")`` each agent has an option. Their
-    options begin and end together: at the termination, after ``max_steps`` or as soon as any
-    ``done`` below is true, also that of one agent. The rewards of each agent are discounted and
-    summed separately.
+    With a group of agents and ``option_key=("agents", "option")`` each agent has an option and its
+    own reward; their options begin and end together, as soon as one of them ends.
 
     Args:
         worker (TensorDictModuleBase): reads observation or state entries and ``skill_key``, writes
@@ -102,10 +97,9 @@ class OptionTransform(HasOptions):
             number.
 
     Raises:
-        ValueError: if a number is out of range; when attached to an env: if the worker reads an
-            entry the env does not have or writes an action that does not fit the env's action spec,
-            or if the env steps or resets elements whose option has ended; when stepping: if an
-            option index is out of range, or the termination returns anything but one bool each.
+        ValueError: when attached, if worker and env do not fit, or the env cannot leave elements
+            alone whose option has ended; when stepping, if an option does not exist, or the
+            termination returns anything but one bool each.
 
     Reference:
         Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999; dissertation, sections 2.2
@@ -123,6 +117,10 @@ class OptionTransform(HasOptions):
         >>> td["next", "state"].item(), td["next", "duration"].item()
         (4, 4)
     """
+
+    worker: TensorDictModuleBase
+    termination: Termination | None
+    skills: Tensor | None
 
     invertible = True
 
@@ -177,7 +175,9 @@ class OptionTransform(HasOptions):
             self.trajectory = OptionTrajectory(keys, self.max_steps)
         self._rollout: OptionRollout | None = None
 
-    # ---------------------------------------------------------------- stepping
+    def told(self, option: Tensor) -> Tensor:
+        """Return what the worker gets for options, int64 ``[*B]``: themselves or vectors."""
+        return option if self.skills is None else self.skills.to(option.device)[option]
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Choose the first base action; the env then takes that step as it always does."""
@@ -276,8 +276,6 @@ class OptionTransform(HasOptions):
                 )
         return option
 
-    # ---------------------------------------------------------------- specs
-
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         rollout = self._attached()
         input_spec = input_spec.clone()
@@ -323,8 +321,6 @@ class OptionTransform(HasOptions):
         if self.trajectory is not None:
             spec[OptionTrajectory.KEY] = rollout.trajectory_spec
         return spec
-
-    # ---------------------------------------------------------------- its place in an env
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Takes its place in an env, and checks there that worker and env fit."""
