@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import math
+import warnings
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
-from torchrl.envs import TransformedEnv
+from torchrl.envs import (
+    GymEnv,
+    TransformedEnv,
+)
 
 from torchrl_hmcts.modules import (
     ConcatSkillMLP,
@@ -19,8 +26,10 @@ from torchrl_hmcts.modules import (
     SkillPolicy,
     SpectralLinear,
 )
+from torchrl_hmcts.objectives import METRAEncoderLoss, SkillDynamicsLoss
 from torchrl_hmcts.testing import PointMassEnv
-from torchrl_hmcts.transforms import SkillTransform
+from torchrl_hmcts.trainers import DIAYNTrainer
+from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
 
 NETWORKS = [SkillMLP, ConcatSkillMLP]
 
@@ -224,3 +233,70 @@ def test_the_policy_samples_continuous_actions_from_the_actors_distribution() ->
     torch.testing.assert_close(ours.std(0), theirs.std(0), atol=0.03, rtol=0)
     again = SkillPolicy(actor, generator=torch.Generator().manual_seed(0))(td)["action"]
     assert torch.equal(ours, again)
+
+
+def test_float64_observations_are_read_in_the_precision_of_the_networks() -> None:
+    seen = torch.randn(5, 4, dtype=torch.float64)
+    td = TensorDict(observation=seen, skill=torch.arange(5) % 3, batch_size=[5])
+    keys: dict[str, Any] = {"in_keys": ["observation"]}
+    for network in (
+        SkillActor(4, Bounded(-1.0, 1.0, shape=(2,)), 3, **keys).module[0],
+        SkillActor(4, Categorical(2), 3, network=ConcatSkillMLP, **keys).module[0],
+        SkillDiscriminator(4, 3, **keys),
+        SkillEncoder(4, 3, linear=SpectralLinear, **keys),
+    ):
+        with torch.no_grad():  # a spectral norm takes a step of its iteration with gradients
+            double = network(td.clone())
+            single = network(td.clone().set("observation", seen.float()))
+        for key in network.out_keys:
+            assert double[key].dtype == torch.float32
+            assert double[key].equal(single[key]), key
+    narrow = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float64)
+    assert SkillPolicy(SkillActor(4, narrow, 3, **keys))(td)["action"].dtype == torch.float64
+
+
+def test_skills_are_learned_in_mujoco_as_it_is() -> None:
+    pytest.importorskip("mujoco")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of MuJoCo, about its own models
+        base = GymEnv("HalfCheetah-v5")
+        assert base.observation_spec["observation"].dtype == torch.float64
+        env = base.append_transform(SkillTransform(3, 10))
+        env.append_transform(DisplacementTransform("observation"))
+        for make in (
+            lambda: None,
+            lambda: METRAEncoderLoss(SkillEncoder(17, 3, in_keys=["observation"])),
+            lambda: SkillDynamicsLoss(
+                SkillDynamics(17, 17, 3, in_keys=["observation"], target_key="observation")
+            ),
+        ):
+            loss = DIAYNTrainer.make_loss(env, objective=make(), seed=0)
+            trainer = DIAYNTrainer(env, loss, total_frames=64, batch_size=16, seed=0)
+            trainer.train()
+            assert all(math.isfinite(x[-1]) for x in trainer.history.values())
+            assert trainer.replay_buffer[:]["next", "reward"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("features", "dtype", "message"),
+    [
+        (3, torch.float32, r"for 3 features of torch.float32 was given 4.*in_features=4"),
+        (4, torch.int64, r"of torch.float32 was given 4 of torch.int64.*DTypeCastTransform"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["actor", "discriminator", "concatenated"])
+def test_a_network_that_does_not_fit_what_it_reads_says_so(
+    features: int, dtype: torch.dtype, message: str, kind: str
+) -> None:
+    keys = {"in_keys": ["observation"]}
+    if kind == "discriminator":
+        module: torch.nn.Module = SkillDiscriminator(features, num_skills=3, **keys)
+    else:
+        network = SkillMLP if kind == "actor" else ConcatSkillMLP
+        module = SkillActor(features, Categorical(2), num_skills=3, network=network, **keys)
+    given = 4 if features == 3 else features
+    message = message if kind != "concatenated" else "was given"
+    seen = torch.zeros(5, given, dtype=dtype)
+    td = TensorDict(observation=seen, skill=torch.zeros(5, dtype=torch.int64))
+    with pytest.raises(ValueError, match=message):
+        module(td.auto_batch_size_(1))

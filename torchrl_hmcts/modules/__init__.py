@@ -8,11 +8,14 @@ from torchrl_hmcts.modules.objective_networks import (
     SkillEncoder,
     SpectralLinear,
 )
-from torchrl_hmcts.modules.option_memory import OptionMemory
-from torchrl_hmcts.modules.option_model import OptionModel
+from torchrl_hmcts.modules.option_model import OptionMemory, OptionModel
 from torchrl_hmcts.modules.option_model_env import OptionModelEnv
-from torchrl_hmcts.modules.skill_actor import SkillActor, SkillPolicy
-from torchrl_hmcts.modules.skill_critic import SkillActionCritic, SkillCritic
+from torchrl_hmcts.modules.skill_actor import (
+    SkillActionCritic,
+    SkillActor,
+    SkillCritic,
+    SkillPolicy,
+)
 from torchrl_hmcts.modules.skill_mlp import ConcatSkillMLP, SkillMLP
 from torchrl_hmcts.modules.skill_prior import (
     FixedSkillPrior,

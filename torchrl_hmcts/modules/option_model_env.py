@@ -18,8 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_hmcts.checks import real_number
-from torchrl_hmcts.modules.option_memory import OptionMemory
-from torchrl_hmcts.modules.option_model import OptionModel
+from torchrl_hmcts.modules.option_model import OptionMemory, OptionModel
 from torchrl_hmcts.nesting import known_gamma
 
 

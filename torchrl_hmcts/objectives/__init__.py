@@ -8,8 +8,8 @@ from torchrl_hmcts.objectives.discovery import (
     SkillDiscriminatorLoss,
     SkillDynamicsLoss,
 )
-from torchrl_hmcts.objectives.durations import use_durations
 from torchrl_hmcts.objectives.goal_cloning import GoalCloningLoss
+from torchrl_hmcts.objectives.loss import use_durations
 from torchrl_hmcts.objectives.option_critic import IntraOptionQLoss, OptionTerminationLoss
 from torchrl_hmcts.objectives.option_model_loss import OptionModelLoss
 from torchrl_hmcts.objectives.search_distillation import ExpertIterationLoss

@@ -261,10 +261,10 @@ class A3CLoss(A2CLoss):
         if isinstance(value_type, type) and not isinstance(value_type, ValueEstimators):
             hyperparams.setdefault("value_network", self.critic_network)
         out = super().make_value_estimator(value_type, **hyperparams)
-        self._forward_value_estimator_keys()
+        self.value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)
         return out
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         super()._forward_value_estimator_keys(**kwargs)
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)
+        if hasattr(self, "_discount"):  # TorchRL's constructor is over
+            self.value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_hmcts.checks import one_of, real_number
+from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.objectives.loss import Loss, run_module
 
 _VALUE_LOSSES = ("l2", "smooth_l1", "log", "cross_entropy")
@@ -123,8 +124,8 @@ class ExpertIterationLoss(Loss):
         mask = tensordict.get(keys.action_mask, None)
         if mask is not None:
             logits = logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
-        target = self._required(tensordict, keys.policy_target)
-        goal = self._required(tensordict, keys.value_target).reshape(value.shape)
+        target, goal = entries(self, tensordict, [keys.policy_target, keys.value_target])
+        goal = goal.reshape(value.shape)
         # 0 for what may not be taken, whose log-probability is a very large number.
         cross_entropy = -torch.where(target > 0, target * logits.log_softmax(-1), 0.0).sum(-1)
         entropy = -torch.special.xlogy(target, target).sum(-1)
@@ -149,16 +150,6 @@ class ExpertIterationLoss(Loss):
         if self.value_loss_name == "log":
             value, goal = value.clamp_min(_SMALLEST).log(), goal.clamp_min(_SMALLEST).log()
         return F.smooth_l1_loss(value, goal, reduction="none")
-
-    def _required(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        entry = tensordict.get(key, None)
-        if entry is None:
-            raise KeyError(
-                f"ExpertIterationLoss reads {key!r}, which the examples do not have; they have "
-                f"{sorted(map(str, tensordict.keys(True, True)))}. Name their entries with "
-                f"set_keys(policy_target=..., value_target=...)."
-            )
-        return entry
 
     def _weight(self, tensordict: TensorDictBase, key: NestedKey, like: Tensor) -> Tensor:
         weight = tensordict.get(key, None)

@@ -66,18 +66,15 @@ class SubgoalTransform(EnvTransform):
         r = r_\text{tick} + r_\text{met}\,[d < d_\text{met}] + r_\text{div}\,[d > d_\text{div}]
 
     A goal that is met makes way for the next one. Where :math:`d > d_\text{div}`, and where the
-    last goal is met though the episode continues, a new plan is made from :math:`x` before the next
-    action. All elements of a batch that need a plan at the same base step get it in one call.
+    last goal is met though the episode continues, a new plan is made from :math:`x`. All elements
+    of a batch that need a plan at the same base step get it in one call.
 
-    It writes these entries in the root and under ``"next"``. They are part of the state, so the env
-    stays stateless and continues from any tensordict: ``goals_key`` (float32 ``[*B, K D]``, the
-    next K goals, the last one repeated), ``"plan"`` (float32 ``[*B, G, D]``), ``"plan_length"``
-    and ``"goal_index"`` (int64 ``[*B, 1]``), and the counters of the episode ``"num_plans"``,
-    ``"num_goals_met"`` and ``"num_divergences"`` (int64 ``[*B, 1]``). Under ``"next"`` also the
-    worker's reward, in place of the env's own, which moves to ``task_reward_key``.
-
-    A reset plans where it resets. ``reset(td, set_state=True)`` to a state that holds a plan keeps
-    that plan, to one without a plan makes one.
+    It writes, in the root and under ``"next"``, ``goals_key`` (float32 ``[*B, K D]``, the next K
+    goals, the last one repeated), ``plan_key`` (float32 ``[*B, G, D]``), ``"plan_length"``,
+    ``"goal_index"`` and the counters of the episode ``"num_plans"``, ``"num_goals_met"`` and
+    ``"num_divergences"`` (int64 ``[*B, 1]``). They are part of the state: ``reset(td,
+    set_state=True)`` to a state that holds a plan keeps it. Under ``"next"`` the worker's reward
+    takes the place of the env's own, which moves to ``task_reward_key``.
 
     Args:
         planner (PlansGoals or callable): the manager. ``planner(td [m]) -> (goals [m, L, D],
@@ -86,28 +83,25 @@ class SubgoalTransform(EnvTransform):
         position_key (NestedKey): entry ``[*B, D]`` that is compared with the goals.
         goal_met_threshold (float): :math:`d_\text{met}`, in the units of the position. Default 0.5:
             half a tile.
-        goal_divergence_threshold (float): :math:`d_\text{div}`; must be larger than the distance of
-            one goal to the next. ``math.inf`` never plans again. Default 2 tiles.
+        goal_divergence_threshold (float): :math:`d_\text{div}`; larger than the distance of one
+            goal to the next. ``math.inf`` never plans again. Default 2 tiles.
         r_tick (float): reward of every base step. Default -0.025: a worker that moves around a
             corner of Waterworld and meets the same goals again earns 0.020 per base step, so with a
             smaller cost it would pay not to arrive.
-        r_goal_met (float): Default 1.
-        r_goal_divergence (float): Default -1.
+        r_goal_met, r_goal_divergence (float): the other rewards. Default 1 and -1.
         num_goals (int): K. Default 3.
         max_goals (int): G; a longer plan is cut, and a new plan follows when its last goal is met.
         relative (bool): show goals relative to the position (default), so that what the worker
             learns in one place holds in all, or as they are.
-        goals_key (NestedKey): the next K goals, ``[*B, K D]``. Default ``"goals"``.
-        plan_key (NestedKey): the whole plan, ``[*B, G, D]``. Default ``"plan"``.
-        reward_key (NestedKey): the env's reward, which becomes the worker's. Default ``"reward"``.
-        task_reward_key (NestedKey): where the env's reward goes. Default ``"task_reward"``.
+        goals_key, plan_key (NestedKey): what is shown, and the whole plan.
+        reward_key (NestedKey): the env's reward, which becomes the worker's.
+        task_reward_key (NestedKey): where the env's reward goes.
 
     Raises:
         TypeError: if ``planner`` is neither.
-        ValueError: if a threshold, reward or number is out of range; when planning, if a plan has
-            no goal, the wrong shape or a value that is not finite.
-        KeyError: when the specs are made, if the env lacks ``position_key`` or ``reward_key``; when
-            stepping, if the tensordict has no plan.
+        ValueError: when planning, if a plan has no goal, the wrong shape or a value that is not
+            finite.
+        KeyError: when the specs are made, if the env lacks ``position_key`` or ``reward_key``.
 
     Reference:
         Dissertation, section 3.2.1 and algorithm 1. That goals are popped when met, and r_tick,
@@ -122,14 +116,9 @@ class SubgoalTransform(EnvTransform):
         ...     away = torch.tensor([[1.0, 0.0], [2.0, 0.0]])
         ...     return td["position"].unsqueeze(1) + away, torch.full((len(td),), 2)
         >>> env = TransformedEnv(PointMassEnv(), SubgoalTransform(to_the_right, num_goals=2))
-        >>> td = env.reset()
-        >>> td["goals"].round(decimals=3).tolist()
-        [1.0, 0.0, 2.0, 0.0]
-        >>> td = env.step(td.set("action", torch.tensor(3)))  # push to the right
-        >>> td["next", "goals"]
-        tensor([0.9900, 0.0000, 1.9900, 0.0000])
-        >>> td["next", "reward"], td["next", "num_plans"]
-        (tensor([-0.0250]), tensor([1]))
+        >>> td = env.step(env.reset().set("action", torch.tensor(3)))  # push to the right
+        >>> td["next", "goals"], td["next", "reward"]
+        (tensor([0.9900, 0.0000, 1.9900, 0.0000]), tensor([-0.0250]))
     """
 
     def __init__(
@@ -287,7 +276,7 @@ class SubgoalTransform(EnvTransform):
         return np.logical_or.reduce([_any(before.get(k) != after.get(k), m) for k in state])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        plan = self._carried(tensordict, self.plan_key)
+        plan = tensordict[self.plan_key]
         position = _rows(next_tensordict.get(self.position_key))
         m, dims = position.shape
         # Small arrays: numpy does in one microsecond what torch does in three.
