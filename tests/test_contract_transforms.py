@@ -32,14 +32,12 @@ from torchrl_hmcts.modules import (
     GrowingSkillPrior,
     SkillActor,
     SkillDiscriminator,
-    SkillEncoder,
     SkillPolicy,
 )
-from torchrl_hmcts.objectives import METRAEncoderLoss, SkillDiscriminatorLoss
+from torchrl_hmcts.objectives import SkillDiscriminatorLoss
 from torchrl_hmcts.testing import (
     TRANSFORM_CHECKS,
     ChainEnv,
-    ContractError,
     PointMassEnv,
     check_macro_env,
     check_transform,
@@ -193,11 +191,6 @@ def discriminator_objective(key: Any = "position") -> SkillDiscriminatorLoss:
     return SkillDiscriminatorLoss(SkillDiscriminator(2, 3, in_keys=[key]))
 
 
-def metra_objective() -> METRAEncoderLoss:
-    torch.manual_seed(0)
-    return METRAEncoderLoss(SkillEncoder(2, 3))
-
-
 def transitions() -> TensorDict:
     g = torch.Generator().manual_seed(0)
     after = TensorDict(
@@ -317,12 +310,6 @@ case(
 )
 case("skill_reward", lambda: SkillReward(discriminator_objective()), skilled_for_good, **REWARD)
 case(
-    "skill_reward_of_metra",
-    lambda: SkillReward(metra_objective(), intrinsic_coeff=0.5, extrinsic_coeff=0.1),
-    skilled_for_good,
-    **REWARD,
-)
-case(
     "skill_reward_nested",
     lambda: SkillReward(nested_objective(), reward_key=("agent", "r")),
     nested_skills,
@@ -391,6 +378,7 @@ case(
 case(
     "skill_mask_nested",
     lambda: SkillMaskTransform(GrowingSkillPrior(2), mask_key=("agent", "mask")),
+    chain_with_options,
     writes=[("agent", "mask")],
     inside_workers=False,
 )
@@ -500,20 +488,3 @@ def test_an_env_of_options_keeps_the_contract_of_a_macro_env(name: str) -> None:
     duration = ("agent", "k") if name == "option_nested" else "duration"
     mask = ("agent", "mask") if "nested" in name else "action_mask"
     check_macro_env(env, duration_key=duration, mask_key=mask, tolerance=1e-5)
-
-
-def test_an_env_of_random_options_keeps_it_too() -> None:
-    torch.manual_seed(0)
-    worker = SkillPolicy(SkillActor(2, Categorical(4), 3, in_keys=["velocity"]))
-    env = TransformedEnv(PointMassEnv(), OptionTransform(worker, 3, 4))
-    check_macro_env(env, deterministic=False)
-
-
-def test_a_macro_env_of_a_batch_locked_env_cannot_be_planned_in() -> None:
-    worker = TensorDictModule(same, ["skill"], ["action"])
-    base = ChainEnv(length=5, batch_size=[2])
-    base.batch_locked = True
-    base._supports_set_state = False
-    env = TransformedEnv(base, OptionTransform(worker, 2, 3))
-    with pytest.raises(ContractError, match="ChainEnv.*set to any state"):
-        check_macro_env(env)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from typing import Any
 
 import pytest
@@ -11,7 +9,6 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 from torchrl.envs import (
-    GymEnv,
     TransformedEnv,
 )
 
@@ -26,10 +23,8 @@ from torchrl_hmcts.modules import (
     SkillPolicy,
     SpectralLinear,
 )
-from torchrl_hmcts.objectives import METRAEncoderLoss, SkillDynamicsLoss
 from torchrl_hmcts.testing import PointMassEnv
-from torchrl_hmcts.trainers import DIAYNTrainer
-from torchrl_hmcts.transforms import DisplacementTransform, SkillTransform
+from torchrl_hmcts.transforms import SkillTransform
 
 NETWORKS = [SkillMLP, ConcatSkillMLP]
 
@@ -89,15 +84,6 @@ def test_stacked_parameters_give_each_copys_output(network: type, batch: tuple[i
     torch.testing.assert_close(both, expected)
     assert nets[0].stackable
     assert not network(2, 4, 3, activation=torch.nn.PReLU).stackable
-
-
-@pytest.mark.parametrize("network", NETWORKS)
-def test_the_mlp_can_be_vmapped_over_parameters(network: type) -> None:
-    nets = [network(2, 4, num_skills=3) for _ in range(2)]
-    x, skill = torch.randn(5, 2), torch.randint(3, (5,))
-    params, _ = torch.func.stack_module_state(nets)
-    out = torch.vmap(lambda p: torch.func.functional_call(nets[0], p, (x, skill)))(params)
-    torch.testing.assert_close(out, torch.stack([net(x, skill) for net in nets]))
 
 
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 8)])
@@ -253,28 +239,6 @@ def test_float64_observations_are_read_in_the_precision_of_the_networks() -> Non
             assert double[key].equal(single[key]), key
     narrow = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float64)
     assert SkillPolicy(SkillActor(4, narrow, 3, **keys))(td)["action"].dtype == torch.float64
-
-
-def test_skills_are_learned_in_mujoco_as_it_is() -> None:
-    pytest.importorskip("mujoco")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of MuJoCo, about its own models
-        base = GymEnv("HalfCheetah-v5")
-        assert base.observation_spec["observation"].dtype == torch.float64
-        env = base.append_transform(SkillTransform(3, 10))
-        env.append_transform(DisplacementTransform("observation"))
-        for make in (
-            lambda: None,
-            lambda: METRAEncoderLoss(SkillEncoder(17, 3, in_keys=["observation"])),
-            lambda: SkillDynamicsLoss(
-                SkillDynamics(17, 17, 3, in_keys=["observation"], target_key="observation")
-            ),
-        ):
-            loss = DIAYNTrainer.make_loss(env, objective=make(), seed=0)
-            trainer = DIAYNTrainer(env, loss, total_frames=64, batch_size=16, seed=0)
-            trainer.train()
-            assert all(math.isfinite(x[-1]) for x in trainer.history.values())
-            assert trainer.replay_buffer[:]["next", "reward"].dtype == torch.float32
 
 
 @pytest.mark.parametrize(

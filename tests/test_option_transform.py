@@ -7,9 +7,8 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import InteractionType, TensorDictModule, set_interaction_type
+from tensordict.nn import InteractionType, TensorDictModule
 from torch import nn
-from torchrl.collectors import Collector
 from torchrl.data import (
     Composite,
     Unbounded,
@@ -18,7 +17,6 @@ from torchrl.envs import (
     Compose,
     GymEnv,
     ParallelEnv,
-    PendulumEnv,
     RewardScaling,
     RewardSum,
     SerialEnv,
@@ -28,9 +26,9 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs, step_mdp
 from torchrl.modules import ProbabilisticActor
 
-from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_from_text, maze_pool
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
-from torchrl_hmcts.testing import ChainEnv, TableEnv
+from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.transforms import OptionTransform
 
 GAMMA = 0.9
@@ -52,28 +50,6 @@ class Hidden(nn.Module):
 
 def skill_is_action(action_key="action", skill_key="skill"):
     return TensorDictModule(lambda skill: skill.clone(), [skill_key], [action_key])
-
-
-def constant(action):
-    """A worker that always takes the same action."""
-    return TensorDictModule(
-        lambda skill: action.expand(*skill.shape, *action.shape).clone(), ["skill"], ["action"]
-    )
-
-
-def towards_corner():
-    """A Waterworld worker that looks at the state: skill 0 to the left or up, 1 right or down."""
-
-    def choose(position, velocity, skill):
-        along = (position.sum(-1) + velocity.sum(-1)).mul(3).long() % 2
-        return 2 * along + skill
-
-    return TensorDictModule(choose, ["position", "velocity", "skill"], ["action"])
-
-
-def waterworld(**kwargs):
-    """A small room, so that episodes end inside options, at different steps."""
-    return WaterworldMazeEnv(maze_from_text("...\n.#.\n...")[0][None], seed=0, **kwargs)
 
 
 def chain(*, start=None, batch=(), **kwargs):
@@ -168,19 +144,6 @@ class TestAgainstALoop:
         assert after.shape == td.shape
         assert_close(after, by_hand(env, td, skill_is_action(), max_steps))
 
-    @pytest.mark.parametrize("batch", [[], [20], [4, 5]])
-    def test_waterworld_with_a_worker_that_looks_at_the_state(self, batch):
-        env, worker = waterworld(max_steps=40), towards_corner()
-        td = env.reset(TensorDict(batch_size=batch))
-        ends = 0
-        for _ in range(3):
-            td["option"] = torch.randint(2, batch)
-            after = macro(env, worker, max_steps=15).step(td.clone())["next"]
-            assert_close(after, by_hand(env, td, worker, 15))
-            ends += after["done"].sum()
-            td = after.exclude("reward", "duration")
-        assert not batch or ends > 0
-
     @pytest.mark.parametrize("batch", BATCHES)
     @pytest.mark.parametrize("shape", [(), (1,)])
     def test_a_termination_ends_an_option(self, batch, shape):
@@ -196,27 +159,6 @@ class TestAgainstALoop:
         td["option"] = torch.randint(2, batch)
         after = macro(env, max_steps=6, termination=termination).step(td.clone())["next"]
         assert_close(after, by_hand(env, td, skill_is_action(), 6, termination))
-
-    def test_a_termination_at_once_still_takes_one_base_step(self):
-        env, td = chain(start=[1, 2], batch=[2])
-        always = lambda td: torch.ones(td.shape, dtype=torch.bool)  # noqa: E731
-        after = step_next(macro(env, termination=always), td, [RIGHT, LEFT])
-        assert after["state"].tolist() == [2, 1]
-        assert after["duration"].tolist() == [[1], [1]]
-
-    def test_the_keys_of_option_skill_and_duration_can_be_nested(self):
-        env, td = chain(start=3)
-        env = macro(
-            env,
-            skill_is_action(skill_key=("manager", "skill")),
-            option_key=("manager", "option"),
-            skill_key=("manager", "skill"),
-            duration_key=("manager", "duration"),
-        )
-        check_env_specs(env)
-        assert env.action_key == ("manager", "option")
-        td.set(("manager", "option"), torch.tensor(RIGHT))
-        assert env.step(td)["next", "manager", "duration"].tolist() == [2]
 
     def test_a_root_can_be_stepped_again_with_another_option(self):
         """What the first step left under "next" is of no consequence for the second."""
@@ -261,13 +203,6 @@ class TestStochasticWorker:
             assert_close(after, expected)
             durations.add(after["duration"].item())
         assert len(durations) > 2
-
-    def test_it_follows_the_interaction_type(self):
-        base, td = chain(start=[1] * 50, batch=[50])
-        with set_interaction_type(InteractionType.DETERMINISTIC):
-            after = step_next(macro(base, self.actor(), max_steps=3), td, [RIGHT] * 50)
-            expected = by_hand(base, td.set("option", torch.ones(50).long()), self.actor(), 3)
-        assert_close(after, expected)
 
 
 class TestBatchedEnvs:
@@ -328,13 +263,6 @@ class TestGymEnv:
             td, root = after, expected
         assert max_steps == 1 or after["done"]
 
-    def test_rollouts_go_on_into_the_next_episode(self):
-        env = macro(GymEnv("CartPole-v1"), balancing(), max_steps=4)
-        td = env.rollout(30, break_when_any_done=False)
-        done = td["next", "done"].squeeze(-1)
-        assert done.sum() >= 2
-        assert (td["next", "duration"].squeeze(-1)[~done] == 4).all()
-
 
 def check_macro_rollout(base, td, worker, max_steps=4, break_when_all_done=False, **_):
     """Every macro-step of a rollout is that of a loop from its root; roots follow each other."""
@@ -370,17 +298,6 @@ class TestRollouts:
         )
         assert until_all or td.shape == (*batch, 20)
         check_macro_rollout(base, td, skill_is_action(), break_when_all_done=until_all)
-
-    def test_a_collector_gathers_macro_steps(self):
-        base, _ = chain()
-        collector = Collector(
-            macro(base), frames_per_batch=20, total_frames=40, policy=None, trust_policy=True
-        )
-        batches = list(collector)
-        assert len(batches) == 2
-        for td in batches:
-            check_macro_rollout(base, td.select("state", "option", "next"), skill_is_action())
-        collector.shutdown()
 
 
 class TestOtherTransforms:
@@ -473,41 +390,6 @@ class TestTrajectories:
             macro(ChainEnv(6), trajectory_keys=keys)
 
 
-def pendulum():
-    return macro(PendulumEnv(), constant(torch.tensor([0.5])), num_options=3, max_steps=6)
-
-
-class TestEveryEnv:
-    @pytest.mark.parametrize(
-        "make",
-        [
-            lambda: macro(ChainEnv(6)),
-            lambda: macro(GymEnv("CartPole-v1"), balancing(), max_steps=5),
-            lambda: macro(ChainEnv(6, batch_size=[4])),
-            lambda: macro(ChainEnv(6, batch_size=[2, 3])),
-            lambda: macro(
-                TableEnv(
-                    {(0, 0): (1, 2.0, 3), (0, 1): (2, 1.0, 1), (1, 1): (2, 0, 2)}, terminal=[2]
-                )
-            ),
-            lambda: macro(waterworld(), towards_corner()),
-            lambda: macro(WaterworldMazeEnv(maze_pool("test"), batch_size=[4]), towards_corner()),
-            lambda: macro(GridworldMazeEnv(maze_pool("test")), skill_is_action(), num_options=5),
-            pendulum,
-        ],
-    )
-    def test_specs_hold(self, make):
-        check_env_specs(make(), return_contiguous=True)
-
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_pendulum_steps_are_those_of_a_loop(self, batch):
-        env, base = pendulum(), PendulumEnv()
-        td = base.reset(base.gen_params(batch_size=batch), set_state=False)
-        td["option"] = torch.zeros(batch, dtype=torch.int64)
-        after = env.step(td.clone())["next"]
-        assert_close(after, by_hand(base, td, constant(torch.tensor([0.5])), 6))
-
-
 class TestOwnership:
     def test_the_workers_mode_parameters_and_gradients_are_its_owners(self):
         worker = TensorDictModule(Hidden(), ["skill"], ["action"])
@@ -521,16 +403,6 @@ class TestOwnership:
         assert not list(env.parameters())
         assert not env.state_dict()
         assert transform.worker is worker
-
-    def test_no_gradient_flows_through_the_worker(self):
-        net = nn.Linear(1, 1)
-        worker = TensorDictModule(
-            lambda state, skill: (net(state.unsqueeze(-1).float()).squeeze(-1) > 0).long(),
-            ["state", "skill"],
-            ["action"],
-        )
-        td = macro(ChainEnv(6), worker).rollout(3)
-        assert not td["next", "reward"].requires_grad
 
     def test_a_clone_serves_a_second_env_with_the_same_worker(self):
         transform = OptionTransform(skill_is_action(), 2, 4, GAMMA)
@@ -609,8 +481,6 @@ class TestBadInput:
         ],
     )
     def test_a_worker_that_does_not_fit_is_refused_when_attached(self, worker, message):
-        with pytest.raises(ValueError, match=message):
-            macro(ChainEnv(6), worker)
         with pytest.raises(ValueError, match=message):
             TransformedEnv(ChainEnv(6), Compose(StepCounter(), OptionTransform(worker, 2, 4)))
         env = TransformedEnv(ChainEnv(6))

@@ -12,7 +12,7 @@ from torchrl.envs import Compose, GymEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SoftUpdate
 
-from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
+from torchrl_hmcts.envs import maze_from_text
 from torchrl_hmcts.modules import (
     LearnedTermination,
     StallTermination,
@@ -113,20 +113,6 @@ class TestStallTermination:
             assert td["duration"].item() == 3
             td = td.set("option", torch.tensor(LEFT))
         assert td["stalled_steps"].item() == 9
-
-    def test_in_waterworld_an_option_into_a_wall_ends_there(self):
-        env = WaterworldMazeEnv(maze_from_text("....\n....")[0][None], observation=False, seed=0)
-        worker = skill_is_action()
-        stall = StallTransform("position", 0.005)
-        options = OptionTransform(worker, 4, 200, termination=StallTermination(3))
-        macro = TransformedEnv(env, Compose(stall, options))
-        check_env_specs(macro)
-        td = env.make_state(0, [[1.5, 0.5], [1.5, 0.5]], (3.5, 1.5))
-        after = macro.step(td.set("option", torch.tensor([0, 3])))["next"]
-        top, right = after["position"]
-        assert top[1].item() == pytest.approx(0.25, abs=1e-3)  # at the wall above
-        assert right[0].item() == pytest.approx(3.75, abs=1e-3)  # and the one to the right
-        assert after["duration"][0] < after["duration"][1] < 100
 
     @pytest.mark.parametrize("length", [4, 7])
     def test_plans_are_the_same_whatever_count_the_root_has(self, length):

@@ -126,10 +126,6 @@ class SkillMLP(nn.Module):
         """True if the parameters of N copies may be put in stacked, to run all copies at once."""
         return can_stack(self.trunk)
 
-    def extra_repr(self) -> str:
-        """Returns the sizes that ``print`` shows."""
-        return f"{described(self.skill_spec)}, out_features={self.out_features}"
-
 
 class ConcatSkillMLP(SkillMLP):
     r"""Maps features and a skill to outputs by a network that reads the skill beside the features.

@@ -169,20 +169,17 @@ class A3CLoss(A2CLoss):
         actor_network (ProbabilisticTensorDictSequential): the policy.
         critic_network (TensorDictModule): writes ``state_value`` ``[*B, T, 1]``, or the value as
             its first entry of another name.
-        gamma (float): discount per base step, in ``(0, 1]``. Default 0.99.
+        gamma (float): discount per base step, in ``(0, 1]``.
         entropy_coeff (float): :math:`c_H \ge 0`, nats to return. Default 0.01, the paper's.
         critic_coeff (float): :math:`c_v > 0`. Default 0.5: half the squared error.
         reduction (str): ``"mean"`` (default), ``"sum"``, which is the paper's accumulation, or
-            ``"none"``. With the mean a learning rate does not depend on the segment's length.
+            ``"none"``.
         loss_critic_type (str): ``"l2"`` (default), ``"l1"`` or ``"smooth_l1"``.
         **kwargs: of ``torchrl.objectives.A2CLoss``, e.g. ``separate_losses`` or ``functional``.
 
     Returns:
         TensorDict with ``loss_objective``, ``loss_critic`` and ``loss_entropy``, and the detached
         ``entropy``, nats. With ``reduction="none"`` the losses are ``[*B, T]``.
-
-    Raises:
-        ValueError: if gamma, a coefficient or the reduction is out of range.
 
     Keys (``set_keys``): those of ``A2CLoss``, and ``duration`` (int64 ``[*B, T, 1]``, base steps,
     default ``("next", "duration")``; 1 if absent).

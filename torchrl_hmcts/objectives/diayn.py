@@ -35,7 +35,6 @@ class DIAYNLoss(DiscreteSkillSACLoss):
         TensorDict with the entries of :class:`DiscreteSkillSACLoss`, among them
         ``loss_discriminator`` and the detached ``discriminator_accuracy``.
 
-
     Keys (``set_keys``): those of ``DiscreteSACLoss`` and of :class:`SkillDiscriminatorLoss`
     (``skill``, ``skill_logits``).
 
@@ -49,9 +48,7 @@ class DIAYNLoss(DiscreteSkillSACLoss):
         >>> loss = DIAYNLoss(
         ...     SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"]),
         ...     SkillCritic(2, 4, num_skills=3, in_keys=["velocity"]),
-        ...     SkillDiscriminator(2, num_skills=3),
-        ...     action_space="categorical",
-        ... )
+        ...     SkillDiscriminator(2, num_skills=3), action_space="categorical")
         >>> [key for key in loss.out_keys if key.startswith("loss")]
         ['loss_actor', 'loss_qvalue', 'loss_alpha', 'loss_discriminator']
     """

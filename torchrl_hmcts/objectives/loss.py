@@ -162,24 +162,20 @@ def use_durations(
 
     .. math:: R + \gamma^k (1 - d) V(s')
 
-    TorchRL's on-policy trainers (``PPOTrainer``, ``A2CTrainer``, ``ReinforceTrainer``) estimate
-    advantages by a ``GAE`` of their own, which does not know the loss's setting: give them
-    ``gae=use_durations(GAE(...))``. A later ``make_value_estimator`` makes an estimator that does
-    not know durations; call this again after it.
+    TorchRL's on-policy trainers estimate advantages by a ``GAE`` of their own: give them
+    ``gae=use_durations(GAE(...))``. Call this again after each ``make_value_estimator``.
 
     Args:
         module (LossModule or ValueEstimatorBase): what discounts, e.g. a ``DQNLoss`` or a ``GAE``.
         gamma (float, optional): discount per base step, in ``(0, 1]``, for a loss, whose default
-            value estimator is made with it. Default: a loss keeps the estimator it has, or makes
-            one with its own defaults.
+            value estimator is made with it. Default: that of the estimator it has.
         duration_key (NestedKey): base steps of a macro-step, int64 ``[*B, 1]``, under ``"next"``.
 
     Returns:
         The module.
 
     Raises:
-        TypeError: if the module is neither a loss nor an estimator.
-        ValueError: if ``gamma`` is out of range, or is given for an estimator, which has its own.
+        ValueError: if ``gamma`` is given for an estimator, which has its own.
 
     Reference:
         Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999.

@@ -34,10 +34,8 @@ class OptionModelLoss(Loss):
     corner, and the square as :math:`\ell_R`: a sparse reward is to be met in the mean.
 
     Members differ by their first weights and, if the data hold ``bootstrap_mask``, by which
-    transitions each of them learns from; store such a mask with the data.
-
-    An option that the time limit cut short has no true outcome: leave such transitions out (those
-    with ``truncated`` and fewer base steps than the option would have taken).
+    transitions each of them learns from; store such a mask with the data. An option that the time
+    limit cut short has no true outcome: leave such transitions out.
 
     Args:
         model (OptionModel): what is trained; it stays a sub-module as it is.
@@ -50,12 +48,9 @@ class OptionModelLoss(Loss):
         and detached ``delta_error`` (mean absolute error of the normalised changes, over members)
         and ``terminated_accuracy``; with ``reduction="none"`` all ``[*B]``.
 
-    Raises:
-        ValueError: if the reduction or a weight is not usable.
-
     Keys (``set_keys``): ``reward``, ``duration``, ``terminated`` (under ``"next"``; defaults: the
-    model's), ``bootstrap_mask`` (``[*B, K]``, any number >= 0, read if it is there; default
-    ``"bootstrap_mask"``), ``priority_weight``.
+    model's), ``bootstrap_mask`` (``[*B, K]``, any number >= 0, if it is there),
+    ``priority_weight``.
 
     Reference:
         Bootstrapped ensembles: Chua et al. 2018, arXiv 1805.12114; masks: Osband et al., "Deep

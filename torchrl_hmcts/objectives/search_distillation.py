@@ -36,26 +36,22 @@ class ExpertIterationLoss(Loss):
     - ``"l2"``: :math:`(v - G)^2`;
     - ``"smooth_l1"``: Huber's, with its corner at 1;
     - ``"log"``: Huber's of :math:`\ln v - \ln G`, for positive values. With one reward at the end
-      :math:`\ln G = n \ln \gamma`: the error counts base steps, however far the reward is;
+      it counts base steps, however far the reward is;
     - ``"cross_entropy"``: :math:`-G \ln v - (1 - G) \ln(1 - v)`, for values that are probabilities.
 
     Args:
         network (TensorDictModuleBase): reads its ``in_keys`` and writes ``logits`` ``[*B, A]`` and
             ``state_value`` ``[*B, 1]``, the prior and the value of a planner.
-        value_coeff (float): :math:`c_v`. Default ``1.0``.
+        value_coeff (float): :math:`c_v`.
         value_loss (str): ``"l2"`` (default), ``"smooth_l1"``, ``"log"`` or ``"cross_entropy"``.
         reduction (str): ``"mean"`` (default; over all examples, not over their weights), ``"sum"``
             or ``"none"``.
 
     Returns:
-        TensorDict with ``loss_policy`` and ``loss_value``, and the detached diagnostics
-        ``policy_accuracy`` (fraction of examples whose target's best option has the highest logit),
-        ``policy_divergence`` (nats above the target's entropy) and ``value_error`` (mean absolute),
-        the last three over examples that have a weight. With ``reduction="none"`` all are ``[*B]``.
-
-    Raises:
-        ValueError: if ``value_coeff`` is negative, or a name is none of those above.
-        KeyError: at the call, if the examples have no targets.
+        TensorDict with ``loss_policy`` and ``loss_value``, and detached diagnostics over examples
+        that have a weight: ``policy_accuracy`` (fraction whose target's best option has the highest
+        logit), ``policy_divergence`` (nats above the target's entropy) and ``value_error`` (mean
+        absolute). With ``reduction="none"`` all are ``[*B]``.
 
     Keys (``set_keys``): ``logits``, ``state_value``, ``policy_target`` (float ``[*B, A]``),
     ``policy_weight`` (float ``[*B]``, 1 if absent), ``value_target`` (float ``[*B, 1]``),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from torchrl_hmcts.checks import nested_key, real_number
@@ -172,7 +171,10 @@ class StallTransform(EnvTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         before, after = tensordict[self.in_key], next_tensordict.get(self.in_key)
-        still = _distance(before, after, next_tensordict.batch_dims) < self.tolerance
+        moved = (after - before).reshape(*next_tensordict.batch_size, -1)
+        if not moved.is_floating_point():
+            moved = moved.to(torch.get_default_dtype())
+        still = torch.linalg.vector_norm(moved, dim=-1, keepdim=True) < self.tolerance
         count = tensordict.get(self.out_key, None)
         count = still if count is None else (count + 1) * still
         return next_tensordict.set(self.out_key, count.to(torch.int64))
@@ -188,12 +190,3 @@ class StallTransform(EnvTransform):
         if self.in_key not in state_spec.keys(True, True):
             state_spec[self.in_key] = self.parent.full_observation_spec[self.in_key].clone()
         return state_spec
-
-
-def _distance(before: Tensor, after: Tensor, batch_dims: int) -> Tensor:
-    """Euclidean distance over all but the batch dimensions, ``[*B, 1]``."""
-    shape = (*after.shape[:batch_dims], -1)
-    difference = (after - before).reshape(shape)
-    if not difference.is_floating_point():
-        difference = difference.to(torch.get_default_dtype())
-    return torch.linalg.vector_norm(difference, dim=-1, keepdim=True)

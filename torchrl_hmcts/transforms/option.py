@@ -320,9 +320,3 @@ class OptionTransform(EnvTransform):
                 )
             self._rollout = OptionRollout(self)
         return self._rollout
-
-    def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}(num_options={self.num_options}, max_steps={self.max_steps}, "
-            f"gamma={self.gamma})"
-        )

@@ -96,7 +96,13 @@ class OptionRecorder(EnvTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         block = next_tensordict.pop(OptionTrajectory.KEY)  # [*B, T]
-        skill = tensordict[self.skill_key].clone()  # a planner may use its options' memory again
+        skill = tensordict.get(self.skill_key, None)
+        if skill is None:
+            raise KeyError(
+                f"OptionRecorder found no skill under {self.skill_key!r}. Give it the skill_key of "
+                "the OptionTransform, and put both on the same side of a SerialEnv or ParallelEnv."
+            )
+        skill = skill.clone()  # a planner may use the memory of its options again
         self._blocks.append((block.reshape(-1, block.shape[-1]), skill.reshape(-1)))
         self.num_base_steps += int(block.get(OptionTrajectory.MASK_KEY).sum())
         return next_tensordict

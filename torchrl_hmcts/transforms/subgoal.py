@@ -350,12 +350,6 @@ class SubgoalTransform(EnvTransform):
         keys = list(map(unravel_key, self.parent.done_keys))
         return next((key for key in keys if parts(key)[-1] == "terminated"), keys[0])
 
-    def __repr__(self) -> str:
-        return (
-            f"SubgoalTransform(planner={type(self.planner).__name__}, num_goals={self.num_goals}, "
-            f"relative={self.relative})"
-        )
-
 
 def _rows(value: Tensor) -> np.ndarray:
     """The vectors of an entry as rows, ``[m, D]``."""
