@@ -62,8 +62,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
             options led to a state in the tree, its subtree is searched further
             (:meth:`MCTSPlanner.advance`). Default ``False``.
         state_map (callable, optional): ``state_map(td) -> TensorDict [*B]`` of the planner's
-            ``in_keys``, from the entries of the env in which the policy acts. Default: that env
-            writes the ``in_keys`` itself.
+            ``in_keys``. Default: the env in which the policy acts writes them itself.
         env (EnvBase, optional): the macro env to act in, checked once against the planner's.
 
     Raises:

@@ -144,8 +144,7 @@ class PolicyValueEvaluator:
         module: a TensorDictModule whose inputs are entries of the macro environment and which
             writes logits ``[m, A]`` and values ``[m, 1]`` or ``[m]``.
         temperature: T > 0 of the prior. Default 1.
-        uniform_share: :math:`\epsilon` in [0, 1], the share of the prior that is uniform, so that a
-            network that is too sure rules out no option. Default 0.
+        uniform_share: :math:`\epsilon` in [0, 1], so that no option is ruled out. Default 0.
         logits_key, value_key: its outputs. Defaults ``"logits"`` and ``"state_value"``.
 
     Raises:
@@ -218,12 +217,10 @@ class RolloutEvaluator:
     ``num_base_steps`` does.
 
     Args:
-        policy: ``policy(td) -> probabilities [m, A]`` of the options, e.g. :class:`ModulePrior`;
-            options that the mask forbids are never taken. Default: uniform.
+        policy: ``policy(td) -> probabilities [m, A]``, e.g. :class:`ModulePrior`. Default: uniform.
         max_options: options of a rollout at most. Default 10.
         num_rollouts: rollouts from each state, of which the mean is taken. Default 1.
-        bootstrap: evaluator of the state in which a rollout is cut off: by ``max_options``, by a
-            truncation, or where no option is allowed. Default: 0.
+        bootstrap: evaluator of the state in which a rollout is cut off. Default: 0.
 
     Raises:
         ValueError: if a number is below 1; at the call if the policy gives no probabilities.

@@ -92,15 +92,13 @@ class MCTSPlanner(TensorDictModuleBase):
             ``planner.settings`` holds them; each can be read and assigned as an attribute.
         expand, leaves_per_wave, waves_in_flight, exhausted: see there, too.
         leaf_evaluator (callable, optional): ``leaf_evaluator(td) -> values [m]`` or ``[m, 1]`` of
-            new nodes, from their state and observation, or an :class:`Evaluation` of values and
-            priors: :class:`ValueEvaluator`, :class:`RolloutEvaluator`, :class:`MixedEvaluator`,
-            :class:`PolicyValueEvaluator` or your own. Default: 0.
+            new nodes, or an :class:`Evaluation`: :class:`ValueEvaluator`,
+            :class:`RolloutEvaluator`, :class:`PolicyValueEvaluator` or your own. Default: 0.
         option_prior (callable, optional): ``option_prior(td) -> probabilities [m, A]``:
             :class:`ModulePrior` or your own. Default: those of ``leaf_evaluator``, else uniform.
         root_noise (DirichletNoise, optional): noise in the prior of the roots. Default: none.
-        final_choice: :class:`BestPlan`, :class:`MostVisited`, :class:`HighestValue` or
-            :class:`SampledVisits`. Default: best plan; with ``chance`` most visited, since no
-            sequence of options is sure to repeat; with :class:`Gumbel` its own choice.
+        final_choice: :class:`BestPlan` (default), :class:`MostVisited` (default with ``chance``),
+            :class:`HighestValue` or :class:`SampledVisits`. :class:`Gumbel` has its own choice.
         budget (SearchBudget): limits per root. Default: 1,000 expansions, until a plan is found.
         duration_key, mask_key (NestedKey): entries of the env with the base steps of a step, int64
             ``[*B, 1]`` (None, or an env without it: 1), and the options that may be taken, bool
@@ -319,8 +317,8 @@ class MCTSPlanner(TensorDictModuleBase):
     def resume(self, search: Search, *, where: Tensor | None = None) -> Search:
         """Continue a search, with a fresh budget; with ``Gumbel`` to the end of its schedule.
 
-        Only the roots ``where`` (bool ``[*B]``) are searched, all by default. The search follows
-        the planner: assign ``planner.tree_policy = UCT(c=5.0)`` for another constant.
+        Only the roots ``where`` (bool ``[*B]``) are searched, all by default. The search takes the
+        planner's present settings.
 
         Raises:
             ValueError: if the search was planted with another backup, novelty test or the like.

@@ -139,32 +139,28 @@ class RadiusNovelty(_Compiled):
 
     .. math:: k(s) < \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
 
-    The subtree behind the longer path stays. States lie in a grid of cells (of the three features
-    that vary most), so that the cost of a test does not depend on the size of the tree.
+    States lie in a grid of cells, so that the cost of a test does not depend on the size of the
+    tree.
 
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``.
         radius: in units of the (scaled) entries.
         scale: factor of each entry. Default: all 1.
-        relaxation: factor of the radius when a search is exhausted, in ``(0, 1)``. Default 0.75; a
-            smaller factor reopens more at once, and makes the hardest searches longer.
+        relaxation: factor of the radius when a search is exhausted, in ``(0, 1)``. Default 0.75.
         max_relaxations: how often the radius of a search may be relaxed. Default 14, to a sixtieth.
-        shorter_paths: also accept a state near others if it is reached in fewer base steps. Default
-            False: only the first path to a place is searched. Use it with a budget that continues
-            after the first plan (``improve_expansions``).
+        shorter_paths: also accept a state near others if it is reached in fewer base steps, for a
+            budget that continues after the first plan (``improve_expansions``). Default False.
         encoder (TensorDictModule, optional): writes ``key`` from entries of the state or
-            observation, e.g. a :class:`~torchrl_hmcts.modules.SkillEncoder`; the test then compares
-            learned features. Default: none, ``key`` is an entry itself.
+            observation, e.g. a :class:`~torchrl_hmcts.modules.SkillEncoder`. Default: none.
 
     Raises:
         ValueError: if no key is given, the radius is not positive, the scales do not match the
             keys, or a factor is out of its range.
 
     Reference:
-        The idea for continuous states of width-1 novelty: Lipovetzky, Ramirez and Geffner,
-        "Classical planning with simulators", 2015. Shorter paths: the local dominance of Li,
-        Littlefield and Bekris, "Asymptotically optimal sampling-based kinodynamic planning", 2016
-        (stable sparse RRT).
+        Width-1 novelty: Lipovetzky, Ramirez and Geffner, "Classical planning with simulators",
+        2015. Shorter paths: Li, Littlefield and Bekris, "Asymptotically optimal sampling-based
+        kinodynamic planning", 2016.
 
     Example:
         >>> import numpy as np, torch
@@ -304,17 +300,13 @@ class WidthNovelty(_Compiled):
     exhausted. This is width-1 search, the "IW(1)" of classical planning, meant for discrete
     features, e.g. the 128 RAM bytes of an Atari game.
 
-    With ``stages`` an exhausted search first compares more features, and only then raises
-    :math:`n`. Put features that tell many states apart last. The test remembers the values of all
-    features from the start.
-
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``, of an integer
             type or bool.
         max_relaxations: how often :math:`n` may be raised for a search. Default 14; at most 254.
         stages (sequence of int): number of features, counted from the first, to compare at first,
-            after one relaxation, and so on; each larger than the one before. After the last stage
-            all are compared. Default: all at once.
+            after one relaxation, and so on; after the last stage all are compared, and only then
+            :math:`n` is raised. Features that tell many states apart come last. Default: all.
 
     Raises:
         ValueError: if no key is given, ``max_relaxations`` is out of its range, or the stages do
