@@ -14,6 +14,7 @@ pytest.importorskip("ale_py")
 
 from torchrl_hmcts.envs import AtariOptionPool, RepeatActions  # noqa: E402
 from torchrl_hmcts.trainers import AtariAgent, AtariSearch, ReactiveManager  # noqa: E402
+from torchrl_hmcts.trainers.cli import main  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun, score_at  # noqa: E402
 
@@ -153,3 +154,17 @@ def test_the_score_at_a_number_of_frames_is_that_of_the_last_episodes_that_were_
     rows = [{"frames": i * 1_000_000, "score": float(i)} for i in range(1, 10)]
     assert score_at(rows, last=3) == {"2000000": 1.5, "5000000": 4.0, "10000000": 8.0}
     assert score_at(rows[:1]) == {}  # a run that was stopped at 1 million frames has none
+
+
+def test_a_run_is_shown_with_search_and_without(tmp_path, capsys) -> None:
+    folder, film = tmp_path / "run", tmp_path / "film.gif"
+    words = ["experiment=atari", "game=Breakout", "protocol=sticky", "source=repeat", "ratio=1"]
+    small = ["frames=9000", "max_episode_frames=400", "num_processes=0", f"out={folder}"]
+    assert main(["train", *words, *small]) == 0
+    for ratio, how in ((0, "plays without search"), (1, "searches")):
+        assert main(["play", f"run={folder}", f"ratio={ratio}", f"out={film}"]) == 0
+        assert f"Breakout, sticky: the agent {how} and scores" in capsys.readouterr().out
+        assert film.read_bytes()[:3] == b"GIF"
+        film.unlink()
+    assert main(["play", f"run={folder}", "out=film.mp4"]) != 0
+    assert "out of an Atari run is a film FILE.gif; got" in capsys.readouterr().err

@@ -81,8 +81,9 @@ class AtariConfig(RunConfig):
     """Test episodes of such a point."""
     curve_steps: int = 0
     """Base steps after which such an episode is ended; 0: it is played to its end."""
-    ratio: float = 25.0
-    """Simulated base steps per real one, after which a search selects no new leaves."""
+    ratio: float = -1.0
+    """Simulated base steps per real one, after which a search selects no new leaves; -1: 25, or 10
+    where the guide is reactive; 0: a reactive guide plays without search."""
     rollout_options: int = -1
     """Options of the rollouts that stay in the tree; -1: 5, or none where the guide is reactive,
     whose values take their place."""
@@ -146,7 +147,7 @@ class AtariConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.ratio >= 0.0 or (self.ratio == 0.0 and self._guide != "reactive"):
+        if self.ratio != -1.0 and not self.ratio >= (0.0 if self._guide == "reactive" else 1e-9):
             raise ValueError(
                 f"ratio must be above 0; got {self.ratio}. With guide=reactive ratio=0 plays "
                 f"without search; here it is guide={self.guide}."
@@ -175,7 +176,10 @@ class AtariConfig(RunConfig):
         options = self.rollout_options
         if options < 0:
             options = 0 if guide == "reactive" else 5
-        return replace(self, guide=guide, source=source, rollout_options=options)
+        ratio = self.ratio
+        if ratio < 0.0:
+            ratio = 10.0 if guide == "reactive" else 25.0
+        return replace(self, guide=guide, source=source, rollout_options=options, ratio=ratio)
 
     def check_inputs(self) -> None:
         """Check what the run needs from outside, before anything is written.

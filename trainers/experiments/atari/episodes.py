@@ -211,7 +211,8 @@ class AtariRun:
     @property
     def _played_enough(self) -> bool:
         config = self.config
-        enough = config.guide != "reactive" and len(self.scores) >= config.episodes
+        practising = config.guide == "reactive" and config.practice > 0.0
+        enough = not practising and len(self.scores) >= config.episodes
         return enough or self.num_frames >= config.frames
 
     def kept(self) -> str:
@@ -279,15 +280,14 @@ class AtariRun:
         if not isinstance(manager, ReactiveManager) or pool is None:
             return
         pool.set_seed(_PRACTICE_SEED + self.kit.start_seed(len(self.scores), sticky=self.sticky))
-        rest = self.num_frames - manager.practised
+        before = manager.practised
+        rest = self.num_frames - before
         while (due := rest * share / (1.0 - share) - manager.practised) > 0:
             manager.practise(pool, min(math.ceil(due), _PRACTICE_FRAMES))
             tick()
-        scores = manager.scores
-        mean = sum(scores) / max(1, len(scores))
-        console.note(
-            f"Practice: {manager.practised:,} frames, the latest episodes score {mean:.1f}"
-        )
+        if manager.scores and manager.practised > before:
+            mean = sum(manager.scores) / len(manager.scores)
+            console.note(f"Practice: {manager.practised:,} frames, latest episodes {mean:.1f}")
 
     def _begin_episode(self, agent: AtariAgent) -> None:
         self._seed_episode(agent)

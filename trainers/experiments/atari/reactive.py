@@ -52,8 +52,9 @@ class ReactiveManager:
 
     .. math:: -\lambda\, \mathbb{E}_{s, o} \log \pi_\theta(o \mid s)
 
-    over such labels. As the agent's ``guide`` it gives the prior of PUCT, a share of it uniform,
-    and the values of leaves. It plays alone by :meth:`act`, or in an agent with
+    over such labels. As the agent's ``guide`` it is called with the RAM, uint8 ``[K, 128]``, and
+    gives the prior of PUCT ``[K, Z]``, a share of it uniform, and the values of leaves ``[K, 1]``.
+    It plays alone by :meth:`act`, or in an agent with
     ``AtariSearch(ratio=0)``.
 
     Args:
@@ -125,6 +126,9 @@ class ReactiveManager:
         instance(name, "hidden", hidden, Sequence)
         self.imitation_coeff = real_number(name, "imitation_coeff", imitation_coeff, least=0.0)
         self.uniform_share = real_number(name, "uniform_share", uniform_share, least=0.0, most=1.0)
+        real_number(name, "lr", lr, above=0.0)
+        real_number(name, "gamma", gamma, above=0.0, most=1.0)
+        real_number(name, "entropy_coeff", entropy_coeff, least=0.0)
         self.num_options, self.num_envs, self.steps = num_options, num_envs, steps
         self.epochs, self.batch_size = epochs, batch_size
         widths = list(hidden)
