@@ -38,7 +38,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 SKIPPED = {"__init__.py", "drawing.py", "export.py"}  # pictures, not search
 FAST = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-_BESIDE = ("variant_", "batch_", "subtree_", "root_", "number_")
+_BESIDE = ("variant_", "batch_", "root_")
 KERNELS = {f"{name}kernels.py" for name in ("", *_BESIDE)}
 COMPILED = {*KERNELS, "novelty_kernels.py", "tree.py"}  # numba keeps what it made of them
 # First, as `make coverage` does, what is fast without compiling.
@@ -51,7 +51,7 @@ TESTS = {  # of a file; others have the general ones of their folder
         f"{_SEARCH} tree_policies stochastic_search planner_reference kernels_in_python",
     ),
     "search.py": f"{_SEARCH} novelty",
-    "outcomes.py": "search_numbers planner",
+    "outcomes.py": "search_numbers planner evaluators",
     "search_loop.py": f"{_SEARCH} waves_in_flight tree_rollout",
     "subtree.py": f"{_SEARCH} novelty tree_rollout",
     "settings.py": "search_numbers planner tree_policies",
@@ -66,7 +66,6 @@ TESTS = {  # of a file; others have the general ones of their folder
     "reference.py": "planner_reference",
     "tree_policies.py": "tree_policies",
     "evaluation.py": "evaluators expert_iteration",
-    "answers.py": "evaluators planner",
     "random_streams.py": "evaluators planner",
     "evaluators.py": "evaluators expert_iteration",
     "plan.py": "planner_golden planner hierarchical_policy",

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Binary, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_hmcts.envs import maze_pool
+from torchrl_hmcts.envs import AtariOptionPool, RepeatActions, maze_pool
 from torchrl_hmcts.planners import (
     PUCT,
     MCTSPlanner,
@@ -31,6 +30,7 @@ from torchrl_hmcts.planners import (
     Search,
     SearchBudget,
     Transition,
+    simulator,
     tree_search,
 )
 from torchrl_hmcts.planners.tree import EDGE, NODE
@@ -84,24 +84,23 @@ def scaling() -> dict[str, Any]:
 
 def overhead(planner: MCTSPlanner, start: TensorDictBase, searches: int) -> dict[str, Any]:
     """The planner's own share of the time of a search, everything but the simulator's step."""
-    simulator, spent = planner.simulator, [0.0, 0.0]
-    step = simulator.env._step
+    spent, step = [0.0, 0.0], simulator.step_states
 
-    def timed(states: TensorDictBase) -> TensorDictBase:
+    def timed(env: EnvBase, states: TensorDictBase) -> TensorDictBase:
         begin = clock()
-        after = step(states)
+        after = step(env, states)
         spent[0] += clock() - begin
         return after
 
     planner.search(start)
     waves = 0
-    simulator.env.__dict__["_step"] = timed
+    simulator.step_states = timed
     for _ in range(searches):
         begin = clock()
         search = planner.search(start)
         spent[1] += clock() - begin
         waves += int(search.num_expansions[0])
-    del simulator.env.__dict__["_step"]
+    simulator.step_states = step
     own = spent[1] - spent[0]
     return {
         "expansions": waves,
@@ -121,68 +120,19 @@ def waterworld() -> dict[str, Any]:
     return overhead(planner, make_starts(env.base_env, 1, seed=0), searches=5)
 
 
-class BreakoutOptions(EnvBase):
-    """Four options that hold an action for ten steps of four frames; state: the emulator's."""
-
-    batch_locked = False
-    _supports_set_state = True
-
-    def __init__(self) -> None:
-        import ale_py
-
-        super().__init__(batch_size=[])
-        ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
-        self._ale_py, self.ale = ale_py, ale_py.ALEInterface()
-        self.ale.setFloat("repeat_action_probability", 0.0)
-        self.ale.setInt("frame_skip", 4)
-        self.ale.loadROM(ale_py.roms.get_rom_path("breakout"))
-        self.actions = self.ale.getMinimalActionSet()
-        self.size = len(self.ale.cloneState().serialize())
-        state = Unbounded((self.size,), dtype=torch.uint8)
-        self.state_spec = Composite(emulator=state)
-        self.observation_spec = Composite(
-            emulator=state.clone(), ram=Unbounded((128,), dtype=torch.uint8)
-        )
-        self.action_spec = Categorical(4, shape=())
-        self.reward_spec = Unbounded((1,))
-        self.done_spec = Composite(done=Binary(1, dtype=torch.bool))
-
-    def _entries(self) -> tuple[torch.Tensor, torch.Tensor]:
-        state = np.frombuffer(self.ale.cloneState().serialize(), np.uint8).copy()
-        return torch.from_numpy(state), torch.from_numpy(self.ale.getRAM())
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
-        self.ale.reset_game()
-        emulator, ram = self._entries()
-        return TensorDict({"emulator": emulator, "ram": ram}, [])
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        rows = []
-        for state, action in zip(
-            tensordict["emulator"].numpy(), tensordict["action"].tolist(), strict=True
-        ):
-            self.ale.restoreState(self._ale_py.ALEState(state.tobytes()))
-            reward = sum(self.ale.act(self.actions[action]) for _ in range(10))
-            rows.append((*self._entries(), float(reward), self.ale.game_over()))
-        emulator, ram, reward, done = zip(*rows, strict=True)
-        done = torch.tensor(done).unsqueeze(-1)
-        reward = torch.tensor(reward).unsqueeze(-1)
-        entries = {"emulator": torch.stack(emulator), "ram": torch.stack(ram), "reward": reward}
-        return TensorDict({**entries, "done": done}, tensordict.batch_size)
-
-    def _set_seed(self, seed: int | None) -> None:
-        """The emulator is deterministic."""
-
-
 def atari() -> dict[str, Any] | str:
+    """Four options that hold an action of Breakout for ten steps of four frames."""
     try:
-        env = BreakoutOptions()
+        pool = AtariOptionPool("Breakout", RepeatActions(4), max_steps=10, num_processes=0, seed=0)
     except ImportError:
         return "not measured: pip install ale-py"
+    env = TransformedEnv(pool)  # which does not step beside the planner
     planner = MCTSPlanner(
         env, tree_policy=PUCT(), budget=SearchBudget(expansions=60, until_plan=False)
     )
-    return {"state_bytes": env.size, **overhead(planner, env.reset()[None], searches=3)}
+    start = env.reset()[None]
+    size = start["emulator_state"].shape[-1]
+    return {"state_bytes": size, **overhead(planner, start, searches=3)}
 
 
 def main() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -434,29 +433,6 @@ def test_an_answer_that_does_not_fit_is_named_at_once(
     root = Table(seed=7).root([0, 1])
     with pytest.raises(error, match=message):
         tree_search(root, transition, 20, tree_policy=policy)
-
-
-@pytest.mark.parametrize("policy", [PUCT(), UCT_IN_PYTHON])
-@pytest.mark.parametrize("name", ["reward", "discount", "prior", "value"])
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_number_that_is_not_finite_is_caught_in_the_middle_of_a_search(
-    name: str, bad: float, policy: Any
-) -> None:
-    def spoil(answer: Transition) -> Transition:
-        array = getattr(answer, name).copy()
-        array[-1] = bad
-        return answer._replace(**{name: array})
-
-    root = Table(seed=7).root([0, 1])
-    with pytest.raises(ValueError, match="finite"):
-        tree_search(root, nth(9, spoil), 40, tree_policy=policy)
-
-
-@pytest.mark.parametrize("policy", [PUCT(), UCT_IN_PYTHON])
-def test_rows_that_are_missing_are_caught_in_the_middle_of_a_search(policy: Any) -> None:
-    cut = lambda answer: Transition(*(x[:1] for x in answer))  # noqa: E731
-    with pytest.raises(ValueError, match="transition function returned"):
-        tree_search(Table(seed=7).root([0, 1]), nth(9, cut), 40, tree_policy=policy)
 
 
 @pytest.mark.parametrize("policy", [PUCT(), UCT_IN_PYTHON])

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from search_parts import CountingEnv, DeadEnd, expansions, trees
+from search_parts import CountingEnv, DeadEnd
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_hmcts.planners import (
-    PUCT,
     MCTSPlanner,
     MixedEvaluator,
     ModulePrior,
@@ -385,16 +384,6 @@ def test_a_prior_that_is_not_there_or_not_clear_is_refused() -> None:
         ModulePrior(right)  # type: ignore[arg-type]
 
 
-def test_a_prior_of_a_module_is_the_one_in_the_tree() -> None:
-    env = ChainEnv(5)
-    planner = MCTSPlanner(env, tree_policy=PUCT(), option_prior=ModulePrior(logits_of_state()))
-    tree = planner.search(at(env, [2])).tree
-    assert tree.states is not None
-    for node in range(int(tree.num_nodes[0])):
-        state = tree.states["state"][0, node].item()
-        assert tree.edges["prior"][0, node, 1] == pytest.approx(1 / (1 + np.exp(-state)))
-
-
 # ---------------------------------------------------------------------- mixtures
 
 
@@ -426,48 +415,6 @@ def test_a_mixture_of_misfits_is_refused() -> None:
 
 
 # ---------------------------------------------------------------------- in a planner
-
-
-class Remainder(nn.Module):
-    """Values of a chain's states that say nothing; one by one, so that no rounding varies."""
-
-    def forward(self, state: Tensor) -> Tensor:
-        return (5 * state % 7).to(torch.float32).unsqueeze(-1) / 16
-
-
-def evaluators() -> dict[str, Any]:
-    network = ValueEvaluator(TensorDictModule(Remainder(), ["state"], ["state_value"]))
-    return {
-        "network": network,
-        "rollouts": RolloutEvaluator(num_rollouts=2),
-        "guided": RolloutEvaluator(ModulePrior(logits_of_state()), bootstrap=network),
-        "mixed": MixedEvaluator(network, RolloutEvaluator()),
-    }
-
-
-@pytest.mark.parametrize("name", ["rollouts", "guided", "mixed"])
-def test_a_root_has_the_rollouts_it_has_alone(name: str) -> None:
-    env = ChainEnv(9)
-    budget = expansions(20)
-    planner = MCTSPlanner(env, leaf_evaluator=evaluators()[name], budget=budget)
-    together = trees(planner.search(at(env, [4, 2, 4]), seed=7))
-    assert together == trees(planner.search(at(env, [4, 2, 4]), seed=7))
-    for b, state in enumerate([4, 2, 4]):
-        assert trees(planner.search(at(env, [state]), seed=7 + b)) == [together[b]]
-    assert together[0] != together[2]
-
-
-def test_rollouts_show_the_value_of_a_plan_before_it_is_in_the_tree() -> None:
-    env = ChainEnv(5)
-    for policy, expected in ((right, 0.9**3), (None, 0.0)):
-        planner = MCTSPlanner(
-            env,
-            gamma=0.9,
-            backup="max",
-            leaf_evaluator=policy and RolloutEvaluator(policy),
-            budget=SearchBudget(expansions=1),
-        )
-        assert planner(env.reset())["root_value"].item() == pytest.approx(expected)
 
 
 def test_the_steps_of_rollouts_are_counted_beside_the_budget() -> None:

@@ -43,10 +43,7 @@ PLANNERS, ENVS = "torchrl_hmcts.planners", "torchrl_hmcts.envs"
 Arrays = dict[str, np.ndarray]
 
 
-KERNELS = (
-    *("number_kernels", "variant_kernels", "kernels", "root_kernels", "batch_kernels"),
-    *("subtree_kernels", "novelty_kernels"),
-)
+KERNELS = ("variant_kernels", "kernels", "root_kernels", "batch_kernels", "novelty_kernels")
 
 
 def in_python(name: str) -> ModuleType:
@@ -310,20 +307,6 @@ def test_the_width_test_accepts_the_same_states(dtype: Any, kernels: dict[str, M
     compiled = accepted(lambda: WidthNovelty("x"), states, steps)
     with used(kernels):
         check_equal(accepted(lambda: WidthNovelty("x"), states, steps), compiled)
-
-
-def test_the_same_states_are_found_equal(kernels: dict[str, ModuleType]) -> None:
-    codes = np.random.default_rng(0).integers(0, 12, (200, 2)).astype(np.uint8)
-
-    def twins() -> Arrays:
-        known = Transpositions("x")
-        known.start(2)
-        return {"twins": known.find(np.arange(200) % 2, codes, np.arange(200)).copy()}
-
-    compiled = twins()
-    with used(kernels):
-        check_equal(twins(), compiled)
-    assert (compiled["twins"] >= 0).any()
 
 
 # ---------------------------------------------------------------------- environments

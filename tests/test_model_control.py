@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from search_parts import ROAD, SLIPPERY_ROAD
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -17,7 +16,7 @@ from torchrl.envs import InitTracker, RenameTransform, TransformedEnv
 
 from torchrl_hmcts.envs import DeepMindLabEnv, LabMazeEnv
 from torchrl_hmcts.planners import HierarchicalPolicy, MCTSPlanner, RadiusNovelty, SearchBudget
-from torchrl_hmcts.testing import ChainEnv, TableEnv
+from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.transforms import OptionTransform
 
 
@@ -26,15 +25,6 @@ def renamed() -> TransformedEnv:
     return TransformedEnv(
         ChainEnv(6), RenameTransform(in_keys=["state"], out_keys=["place"], create_copy=True)
     )
-
-
-def test_it_plans_again_after_every_option_from_where_the_real_env_is() -> None:
-    model, real = TableEnv(ROAD, terminal=[5]), TableEnv(SLIPPERY_ROAD, terminal=[5])
-    policy = HierarchicalPolicy(MCTSPlanner(model), env=real, replan_every=1)
-    rollout = real.rollout(20, policy=policy)
-    assert rollout["state"].flatten().tolist() == [0, 1, 2, 6, 3, 4]
-    assert rollout["next", "reward"].sum().item() == 1.0
-    assert rollout["num_plans"].flatten().tolist() == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_map_makes_the_models_state_from_what_the_real_env_shows() -> None:
@@ -50,21 +40,6 @@ def test_a_map_makes_the_models_state_from_what_the_real_env_shows() -> None:
     assert rollout["action"].tolist() == [1] * 5
     assert calls == [0, 1, 2, 3, 4]
     assert rollout["plan_length"].flatten().tolist() == [5, 4, 3, 2, 1]
-
-
-def test_elements_of_a_batch_are_planned_for_side_by_side() -> None:
-    real, model = ChainEnv(6), ChainEnv(6)
-    start = real.reset(TensorDict({"state": torch.tensor([0, 3, 4])}, [3]), set_state=True)
-    policy = HierarchicalPolicy(
-        MCTSPlanner(model),
-        state_map=lambda td: td.select("state").clone(),
-        env=real,
-        replan_every=1,
-    )
-    rollout = real.rollout(
-        20, policy=policy, tensordict=start, auto_reset=False, break_when_all_done=True
-    )
-    assert rollout["next", "done"].squeeze(-1).sum(-1).tolist() == [1, 4, 5]
 
 
 def test_a_real_env_with_other_options_is_refused() -> None:

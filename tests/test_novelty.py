@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,37 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from search_parts import expansions
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Categorical
 
 from torchrl_hmcts.envs import GridworldMazeEnv, generate_mazes, shortest_path_lengths
 from torchrl_hmcts.planners import UCT, MCTSPlanner, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 
 PRUNED = 8
-
-
-class PairEnv(TableEnv):
-    """Two counters from 0 below a size, of which option 0 and 1 raise one each, to their ends."""
-
-    def __init__(self, size: int) -> None:
-        table = {}
-        for x in range(size):
-            for y in range(size):
-                table[x * size + y, 0] = (min(x + 1, size - 1) * size + y, 0.0, 1)
-                table[x * size + y, 1] = (x * size + min(y + 1, size - 1), 0.0, 1)
-        super().__init__(table)
-        self.size = size
-        for name in ("x", "y"):
-            self.observation_spec[name] = Categorical(size, shape=())
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._read_out(super()._step(tensordict))
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        return self._read_out(super()._reset(tensordict, **kwargs))
-
-    def _read_out(self, td: TensorDictBase) -> TensorDictBase:
-        return td.set("x", td["state"] // self.size).set("y", td["state"] % self.size)
 
 
 def accept(test: RadiusNovelty | WidthNovelty, roots: object, states: np.ndarray) -> np.ndarray:
@@ -63,22 +37,6 @@ def test_a_state_exactly_one_radius_away_is_accepted() -> None:
     novelty = RadiusNovelty("x", 0.5)
     novelty.start(1)
     assert accept(novelty, 0, features((0.0, 0.0), (0.3, 0.4))).all()
-
-
-def test_roots_do_not_see_each_others_states() -> None:
-    novelty = RadiusNovelty("x", 1.0)
-    novelty.start(3)
-    accepted = accept(novelty, [0, 1, 0, 2, 1], features(0.0, 0.0, 0.5, 0.5, 0.0))
-    assert accepted.tolist() == [True, True, False, True, False]
-    assert (novelty.num_tested, novelty.num_refused) == (5, 2)
-
-
-def test_a_new_search_forgets_the_last() -> None:
-    novelty = RadiusNovelty("x", 1.0)
-    for _ in range(2):
-        novelty.start(1)
-        assert accept(novelty, 0, features(0.0)).all()
-        novelty.relax(0)
 
 
 def test_relaxing_shrinks_the_radius_of_one_root_a_limited_number_of_times() -> None:
@@ -246,31 +204,6 @@ def test_shorter_paths_improve_the_plan_after_the_first() -> None:
 # ---------------------------------------------------------------------- new values
 
 
-def test_a_state_is_novel_if_one_of_its_values_is() -> None:
-    novelty = WidthNovelty("ram")
-    novelty.start(2)
-    states = np.array([[0, 0], [0, 1], [1, 0], [1, 1], [0, 1]], np.uint8)
-    assert accept(novelty, 0, states).tolist() == [True, True, True, False, False]
-    assert accept(novelty, 1, states[3:]).tolist() == [True, True]
-    assert novelty.statistics() == {"novelty_tested": 7, "novelty_refused": 2}
-
-
-def test_relaxing_accepts_a_value_once_more_for_one_root() -> None:
-    novelty = WidthNovelty("x", max_relaxations=2)
-    novelty.start(2)
-    same = np.zeros((3, 4), np.uint8)
-    for root in (0, 1):
-        assert accept(novelty, root, same).tolist() == [True, False, False]
-    assert novelty.relax(1)
-    assert accept(novelty, 1, same).tolist() == [True, False, False]
-    assert novelty.relax(1)
-    assert accept(novelty, 1, same).tolist() == [True, False, False]
-    assert not novelty.relax(1)
-    assert not accept(novelty, 0, same).any()
-    novelty.restart(1)
-    assert accept(novelty, 1, same).tolist() == [True, False, False]
-
-
 @settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -387,26 +320,6 @@ def test_a_search_expands_each_place_once() -> None:
     assert search.statistics()["pruned"] == 9
 
 
-def test_a_pruned_node_has_no_children_and_is_visited_once() -> None:
-    planner = MCTSPlanner(ChainEnv(30), novelty=RadiusNovelty("state", 1.0), budget=expansions(25))
-    search = planner.search(ChainEnv(30).reset())
-    tree = search.tree
-    pruned = np.flatnonzero(tree.nodes[0]["flags"] & PRUNED)
-    assert len(pruned) == 25
-    assert (tree.nodes[0, pruned]["visits"] == 1).all()
-    assert (tree.edges[0, pruned]["child"] == -1).all()
-
-
-def test_an_exhausted_search_shrinks_its_radius_and_goes_on() -> None:
-    # A step of 1 is within the radius of 3: both outcomes at the root are refused. Halved to 1.5:
-    # still. Halved to 0.75: the step to the right is accepted again, and the search goes on.
-    env = ChainEnv(6)
-    planner = MCTSPlanner(env, novelty=RadiusNovelty("state", 3.0, relaxation=0.5))
-    plan = planner.plan(env.reset())
-    assert plan.found.item()
-    assert plan.options.tolist() == [1] * 5
-
-
 def test_a_terminal_state_is_never_pruned() -> None:
     env = ChainEnv(3)
     planner = MCTSPlanner(env, novelty=RadiusNovelty("state", 1.0, max_relaxations=0))
@@ -462,16 +375,6 @@ def test_reopened_nodes_are_searched_and_keep_their_values() -> None:
     assert nodes["value"].tolist() == pytest.approx([2.0 / 5, 0.0, 0.5, 0.0, 0.0])
     assert not (nodes["flags"] & PRUNED).any()
     assert search.exhausted(np.array([0])).all()
-
-
-def test_an_exhausted_width_search_relaxes_and_reaches_all_states() -> None:
-    env = PairEnv(5)
-    planner = MCTSPlanner(env, novelty=WidthNovelty(["x", "y"]), budget=expansions(400))
-    search = planner.search(env.reset())
-    tree = search.tree
-    assert tree.states is not None
-    used = int(tree.num_nodes[0])
-    assert set(tree.states["state"][0, :used].tolist()) == set(range(25))
 
 
 @pytest.mark.parametrize("novelty", [RadiusNovelty("state", 1.0), WidthNovelty("state")])

@@ -361,24 +361,6 @@ def tree_of(search: Search, b: int) -> tuple[bytes, bytes]:
     return search.tree.nodes[b, :used].tobytes(), search.tree.edges[b, :used].tobytes()
 
 
-@settings(max_examples=25)
-@given(seed=seeds, config=configs, leaves_per_wave=st.sampled_from([1, 3]))
-def test_a_root_searched_beside_others_has_the_tree_it_has_alone(
-    seed: int, config: dict[str, Any], leaves_per_wave: int
-) -> None:
-    smdp = random_smdp(seed)
-    planner = planner_for(smdp, config, simulations=50)
-    planner.leaves_per_wave = leaves_per_wave
-    rng = random.Random(seed)
-    states = [rng.randrange(smdp.num_states) for _ in range(5)]
-    env = planner.simulator.env
-    assert isinstance(env, TableEnv)
-    together = planner.search(roots_at(env, states))
-    for b, state in enumerate(states):
-        alone = planner.search(roots_at(env, [state]))
-        assert tree_of(together, b) == tree_of(alone, 0)
-
-
 @settings(max_examples=15)
 @given(seed=seeds, config=configs)
 def test_roots_that_are_walked_down_together_have_the_trees_they_have_alone(

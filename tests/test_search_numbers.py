@@ -132,16 +132,6 @@ def test_probabilities_of_options_that_are_all_allowed_keep_their_bits() -> None
     assert (search.tree.edges["prior"][0, :4] == prior).all()
 
 
-@pytest.mark.parametrize("prior", [PRIOR, None])
-def test_noise_with_a_fraction_of_zero_changes_nothing(prior: np.ndarray | None) -> None:
-    def edges(**kwargs: Any) -> bytes:
-        planner = bandit_planner(tree_policy=PUCT(), prior=prior, **kwargs)
-        return planner.search(planner.simulator.env.reset()).tree.edges.tobytes()
-
-    assert edges(root_noise=DirichletNoise(fraction=0.0)) == edges()
-    assert edges(root_noise=DirichletNoise(fraction=0.5)) != edges()
-
-
 # ---------------------------------------------------------------------- arrays that users change
 
 
@@ -623,7 +613,7 @@ def test_a_planner_and_its_search_hold_the_same_settings_which_cannot_be_changed
     ("name", "value", "error"),
     [
         ("tree_policy", Gumbel(), "Gumbel needs a fixed number"),
-        ("leaves_per_wave", 0, "leaves_per_wave from 1 to 255; got 0"),
+        ("leaves_per_wave", 0, "product up to 255; got leaves_per_wave=0"),
         ("expand", "some", "expand must be 'all' or 'one'; got 'some'"),
         ("settings", UCT(), "SearchSettings for settings"),
     ],

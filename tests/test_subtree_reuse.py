@@ -138,17 +138,6 @@ def test_a_search_goes_on_below_the_kept_root_and_comes_to_the_values_of_a_new_o
 # ---------------------------------------------------------------------- what is not
 
 
-def test_another_state_than_the_planned_one_plants_a_new_tree() -> None:
-    env = TableEnv(BINARY_TREE, terminal=LEAVES)
-    planner = MCTSPlanner(env, budget=FOREVER)
-    search = planner.search(at(env, [0]))
-    assert planner.advance(search, torch.tensor([1]), at(env, [1])).tolist() == [False]
-    assert search.tree.num_nodes.tolist() == [1]
-    assert search.best_node.tolist() == [-1]
-    planner.resume(search)
-    assert walk(search, 0) == walk(planner.search(at(env, [1])), 0)
-
-
 def test_an_end_that_the_tree_does_not_know_of_plants_a_tree_that_has_ended() -> None:
     env = TableEnv(BINARY_TREE, terminal=LEAVES)
     planner = MCTSPlanner(env, budget=FOREVER)
@@ -208,9 +197,9 @@ def test_several_options_are_followed_at_once() -> None:
 @pytest.mark.parametrize(
     ("options", "states", "message"),
     [
-        (torch.tensor([1]), [2, 2], r"each of the 2 roots .* options \[1\] and states \[2\]"),
-        (torch.tensor([1, 1]), [2], r"each of the 2 roots .* options \[2\] and states \[1\]"),
-        (torch.zeros(2, 1, 1, dtype=torch.int64), [2, 2], r"got \[2, 1, 1\]"),
+        (torch.tensor([1]), [2, 2], r"for the 2 roots .* options \[1\], states \[2\]"),
+        (torch.tensor([1, 1]), [2], r"for the 2 roots .* options \[2\], states \[1\]"),
+        (torch.zeros(2, 1, 1, dtype=torch.int64), [2, 2], r"got options \[2, 1, 1\]"),
         (torch.tensor([0, 2]), [2, 2], "options below 2; got 2"),
     ],
 )

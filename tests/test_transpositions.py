@@ -30,10 +30,6 @@ Table = dict[tuple[int, int], tuple[int, float, int]]
 # ---------------------------------------------------------------------- by itself
 
 
-def codes(*rows: tuple[int, ...]) -> np.ndarray:
-    return np.array(rows, np.uint8)
-
-
 def test_states_are_the_bytes_of_their_entries_side_by_side() -> None:
     td = TensorDict(
         {
@@ -71,27 +67,6 @@ def test_states_are_found_as_in_a_dictionary(seed: int, num_bytes: int) -> None:
         if rng.random() < 0.3:
             known.restart(1)
             held[1].clear()
-
-
-def test_what_was_forgotten_stays_so_when_room_is_made() -> None:
-    known = Transpositions("state")
-    known.start(1)
-    codes = np.arange(100, dtype=np.int64).reshape(-1, 1).view(np.uint8)
-    root, nodes = np.zeros(100, np.int64), np.arange(1, 101)
-    known.find(root[:1], codes[:1], nodes[:1])
-    known.restart(0)
-    assert (known.find(root[1:], codes[1:], nodes[1:]) == -1).all()  # more than the first room
-    assert known.find(root[:1], codes[:1], np.array([500])).tolist() == [-1]
-    again = known.find(root, codes, nodes + 200)
-    assert again.tolist() == [500, *range(2, 101)]
-
-
-def test_states_of_another_size_are_refused() -> None:
-    known = Transpositions("state")
-    known.start(1)
-    known.find(np.zeros(1, np.int64), codes((1, 2)), np.zeros(1, np.int64))
-    with pytest.raises(ValueError, match="states of 2 bytes; got 1"):
-        known.find(np.zeros(1, np.int64), codes((1,)), np.ones(1, np.int64))
 
 
 # ---------------------------------------------------------------------- random processes

@@ -30,8 +30,7 @@ from torchrl_hmcts.planners import (
     Transpositions,
     tree_search,
 )
-from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.planners.layout import layered_layout
+from torchrl_hmcts.planners.drawing import layered_layout, option_color
 from torchrl_hmcts.planners.tree import CLOSED, EXPANDED, PRUNED, REWARDED, TERMINAL
 from torchrl_hmcts.testing import ChainEnv, TableEnv
 

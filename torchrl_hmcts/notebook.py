@@ -8,6 +8,20 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from tensordict import TensorClass
+
+_TensorClassType: Any = type(TensorClass)
+
+
+class KeepsDocstring(_TensorClassType):  # type: ignore[misc]
+    """Metaclass of a ``TensorClass`` that keeps its docstring and repr; tensordict's does not."""
+
+    def __new__(mcs, name: str, bases: Any, namespace: dict[str, Any], **kwargs: Any) -> Any:
+        cls = super().__new__(mcs, name, bases, namespace, **kwargs)
+        for kept in {"__doc__", "__repr__"} & set(namespace):
+            setattr(cls, kept, namespace[kept])
+        return cls
+
 
 def shown(text: str, draw: Callable[[Any], object] | None = None, **figure: Any) -> str:
     """Return a text and a picture as HTML, for ``_repr_html_``.

@@ -14,8 +14,7 @@ from torchrl_hmcts.planners.evaluators import (
 )
 from torchrl_hmcts.planners.mcts import MCTSPlanner
 from torchrl_hmcts.planners.novelty import NoveltyTest, RadiusNovelty, WidthNovelty
-from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.progress import SearchProgress
+from torchrl_hmcts.planners.plan import Plan, SearchProgress, extract_plans
 from torchrl_hmcts.planners.reference import ReferenceSearch
 from torchrl_hmcts.planners.root_options import (
     BestPlan,

@@ -40,10 +40,9 @@ class Root(NamedTuple):
         prior (Array): ``[B, A]`` float32, probabilities of options; scaled so that those of the
             allowed options sum to 1.
         value (Array): ``[B]`` float32.
-        embedding (Array): ``[B, ...]`` the state as the transition function reads it, any dtype. It
-            may be a mapping or tuple of such arrays, nested in any way, or a TensorDict. It may
-            also be a list of B states of any kind; the search keeps them, and no other code may
-            change them.
+        embedding (Array): ``[B, ...]`` the state as the transition function reads it, any dtype; a
+            mapping or tuple of such arrays, nested in any way, or a TensorDict; or a list of B
+            states of any kind, which no other code may change.
 
     Example:
         >>> import numpy as np
@@ -104,11 +103,9 @@ def tree_search(
 ) -> Search:
     r"""Search from ``B`` states at once with a transition function of your own.
 
-    It is the counterpart of mctx's ``muzero_policy(params, key, root, recurrent_fn)``: it has the
-    planner's trees, policies and backups, without environments and tensordicts. Every simulation
-    takes one option in one leaf, for all roots in one call of ``transition``, and backs up
-
-    .. math:: Q = R + D\, V.
+    The counterpart of mctx's ``muzero_policy(params, key, root, recurrent_fn)``, with the planner's
+    trees, policies and backups. Every simulation takes one option in one leaf, for all roots in one
+    call of ``transition``, and backs up :math:`Q = R + D\, V`.
 
     Args:
         root: states to search from, NumPy arrays or CPU tensors. The transition function gets the
@@ -122,8 +119,8 @@ def tree_search(
         seed: of the Gumbel noise; root ``b`` draws from ``seed + b``.
 
     Returns:
-        The :class:`~torchrl_hmcts.planners.Search`: ``search.tree.view().children_visits[:, 0]``
-        are the visits of the roots' options. States of nodes are not kept in the tree.
+        The :class:`Search`; ``search.tree.view().children_visits[:, 0]`` are the visits of the
+        roots' options. The tree keeps no states.
 
     Raises:
         ValueError: if shapes do not fit, a number is out of range or not finite (rewards and

@@ -14,7 +14,6 @@ from torchrl_hmcts.planners.kernels import (
     count_plan,
     select,
 )
-from torchrl_hmcts.planners.number_kernels import GOOD, first_bad
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     EDGE,
@@ -27,7 +26,13 @@ from torchrl_hmcts.planners.tree import (
     TERMINAL,
     WAVE,
 )
-from torchrl_hmcts.planners.variant_kernels import outcome, refresh_twins, wants_sample
+from torchrl_hmcts.planners.variant_kernels import (
+    GOOD,
+    first_bad,
+    outcome,
+    refresh_twins,
+    wants_sample,
+)
 
 COMPILED = not numba.config.DISABLE_JIT
 BLOCK = 32  # trees that go down in step: what they touch fits in the first-level cache
@@ -69,11 +74,7 @@ def _prefetch_node(nodes, edges, b, n):
 
 @numba.njit(forceinline=True, error_model="numpy", _nrt=False)
 def _walk_together(nodes, edges, roots, s, gumbel, first, last):
-    """Take all active roots down level by level; write their node, and the option to simulate.
-
-    One tree after the other would wait for memory at every node; in step, the nodes of the next
-    level are fetched while the other trees choose.
-    """
+    """Take all active roots down level by level, so that the next nodes are fetched meanwhile."""
     for b in range(first, last):
         _prefetch_node(nodes, edges, b, 0)
         roots[b]["at"] = 0
@@ -128,9 +129,8 @@ def advance(
 ):  # fmt: skip
     """Insert the outcomes of ``wave[:count]`` and select the next wave; return its size.
 
-    One call per simulation for searches over plain arrays: a discount of 0 is a terminal state, an
-    option takes one base step, and states (bytes, flat) are copied to and from the tree's
-    ``stored`` ones. What is written to ``states`` and ``options`` is never read again.
+    For searches over plain arrays: a discount of 0 is a terminal state, an option takes one base
+    step, and states (bytes, flat) are copied to and from the tree's ``stored`` ones.
     """
     s = record[0]
     size = stored.shape[2]

@@ -15,9 +15,9 @@ class SearchBudget:
     """Limits of a search, each per root; the search of a root ends at the first limit it reaches.
 
     The limit of simulations is exact with ``expand="one"``; with ``"all"`` the last leaf still
-    simulates all of its options. The other limits are checked after every wave, and with a
-    ``TreeRollout`` after its rollouts. So a search may exceed them by the waves in flight. A tree
-    of 2,130,706,431 visits is not searched further.
+    simulates all of its options. The other limits are checked after every wave and its rollouts, so
+    a search may exceed them by the waves in flight. A tree of 2,130,706,431 visits is not searched
+    further.
 
     Args:
         expansions: nodes whose options are simulated (with ``expand="one"``: options simulated).
@@ -123,11 +123,10 @@ class TreeRollout:
 
     .. math:: o_{i+1} \sim P(\cdot \mid s_i), \qquad i < n
 
-    It is the simulation step of the textbook, except that every state on the way becomes a node. So
-    no simulated step is lost, and a reward far ahead is found by a path that can be executed.
-    Without an ``option_prior`` options are drawn uniformly. A rollout ends with the episode, where
-    the novelty test refuses the state, and where the budget of simulations is spent. The other
-    limits are checked between rollouts. Its steps count in the budget.
+    It is the simulation step of the textbook, except that every state on the way becomes a node: no
+    simulated step is lost, and a reward far ahead is found by a path that can be executed. Without
+    an ``option_prior`` options are drawn uniformly. A rollout ends with the episode, where the
+    novelty test refuses the state, and where the simulations are spent, in which its steps count.
 
     Args:
         max_options: n, options of a rollout at most. Default 10.

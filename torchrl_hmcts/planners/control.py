@@ -37,23 +37,17 @@ class HierarchicalPolicy(TensorDictModuleBase):
     planner's choice is taken, and a new plan is made after it.
 
     The plan is kept in the tensordict, as the state of a recurrent policy is: ``"plan"`` (int64
-    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"`` (int64 ``[*B, 1]``), and
-    with ``divergence`` ``"plan_states"`` (float32 ``[*B, L + 1, f]``). ``"num_plans"`` counts the
-    plans made so far; with TorchRL's ``InitTracker``, those of the episode. Every episode begins
-    with a new plan. The policy detects a new episode by the last step: it ended the old one, or led
-    to another state than the present one. It cannot detect it in a tensordict that was copied
-    before the step; append TorchRL's ``InitTracker`` or ``StepCounter`` to the env there.
+    ``[*B, L]``), ``"plan_length"``, ``"plan_step"`` and ``"num_plans"`` (int64 ``[*B, 1]``, plans
+    so far; with TorchRL's ``InitTracker``, of the episode), and with ``divergence``
+    ``"plan_states"`` (float32 ``[*B, L + 1, f]``). Every episode begins with a new plan. The policy
+    detects a new episode by the last step: it ended the old one, or led to another state than the
+    present one. In a tensordict that was copied before the step it cannot; append TorchRL's
+    ``InitTracker`` or ``StepCounter`` to the env there.
 
-    The policy may act in another env than the planner's. ``state_map`` then makes the state to plan
-    from of that env's entries, :math:`\hat s = \mathrm{map}(o)`. So you can act in an env that
-    cannot be set to a state, and plan in a model that can. Put the real env under an
-    :class:`~torchrl_hmcts.transforms.OptionTransform` with the same worker. Plan again after every
-    option (``replan_every=1``), since options end elsewhere than the model predicts.
-
-    ``reuse`` keeps the trees from one decision to the next. If the executed options led to a state
-    that the tree holds, its subtree is searched further (:meth:`MCTSPlanner.advance`); otherwise a
-    new tree begins. The policy keeps the trees, so it can reuse them in one rollout at a time.
-    Another rollout gets correct plans too, but no subtrees.
+    The policy may act in another env than the planner's, e.g. one that cannot be set to a state,
+    under an :class:`~torchrl_hmcts.transforms.OptionTransform` with the same worker. ``state_map``
+    then makes the state to plan from of that env's entries, :math:`\hat s = \mathrm{map}(o)`. Plan
+    again after every option (``replan_every=1``), since options end elsewhere than predicted.
 
     Args:
         planner (MCTSPlanner): the manager.
@@ -64,16 +58,17 @@ class HierarchicalPolicy(TensorDictModuleBase):
             above which to plan again. Default: states are not compared.
         divergence_key (NestedKey or sequence of them, optional): entries of the simulator's state
             or observation that are compared, e.g. ``"position"``.
-        reuse (bool): keep the trees between decisions. Default ``False``.
+        reuse (bool): keep the trees between decisions, in one rollout at a time: if the executed
+            options led to a state in the tree, its subtree is searched further
+            (:meth:`MCTSPlanner.advance`). Default ``False``.
         state_map (callable, optional): ``state_map(td) -> TensorDict [*B]`` of the planner's
-            ``in_keys``, from the entries of the env in which the policy acts. Default: that env
-            writes the ``in_keys`` itself.
+            ``in_keys``. Default: the env in which the policy acts writes them itself.
         env (EnvBase, optional): the macro env to act in, checked once against the planner's.
 
     Raises:
-        ValueError: if a number is out of range, ``divergence`` comes without ``divergence_key`` or
-            the other way round, the planner's env has no such entry, or ``env`` has other options;
-            at a call if the mapped state lacks an entry or has another batch size.
+        ValueError: if a number is out of range, ``divergence`` and ``divergence_key`` do not come
+            together, the planner's env has no such entry, or ``env`` has other options; at a call
+            if the mapped state lacks an entry or has another batch size.
         TypeError: if an argument is of another kind.
 
     Reference:
@@ -87,9 +82,6 @@ class HierarchicalPolicy(TensorDictModuleBase):
         >>> env = ChainEnv(length=4)
         >>> policy = HierarchicalPolicy(MCTSPlanner(env))
         >>> env.rollout(10, policy=policy)["plan_step"].flatten().tolist()
-        [1, 2, 3]
-        >>> policy = HierarchicalPolicy(MCTSPlanner(env), replan_every=1, reuse=True)
-        >>> env.rollout(10, policy=policy)["num_plans"].flatten().tolist()
         [1, 2, 3]
         >>> policy = HierarchicalPolicy(  # a model that has another name for its state
         ...     MCTSPlanner(env), state_map=lambda td: TensorDict({"state": td["place"]}, []))
@@ -351,13 +343,9 @@ class GoalPlanner:
             self.in_keys = nested_keys("GoalPlanner", "in_keys", in_keys)
 
     def plan_goals(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Plan from states.
+        """Plan from the worker's states ``[m]``; return goals ``[m, L, D]`` and their number.
 
-        Args:
-            tensordict (TensorDictBase): states of the worker's environment, batch ``[m]``.
-
-        Returns:
-            the goals ``[m, L, D]``, the last one repeated, and the lengths, int64 ``[m]``.
+        The last goal is repeated; the lengths are int64 ``[m]``.
         """
         macro = self.to_macro(tensordict)
         plan = self.planner.plan(macro)
@@ -379,15 +367,9 @@ class GoalPlanner:
 class EpisodeStarts:
     """Finds the elements in which an episode began since the policy acted last.
 
-    TorchRL's env writes what a step led to under ``"next"`` of the tensordict that the policy has
-    written to. Where that was the end, or another state than the one to act in now, the env was
-    reset or set to a state in between. ``"is_init"`` and a ``"step_count"`` of 0 say so by
-    themselves.
-
-    Args:
-        state_keys: entries that are compared; empty for all that a step wrote.
-        plan_keys: what the policy carries in the tensordict. Elements in which they are not what it
-            wrote last belong to another rollout.
+    What the last step led to is under ``"next"`` of the tensordict that the policy has written to.
+    If it was the end or differs in ``state_keys``, the env was reset. Where ``plan_keys`` are not
+    what the policy wrote, another rollout runs.
     """
 
     def __init__(self, state_keys: Sequence[NestedKey], plan_keys: Sequence[NestedKey]) -> None:

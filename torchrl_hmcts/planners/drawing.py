@@ -19,10 +19,10 @@ from torchrl_hmcts.planners.export import (
     best_plan,
     check_root,
     option_labels,
+    plan_size,
     plural,
     shown_nodes,
 )
-from torchrl_hmcts.planners.layout import layered_layout
 from torchrl_hmcts.planners.tree import PRUNED, REWARDED, TERMINAL, TreeArrays
 
 Axes = Any  # matplotlib.axes.Axes; matplotlib is loaded by the first picture only
@@ -109,13 +109,12 @@ def plot_tree(
     option_names: Sequence[str] | None = None,
     legend: bool = True,
 ) -> Axes:
-    """Draw the tree of one root in layers: the depth of a node is its number of options from the
-    root.
+    """Draw the tree of one root in layers, one for each number of options from the root.
 
     The colour of a node shows its value V, its size its visits, on a logarithmic scale. Edges have
-    the colour of their option. The best plan lies on a yellow band. White squares are terminal
-    nodes. Nodes with a green rim earned a reward. Grey crosses were refused by the novelty test.
-    Grey diamonds are states that are searched elsewhere in the tree.
+    the colour of their option. The best plan lies on a yellow band. White squares are terminal.
+    A green rim marks a reward. Grey crosses were refused by the novelty test, grey diamonds are
+    searched elsewhere in the tree.
 
     Args:
         tree: of a finished or interrupted search.
@@ -210,14 +209,11 @@ def plot_positions(
 
     Args:
         tree: of a finished or interrupted search, whose states are kept.
-        root: which of the ``B`` roots. Default 0.
         key: entry of the state with (x, y), any shape of two numbers; or a callable that makes
             ``[N, 2]`` of the states ``[N]``. Default ``"position"``.
         ax: axes to draw in; if they show something already, e.g. a maze, their limits stay.
             Default: those of a new figure of pyplot, over the map if the env has ``draw_map``.
-        max_nodes: how many nodes at most: those with most visits, and the best plan. Default: all.
-        option_names: one for each of the ``A`` options. Default: their numbers.
-        legend: whether to say what the colours mean. Default True.
+        root, max_nodes, option_names, legend: as of ``SearchTree.plot``, but by default all nodes.
 
     Returns:
         The matplotlib axes.
@@ -345,11 +341,8 @@ def _title(tree: TreeArrays, root: int, shown: _Shown) -> list[str]:
         f"{plural(int(nodes['visits'][0]), 'visit')}, root value {nodes['value'][0]:.4g}"
     ]
     if plan:
-        end = nodes[plan[-1]]
-        lines.append(
-            f"best plan: {plural(len(plan) - 1, 'option')}, "
-            f"{plural(int(end['base_steps']), 'base step')}, return {end['path_return']:.4g}"
-        )
+        gained = nodes["path_return"][plan[-1]]
+        lines.append(f"best plan: {plan_size(tree, root)}, return {gained:.4g}")
     if shown.left_out:
         lines.append(
             f"shown: the {len(shown.ids):,} most visited; {plural(shown.left_out, 'node')} left out"
@@ -445,3 +438,53 @@ def _pyplot() -> Any:
             "Pictures need matplotlib, which is missing here: pip install torchrl_hmcts[train]."
         ) from error
     return pyplot
+
+
+def layered_layout(parents: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Place the nodes of a tree across, float64 ``[N]``: parents over the middle of their children.
+
+    Nodes of one layer are at least 1 apart, and subtrees as close as that allows; mirrored trees
+    are mirror images (Reingold and Tilford, "Tidier drawings of trees", 1981). ``parents`` ``[N]``
+    are the rows of the nodes above, -1 for the root; ``order`` ``[N]`` has siblings left to right.
+
+    Example:
+        >>> layered_layout(np.array([-1, 0, 0, 1, 1]), np.arange(5))
+        array([ 0. , -0.5,  0.5, -1. ,  0. ])
+    """
+    return (_pack(parents, order) - _pack(parents, order[::-1])) / 2.0
+
+
+def _pack(parents: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Place subtrees from left to right, each as far to the left as it goes."""
+    below: list[list[int]] = [[] for _ in parents]
+    for row in order.tolist():
+        if parents[row] >= 0:
+            below[parents[row]].append(row)
+    offsets = np.zeros(len(parents))  # from the node above
+    edges: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # left and right outline, by layer
+    for row in reversed(range(len(parents))):
+        rows = below[row]
+        if not rows:
+            edges[row] = np.zeros(1), np.zeros(1)
+            continue
+        left, right = edges.pop(rows[0])
+        places = [0.0]
+        for child in rows[1:]:
+            child_left, child_right = edges.pop(child)
+            common = min(len(right), len(child_left))
+            gaps = np.full(common, 1.3)  # between cousins; 1 between sisters
+            gaps[0] = 1.0
+            place = float((right[:common] - child_left[:common] + gaps).max())
+            left = np.concatenate((left, child_left[len(left) :] + place))
+            right = np.concatenate((child_right + place, right[len(child_right) :]))
+            places.append(place)
+        middle = (places[0] + places[-1]) / 2.0
+        offsets[rows] = np.array(places) - middle
+        edges[row] = (
+            np.concatenate(([0.0], left - middle)),
+            np.concatenate(([0.0], right - middle)),
+        )
+    across = np.zeros(len(parents))
+    for row in range(1, len(parents)):
+        across[row] = across[parents[row]] + offsets[row]
+    return across

@@ -13,8 +13,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_hmcts.checks import no_class
-from torchrl_hmcts.planners.answers import check_priors, check_values
+from torchrl_hmcts.planners.outcomes import RootStates, check_priors, check_values
 from torchrl_hmcts.planners.random_streams import with_seeds
+from torchrl_hmcts.planners.settings import SearchSettings
+from torchrl_hmcts.planners.simulator import Simulator
 
 
 class Evaluation(NamedTuple):
@@ -64,7 +66,26 @@ class NodeEvaluator:
                     f"tensors. Write {name}={wrapper}(TensorDictModule(net, in_keys, out_keys))."
                 )
 
-    def bind(self, simulator: Any, gamma: float) -> None:
+    def describe(
+        self,
+        td: TensorDictBase,
+        simulator: Simulator,
+        settings: SearchSettings,
+        seeds: Callable[[], np.ndarray],
+    ) -> RootStates:
+        """Return all that a search knows of states ``[m]`` before it is in them."""
+        novelty, transpositions = settings.novelty, settings.transpositions
+        priors, values = self(td, simulator.terminated(td), seeds)
+        return RootStates(
+            values=values,
+            done=simulator.done(td),
+            priors=priors,
+            masks=simulator.masks(td),
+            features=None if novelty is None else novelty.features(td),
+            codes=None if transpositions is None else transpositions.codes(td),
+        )
+
+    def bind(self, simulator: Simulator, gamma: float) -> None:
         """Give the simulator and the discount to the parts that simulate."""
         for part in self._parts:
             if hasattr(part, "bind"):
@@ -73,10 +94,7 @@ class NodeEvaluator:
     def __call__(
         self, td: TensorDictBase, terminated: np.ndarray, seeds: Callable[[], np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return priors ``[m, A]``, or ``[0, A]`` if all are equal, and values ``[m]``, float32.
-
-        ``td`` is not changed; ``seeds`` is called if a part draws random numbers.
-        """
+        """Return priors ``[m, A]``, or ``[0, A]`` if all are equal, and values ``[m]``, float32."""
         m, num_options = td.batch_size[0], self.num_options
         priors, values = np.zeros((0, num_options), np.float32), np.zeros(m, np.float32)
         if not self._parts:

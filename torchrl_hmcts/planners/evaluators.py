@@ -5,6 +5,9 @@ Letters: ``m`` states of one call, ``A`` options, ``w`` rollouts that still run.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from typing import ClassVar
+
 import numpy as np
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -18,8 +21,8 @@ from torch import Tensor
 
 from torchrl_hmcts.checks import nested_key, real_number, whole_number
 from torchrl_hmcts.direct_calls import has_hooks, is_plain
-from torchrl_hmcts.planners.answers import check_priors, check_values
 from torchrl_hmcts.planners.evaluation import Evaluation, Evaluator
+from torchrl_hmcts.planners.outcomes import check_priors, check_values
 from torchrl_hmcts.planners.random_streams import SEED_KEY, mix, uniform_bits, with_seeds
 from torchrl_hmcts.planners.simulator import Simulator
 
@@ -27,10 +30,9 @@ from torchrl_hmcts.planners.simulator import Simulator
 class ValueEvaluator:
     r"""Takes the value of a state from a network: :math:`V(s) = v_\theta(s)`.
 
-    The network is called without gradients, in its present mode; call ``module.eval()`` yourself.
-    It does not become a part of the planner. The network of a plain ``TensorDictModule`` is called
-    on its tensors, which saves most of the cost of a small one. Networks may round differently when
-    more states share a call; then the last digits of a tree depend on the trees beside it.
+    The network is called without gradients, in its present mode (call ``module.eval()`` yourself),
+    and does not become a part of the planner. Networks may round differently when more states share
+    a call; then the last digits of a tree depend on the trees beside it.
 
     Args:
         module: a TensorDictModule whose inputs are entries of the macro environment.
@@ -135,16 +137,14 @@ class PolicyValueEvaluator:
     .. math:: P(s, a) = (1 - \epsilon)\, \mathrm{softmax}_a(l_\theta(s) / T) + \epsilon / A, \qquad
               V(s) = v_\theta(s)
 
-    It returns an :class:`Evaluation`, so a planner needs it only as ``leaf_evaluator``. It saves
-    the second call that a :class:`ValueEvaluator` beside a :class:`ModulePrior` makes. The network
-    is called as that of a :class:`ValueEvaluator`.
+    A planner needs it only as ``leaf_evaluator``; it saves the second call that a
+    :class:`ValueEvaluator` beside a :class:`ModulePrior` makes, and calls the network like it.
 
     Args:
         module: a TensorDictModule whose inputs are entries of the macro environment and which
             writes logits ``[m, A]`` and values ``[m, 1]`` or ``[m]``.
         temperature: T > 0 of the prior. Default 1.
-        uniform_share: :math:`\epsilon` in [0, 1], the share of the prior that is uniform, so that a
-            network that is too sure rules out no option. Default 0.
+        uniform_share: :math:`\epsilon` in [0, 1], so that no option is ruled out. Default 0.
         logits_key, value_key: its outputs. Defaults ``"logits"`` and ``"state_value"``.
 
     Raises:
@@ -204,6 +204,7 @@ class PolicyValueEvaluator:
         )
 
 
+@dataclass(eq=False)
 class RolloutEvaluator:
     r"""Takes the value of a state from rollouts that begin there: the textbook's simulation step.
 
@@ -211,18 +212,15 @@ class RolloutEvaluator:
 
     A policy takes options of :math:`k_i` base steps in the planner's own simulator, up to the end
     of the episode or ``max_options``. :math:`b` is 0 at a terminal state, else the bootstrap
-    evaluator's value. All rollouts of a wave run in one simulator call per option, and those that
-    have ended cost nothing. In a deterministic simulator a state's value depends only on the state
-    and its seed, not on the states beside it. The budget of the search does not count these steps;
+    evaluator's value. All rollouts of a wave share a simulator call per option. A state's value
+    depends on the state and its seed only. The budget of the search does not count these steps;
     ``num_base_steps`` does.
 
     Args:
-        policy: ``policy(td) -> probabilities [m, A]`` of the options, e.g. :class:`ModulePrior`;
-            options that the mask forbids are never taken. Default: uniform.
+        policy: ``policy(td) -> probabilities [m, A]``, e.g. :class:`ModulePrior`. Default: uniform.
         max_options: options of a rollout at most. Default 10.
         num_rollouts: rollouts from each state, of which the mean is taken. Default 1.
-        bootstrap: evaluator of the state in which a rollout is cut off: by ``max_options``, by a
-            truncation, or where no option is allowed. Default: 0.
+        bootstrap: evaluator of the state in which a rollout is cut off. Default: 0.
 
     Raises:
         ValueError: if a number is below 1; at the call if the policy gives no probabilities.
@@ -244,21 +242,17 @@ class RolloutEvaluator:
         True
     """
 
-    is_random = True
+    policy: Evaluator | None = None
+    max_options: int = 10
+    num_rollouts: int = 1
+    bootstrap: Evaluator | None = field(default=None, kw_only=True)
+    is_random: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        policy: Evaluator | None = None,
-        max_options: int = 10,
-        num_rollouts: int = 1,
-        *,
-        bootstrap: Evaluator | None = None,
-    ) -> None:
-        self.max_options = whole_number("RolloutEvaluator", "max_options", max_options, least=1)
-        self.num_rollouts = whole_number("RolloutEvaluator", "num_rollouts", num_rollouts, least=1)
-        self.policy = policy
-        self.bootstrap = bootstrap
-        self.in_keys = _joined_keys(policy=policy, bootstrap=bootstrap)
+    def __post_init__(self) -> None:
+        for name in ("max_options", "num_rollouts"):
+            number = whole_number("RolloutEvaluator", name, getattr(self, name), least=1)
+            setattr(self, name, number)
+        self.in_keys = _joined_keys(policy=self.policy, bootstrap=self.bootstrap)
         self.num_base_steps = 0
         self._simulator: Simulator | None = None
         self._gamma = 1.0
@@ -292,12 +286,10 @@ class RolloutEvaluator:
             td = td[torch.arange(num_states).repeat_interleave(self.num_rollouts)]
         for step in range(self.max_options + 1):
             terminated = simulator.terminated(td)
-            stops = terminated | simulator.done(td)
+            stops = terminated | simulator.done(td) | (step == self.max_options)
             masks = None if simulator.mask_key is None else simulator.masks(td)
             if masks is not None:
                 stops |= ~masks.any(-1)
-            if step == self.max_options:
-                stops[:] = True
             if self.bootstrap is not None:
                 cut = np.flatnonzero(stops & ~terminated)
                 if len(cut):
@@ -363,13 +355,8 @@ class RolloutEvaluator:
         td = with_seeds(self.bootstrap, td, lambda: (bits >> np.uint64(1)).astype(np.int64))
         return check_values(self.bootstrap(td), len(td), "bootstrap").double().numpy()
 
-    def __repr__(self) -> str:
-        return (
-            f"RolloutEvaluator(policy={self.policy}, max_options={self.max_options}, "
-            f"num_rollouts={self.num_rollouts}, bootstrap={self.bootstrap})"
-        )
 
-
+@dataclass(eq=False)
 class MixedEvaluator:
     r"""A mean of two evaluators, e.g. of a value network and rollouts.
 
@@ -395,12 +382,14 @@ class MixedEvaluator:
         tensor([0.2500, 0.2500])
     """
 
-    def __init__(self, first: Evaluator, second: Evaluator, weight: float = 0.5) -> None:
-        self.weight = real_number("MixedEvaluator", "weight", weight, least=0.0, most=1.0)
-        self.first = first
-        self.second = second
-        self.in_keys = _joined_keys(first=first, second=second)
-        self.is_random = any(getattr(part, "is_random", False) for part in (first, second))
+    first: Evaluator
+    second: Evaluator
+    weight: float = 0.5
+
+    def __post_init__(self) -> None:
+        self.weight = real_number("MixedEvaluator", "weight", self.weight, least=0.0, most=1.0)
+        self.in_keys = _joined_keys(first=self.first, second=self.second)
+        self.is_random = any(getattr(p, "is_random", False) for p in (self.first, self.second))
 
     def bind(self, simulator: Simulator, gamma: float) -> None:
         """Give the simulator and the discount of a planner to both evaluators."""
@@ -412,16 +401,9 @@ class MixedEvaluator:
         second = check_values(self.second(td), len(td), "second evaluator")
         return (1.0 - self.weight) * first + self.weight * second
 
-    def __repr__(self) -> str:
-        return f"MixedEvaluator({self.first}, {self.second}, weight={self.weight})"
-
 
 class _Network:
-    """Outputs of a TensorDictModule, without the cost of its bookkeeping where possible.
-
-    A call of a stock TensorDictModule costs 200 us, most of it for writing outputs; its network
-    alone 30 us.
-    """
+    """Outputs of a TensorDictModule, whose bookkeeping costs six times a small network's call."""
 
     def __init__(self, owner: str, module: TensorDictModuleBase, *keys: NestedKey) -> None:
         if not isinstance(module, TensorDictModuleBase):

@@ -61,9 +61,15 @@ def best_plan(tree: TreeArrays, root: int) -> list[int]:
     return tree.path(root, best) if best > 0 else []
 
 
+def plan_size(tree: TreeArrays, root: int) -> str:
+    """Return how long the best plan is, in options and base steps."""
+    plan = best_plan(tree, root)
+    steps = int(tree.nodes["base_steps"][root, plan[-1]])
+    return f"{plural(len(plan) - 1, 'option')}, {plural(steps, 'base step')}"
+
+
 def most_visited_path(tree: TreeArrays, root: int) -> list[int]:
-    """Return the nodes along the options with most visits, then highest Q, beginning at the
-    root."""
+    """Return the nodes along the options with most visits, then highest Q, from the root on."""
     path = [0]
     while True:
         edges = tree.edges[root, path[-1]]
@@ -76,10 +82,7 @@ def most_visited_path(tree: TreeArrays, root: int) -> list[int]:
 
 
 def shown_nodes(tree: TreeArrays, root: int, max_nodes: int | None) -> np.ndarray:
-    """Return the most visited nodes, in ascending order, each with the node above it.
-
-    The best plan is among them, with any visits, as far as ``max_nodes`` allows.
-    """
+    """Return the most visited nodes, ascending, with the best plan as far as it fits."""
     count = check_root(tree, root)
     if max_nodes is not None and max_nodes < 1:
         raise ValueError(f"max_nodes must be at least 1, the root; got {max_nodes}.")
@@ -101,12 +104,11 @@ def to_networkx(
         states: whether the nodes also have their ``state``, a dict of lists. Default False.
 
     Returns:
-        A ``networkx.DiGraph``. Nodes: ``visits``, ``value`` V, ``depth`` (options from the root),
-        ``base_steps`` and ``path_return`` (from the root), ``expanded``, ``terminal``, ``pruned``,
-        ``closed``, ``rewarded`` (bool), ``twin`` (node searched in its place, -1 for none). Edges:
-        ``option``, ``visits`` and ``value`` Q and ``prior`` of the option; ``reward`` R,
-        ``discount`` D and ``samples`` (times drawn) of the outcome. Graph: ``num_nodes`` of the
-        whole tree and ``best_node``, the end of the best plan, -1 without one.
+        A ``networkx.DiGraph``. Nodes have ``visits``, ``value``, ``depth``, ``base_steps``,
+        ``path_return`` and ``twin`` as in :class:`TreeView`, and their flags as bools. Edges have
+        the ``option``, its ``visits``, ``value`` and ``prior``, and ``reward``, ``discount`` and
+        ``samples`` of the outcome. The graph has ``num_nodes`` and ``best_node``, the end of the
+        best plan, -1 without one.
 
     Raises:
         ImportError: if networkx is missing.
@@ -158,14 +160,11 @@ def to_torchrl(tree: TreeArrays, root: int = 0) -> Tree:
 
     A vertex is a node of this tree, and its fields hold:
 
-    - ``count``: visits, int32. ``wins``: visits times value V, float32, so that
-      ``wins / count`` is the value.
-    - ``node_id`` and ``hash``: the node's number here. Equal states are vertices of their own.
-    - ``node_data``: its state; ``node_observation`` works if that has an ``"observation"``.
+    - ``count``: visits, int32. ``wins``: visits times value V, float32.
+    - ``node_id`` and ``hash``: the node's number here. ``node_data``: its state.
     - ``rollout``: the macro-step that led to it, batch ``[1]``; None at the root. The parent's
       state, ``"action"`` (the option's index, int64) and ``"next"`` with the node's state,
-      ``"reward"`` R, ``"discount"`` D, ``"duration"`` in base steps, ``"done"`` and
-      ``"terminated"``.
+      ``"reward"`` R, ``"discount"`` D, ``"duration"`` in base steps and the ends.
     - ``subtree``: a stack of its children, by option and then in the order they were drawn;
       ``index``: their numbers, int64. Both None where there are none.
 
@@ -291,13 +290,9 @@ def summary(tree: TreeArrays, root: int = 0, option_names: Sequence[str] | None 
     lines.append(f"Root: {plural(int(nodes['visits'][0]), 'visit')}, value V = {value}")
     lines += ["", *_table_of_options(tree, root, names)]
     plan = best_plan(tree, root)
-    last = nodes[plan[-1]] if plan else None
-    if last is not None:
-        gained = _numbers([last["path_return"]])[0].strip()
-        title = (
-            f"Best plan: {plural(len(plan) - 1, 'option')}, "
-            f"{plural(int(last['base_steps']), 'base step')}, return {gained}"
-        )
+    if plan:
+        gained = _numbers([nodes["path_return"][plan[-1]]])[0].strip()
+        title = f"Best plan: {plan_size(tree, root)}, return {gained}"
     else:
         plan = most_visited_path(tree, root)
         title = "No plan found yet. Most visited path:"
@@ -329,16 +324,13 @@ def _table_of_options(tree: TreeArrays, root: int, names: list[str]) -> list[str
     order = np.lexsort((-edges["value"], -visits, forbidden))
     shown, left_out = order[:_MAX_OPTIONS], order[_MAX_OPTIONS:]
     shares, values = visits / max(int(visits.sum()), 1), _numbers(edges["value"])
-    columns: dict[str, list[str]] = {"option": [], "visits": [], "": [], "Q": [], "prior": []}
+    rows = []
     for a in shown:
         bar = f"{100 * shares[a]:.1f} % |{'#' * round(_BAR * shares[a]):{_BAR}}|"
         q = values[a] if edges["child"][a] >= 0 else "-"
-        cells = [names[a], f"{visits[a]:,}", bar, q, f"{edges['prior'][a]:.3f}"]
-        if forbidden[a]:
-            cells[1:] = ["not allowed", "", "", ""]
-        for column, cell in zip(columns.values(), cells, strict=True):
-            column.append(cell)
-    lines = _table(columns)
+        cells = (f"{visits[a]:,}", bar, q, f"{edges['prior'][a]:.3f}")
+        rows.append((names[a], *(("not allowed", "", "", "") if forbidden[a] else cells)))
+    lines = _table(("option", "visits", "", "Q", "prior"), rows)
     if len(left_out):
         number = int(visits[left_out].sum())
         lines.append(f"... and {plural(len(left_out), 'option')} with {plural(number, 'visit')}")
@@ -348,18 +340,15 @@ def _table_of_options(tree: TreeArrays, root: int, names: list[str]) -> list[str
 def _table_of_steps(tree: TreeArrays, root: int, plan: list[int], names: list[str]) -> list[str]:
     nodes = tree.nodes[root, plan[1:]]
     edges = tree.edges[root, nodes["parent"], nodes["option"]]
-    lines = _table(
-        {
-            "#": [f"{i + 1:>3}" for i in range(len(nodes))],
-            "option": [names[a] for a in nodes["option"]],
-            "steps": [f"{int(n):,}" for n in nodes["base_steps"]],
-            "R": _numbers(nodes["reward"]),
-            "return": _numbers(nodes["path_return"]),
-            "Q": _numbers(edges["value"]),
-            "V": _numbers(nodes["value"]),
-            "visits": [f"{int(n):,}" for n in nodes["visits"]],
-        }
+    columns = (
+        [f"{i + 1:>3}" for i in range(len(nodes))],
+        [names[a] for a in nodes["option"]],
+        [f"{int(n):,}" for n in nodes["base_steps"]],
+        *map(_numbers, (nodes["reward"], nodes["path_return"], edges["value"], nodes["value"])),
+        [f"{int(n):,}" for n in nodes["visits"]],
     )
+    header = ("#", "option", "steps", "R", "return", "Q", "V", "visits")
+    lines = _table(header, list(zip(*columns, strict=True)))
     if len(nodes) > _MAX_STEPS:
         head, tail = lines[: 1 + _MAX_STEPS // 2], lines[-_MAX_STEPS // 2 + 1 :]
         gap = f"... {plural(len(lines) - len(head) - len(tail), 'option')} left out ..."
@@ -371,19 +360,18 @@ def _table_of_steps(tree: TreeArrays, root: int, plan: list[int], names: list[st
     return lines
 
 
-def _table(columns: dict[str, list[str]]) -> list[str]:
+def _table(header: Sequence[str], rows: list[Any]) -> list[str]:
     """Lines of a table, its header first; options are cut where it would be too wide."""
-    widths = {name: max(len(name), *map(len, cells)) for name, cells in columns.items()}
-    room = _LINE_WIDTH - sum(widths.values()) - 2 * (len(widths) - 1)
-    widths["option"] = max(widths["option"] + min(room, 0), len("option"))
-    columns = {**columns, "option": [_clip(name, widths["option"]) for name in columns["option"]]}
-    rows = [list(columns), *zip(*columns.values(), strict=True)]
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    at = header.index("option")
+    room = _LINE_WIDTH - sum(widths) - 2 * (len(widths) - 1)
+    widths[at] = max(widths[at] + min(room, 0), len("option"))
     return [
         "  ".join(
-            f"{cell:{'<' if name == 'option' else '>'}{width}}"
-            for (name, width), cell in zip(widths.items(), row, strict=True)
+            f"{_clip(cell, width):<{width}}" if i == at else f"{cell:>{width}}"
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
-        for row in rows
+        for row in (header, *rows)
     ]
 
 

@@ -1,22 +1,17 @@
-"""The inner loops of the search, compiled by numba: choose, descend, insert, back up and close.
+"""The inner loops of the search, compiled by numba, in place, at O(depth) per simulation.
 
-All of them work in place on the records of :mod:`torchrl_hmcts.planners.tree` and cost O(depth) per
-simulation. The module is imported when the first search begins, since numba takes a second to load.
-Fields are read as ``record["field"]``, not ``record.field``, so that the kernels also run as plain
-Python under ``NUMBA_DISABLE_JIT=1``, for a debugger.
-
-Those that allocate nothing are compiled without reference counts (``_nrt=False``, as numba
-compiles its own string functions): counting the views of arrays took a third of a descent's time.
+They are imported when the first search begins, since numba takes a second to load.
 """
 
-# numba compiles these functions; it does not read annotations as strings.
+# numba compiles these functions; it does not read annotations as strings. Fields are read as
+# record["field"], so that they also run as plain Python under NUMBA_DISABLE_JIT=1. What allocates
+# nothing is compiled without counting references (_nrt=False): a third of a descent's time.
 import math
 
 import numba
 import numpy as np
 
 from torchrl_hmcts.compiling import njit
-from torchrl_hmcts.planners.number_kernels import GOOD, MISFIT, first_bad, fits
 from torchrl_hmcts.planners.tree import (
     CLOSED,
     EXPANDED,
@@ -36,6 +31,10 @@ from torchrl_hmcts.planners.tree import (
     WHOLE_TREE,
 )
 from torchrl_hmcts.planners.variant_kernels import (
+    GOOD,
+    MISFIT,
+    first_bad,
+    fits,
     gumbel_option,
     option_value,
     outcome,
@@ -197,9 +196,9 @@ def schedule(wave, i, b, n, a):
 def select(nodes, edges, roots, record, gumbel, wave, walked):
     """Descend to the leaves of every active root; return how many outcomes to simulate.
 
-    Writes (root, node, option) triples to ``wave``. Where a root contributes several leaves,
-    in-flight counts let the descents spread; :func:`insert` takes them back. If the trees have
-    ``walked`` in step (:func:`batch_kernels.walk`), the first descents continue from there.
+    In-flight counts let several descents of a root spread; :func:`insert` takes them back. If the
+    trees have ``walked`` in step (:func:`batch_kernels.walk`), the first descents continue from
+    there.
     """
     s = record[0]
     count = 0
@@ -431,39 +430,21 @@ def arrived(nodes, edges, roots, s, wave, count):
 
 @njit(error_model="numpy", _nrt=False)
 def insert(
-    nodes,
-    edges,
-    roots,
-    record,
-    wave,
-    rewards,
-    discounts,
-    durations,
-    done,
-    novel,
-    twins,
-    merges,
-    values,
-    priors,
-    masks,
-):
+    nodes, edges, roots, record, wave, rewards, discounts, durations, done, novel, twins, merges,
+    values, priors, masks,
+):  # fmt: skip
     """Append the outcomes of a wave as nodes and back each of them up, in order.
 
     ``twins`` (node of the same state, or -1) and ``merges`` (outcome of the same option and state,
-    or -1) may be empty. Returns GOOD; what no search can use changes nothing: the row of the first
-    such outcome, or MISFIT if there is not a row for each.
+    or -1) may be empty. Returns GOOD or, with nothing changed, the row of the first bad outcome or
+    MISFIT.
     """
     s = record[0]
     count = wave.shape[0]
-    if (
-        rewards.shape[0] != count
-        or discounts.shape[0] != count
-        or durations.shape[0] != count
-        or done.shape[0] != count
-        or values.shape[0] != count
-        or not fits(priors, count, edges.shape[-1])
-        or not fits(masks, count, edges.shape[-1])
-    ):
+    fit = fits(priors, count, edges.shape[-1]) and fits(masks, count, edges.shape[-1])
+    fit = fit and rewards.shape[0] == count and discounts.shape[0] == count
+    fit = fit and durations.shape[0] == count and done.shape[0] == count
+    if not fit or values.shape[0] != count:
         return MISFIT
     bad = first_bad(rewards, discounts, values, priors)
     if bad != GOOD:

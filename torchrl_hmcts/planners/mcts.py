@@ -24,9 +24,7 @@ from torchrl_hmcts.nesting import innermost, option_gamma
 from torchrl_hmcts.planners.budget import ProgressiveWidening, SearchBudget, TreeRollout
 from torchrl_hmcts.planners.evaluation import Evaluator, NodeEvaluator
 from torchrl_hmcts.planners.novelty import NoveltyTest
-from torchrl_hmcts.planners.outcomes import RootStates
-from torchrl_hmcts.planners.plan import Plan, extract_plans
-from torchrl_hmcts.planners.progress import SearchProgress
+from torchrl_hmcts.planners.plan import Plan, SearchProgress, extract_plans
 from torchrl_hmcts.planners.root_options import (
     BestPlan,
     DirichletNoise,
@@ -79,40 +77,32 @@ class MCTSPlanner(TensorDictModuleBase):
     truncated one is worth what the leaf evaluator says. Subtrees in which nothing is left to find
     are closed and never simulated again.
 
-    Root ``b`` of a call with seed ``s`` draws its random numbers (root noise, Gumbel, rollouts,
-    sampled choices) from ``s + b``, so that its tree does not depend on the roots beside it. With
-    several waves in flight this holds for a single root only, since a wave takes leaves of all
-    roots.
+    Root ``b`` of a call with seed ``s`` draws its random numbers from ``s + b``, so that its tree
+    does not depend on the roots beside it (with several waves in flight: a single root's only).
 
     Args:
         env (EnvBase): the macro environment as simulator: any env under an ``OptionTransform``, or
             any env with a discrete action, that is stateless (``batch_locked=False``, its state in
-            the tensordict) or can be set to a state by ``reset(td, set_state=True)``. A search
-            changes the state of an env of the second kind, and then sets it back to the state of
-            the call. Transforms that remember something outside the tensordict are refused.
-            ``CatFrames`` is the exception: every node has its own frames, and planning does not
-            change those of the env that acts.
+            the tensordict) or can be set to a state by ``reset(td, set_state=True)``; a search
+            sets the latter back to the state of the call. Transforms that remember something
+            outside the tensordict are refused, but ``CatFrames``: every node has its own frames.
         gamma (float, optional): discount per base step. Default: that of the env's
             ``OptionTransform``, through any nesting of envs; 0.99 for an env without durations.
-        tree_policy, backup, novelty, transpositions, chance: parts of the search, see
-            :class:`SearchSettings`. ``planner.settings`` holds them; each can be read and assigned
-            as an attribute.
-        rollout, expand, leaves_per_wave, waves_in_flight, exhausted: parts of the search, too.
+        tree_policy, backup, novelty, transpositions, chance, rollout: see :class:`SearchSettings`.
+            ``planner.settings`` holds them; each can be read and assigned as an attribute.
+        expand, leaves_per_wave, waves_in_flight, exhausted: see there, too.
         leaf_evaluator (callable, optional): ``leaf_evaluator(td) -> values [m]`` or ``[m, 1]`` of
-            new nodes, from their state and observation, or an :class:`Evaluation` of values and
-            priors: :class:`ValueEvaluator`, :class:`RolloutEvaluator`, :class:`MixedEvaluator`,
-            :class:`PolicyValueEvaluator` or your own. Default: 0.
+            new nodes, or an :class:`Evaluation`: :class:`ValueEvaluator`,
+            :class:`RolloutEvaluator`, :class:`PolicyValueEvaluator` or your own. Default: 0.
         option_prior (callable, optional): ``option_prior(td) -> probabilities [m, A]``:
             :class:`ModulePrior` or your own. Default: those of ``leaf_evaluator``, else uniform.
         root_noise (DirichletNoise, optional): noise in the prior of the roots. Default: none.
-        final_choice: :class:`BestPlan`, :class:`MostVisited`, :class:`HighestValue` or
-            :class:`SampledVisits`. Default: best plan; with ``chance`` most visited, since no
-            sequence of options is sure to repeat; with :class:`Gumbel` its own choice.
+        final_choice: :class:`BestPlan` (default), :class:`MostVisited` (default with ``chance``),
+            :class:`HighestValue` or :class:`SampledVisits`. :class:`Gumbel` has its own choice.
         budget (SearchBudget): limits per root. Default: 1,000 expansions, until a plan is found.
         duration_key, mask_key (NestedKey): entries of the env with the base steps of a step, int64
-            ``[*B, 1]`` (1 if the env has none or None is named), and the options that may be taken,
-            bool ``[*B, A]`` (all if it has none or None is named). Under an ``OptionTransform`` the
-            mask of the base actions has another name; it is not the options' mask.
+            ``[*B, 1]`` (None, or an env without it: 1), and the options that may be taken, bool
+            ``[*B, A]`` (else all), which is not the mask of a worker's base actions.
         reward_key (NestedKey, optional): which reward, if the env has several.
         seed (int, optional): of the planner's random numbers; each call continues the stream.
             Default: drawn from torch's global generator when first needed.
@@ -286,14 +276,9 @@ class MCTSPlanner(TensorDictModuleBase):
             tensordict.set(key, value.to(device) if device is not None else value)
         return tensordict
 
-    def planning(self, td: TensorDictBase) -> Tensor:
-        """Return the options to take ``[*B]``, as TorchRL's planners do."""
-        return self.forward(td.copy()).get(self.option_key)
-
     def plan(self, td: TensorDictBase) -> Plan:
         """Search from every state of ``td`` and return the best plans as sequences of options."""
-        plans = extract_plans(self.search(td))
-        return plans.reshape(td.batch_size)
+        return extract_plans(self.search(td)).reshape(td.batch_size)
 
     def search(self, td: TensorDictBase, *, seed: int | None = None) -> Search:
         """Search from every state of ``td`` (any batch shape, flattened) and return the trees.
@@ -332,8 +317,8 @@ class MCTSPlanner(TensorDictModuleBase):
     def resume(self, search: Search, *, where: Tensor | None = None) -> Search:
         """Continue a search, with a fresh budget; with ``Gumbel`` to the end of its schedule.
 
-        Only the roots ``where`` (bool ``[*B]``) are searched, all by default. The search follows
-        the planner: assign ``planner.tree_policy = UCT(c=5.0)`` for another constant.
+        Only the roots ``where`` (bool ``[*B]``) are searched, all by default. The search takes the
+        planner's present settings.
 
         Raises:
             ValueError: if the search was planted with another backup, novelty test or the like.
@@ -384,15 +369,11 @@ class MCTSPlanner(TensorDictModuleBase):
             ValueError: if the options or states do not fit the search.
         """
         shape = td.batch_size
-        if shape.numel() != search.num_roots or options.shape[: len(shape)] != shape:
+        fits = options.shape[: len(shape)] == shape and options.ndim <= len(shape) + 1
+        if shape.numel() != search.num_roots or not fits:
             raise ValueError(
-                f"advance needs options and a state for each of the {search.num_roots} roots of "
-                f"the search; got options {list(options.shape)} and states {list(shape)}."
-            )
-        if options.ndim > len(shape) + 1:
-            raise ValueError(
-                f"advance needs options [*B] or [*B, k] with *B = {list(shape)}; got "
-                f"{list(options.shape)}."
+                f"advance needs options [*B] or [*B, k] and states [*B] for the {search.num_roots} "
+                f"roots of the search; got options {list(options.shape)}, states {list(shape)}."
             )
         if options.numel() and int(options.max()) >= self.num_options:
             raise ValueError(
@@ -416,11 +397,7 @@ class MCTSPlanner(TensorDictModuleBase):
         return torch.from_numpy(kept).view(shape)
 
     def set_seed(self, seed: int | None) -> None:
-        """Begin the random numbers again.
-
-        Args:
-            seed: as of the constructor.
-        """
+        """Begin the random numbers again, with a ``seed`` as of the constructor."""
         if seed is not None:
             whole_number("MCTSPlanner", "seed", seed)
         self._seeds = None if seed is None else np.random.SeedSequence(int(seed))
@@ -436,19 +413,9 @@ class MCTSPlanner(TensorDictModuleBase):
         simulator, settings = self.simulator, self.settings
         where = np.arange(search.num_roots) if rows is None else rows
         with torch.no_grad(), simulator.searching():
-            done, masks = simulator.done(root), simulator.masks(root)
-            check_masks(masks, done, where)
-            terminated = simulator.terminated(root)
-            priors, values = self.evaluate(root, terminated, lambda: search.seeds[where])
-            novelty, transpositions = settings.novelty, settings.transpositions
-            known = RootStates(
-                values=values,
-                done=done,
-                priors=priors,
-                masks=masks,
-                features=None if novelty is None else novelty.features(root),
-                codes=None if transpositions is None else transpositions.codes(root),
-            )
+            check_masks(simulator.masks(root), simulator.done(root), where)
+            seeds = lambda: search.seeds[where]  # noqa: E731
+            known = self.evaluate.describe(root, simulator, settings, seeds)
         search.plant(known, rows)
         search.tree.set_states(where, np.zeros_like(where), simulator.state(root))
         if self.root_noise is not None:

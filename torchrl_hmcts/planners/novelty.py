@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -79,11 +79,37 @@ def ask(
     return novel
 
 
-class _Counted:
-    """Counts that both tests keep."""
+class _Compiled:
+    """Novelty by a compiled loop, which stops where it needs more room, and its counts."""
 
     num_tested: int
+    _dtype: type
     _tally: np.ndarray
+    _num_features = -1  # not known yet
+
+    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
+        """Return which new states are novel, bool ``[m]``, and remember those."""
+        features = np.ascontiguousarray(features, self._dtype)
+        if self._num_features < 0:
+            self._make_room(features.shape[1])
+        if features.shape[1] != self._num_features:
+            raise ValueError(
+                f"{self} has seen states with {self._num_features} features; got "
+                f"{features.shape[1]}. Call start(num_roots) before testing others."
+            )
+        accepted = np.zeros(len(roots), np.bool_)
+        begin = self._accept(roots, features, base_steps, accepted, 0)
+        while begin < len(roots):
+            self._make_room(features.shape[1])
+            begin = self._accept(roots, features, base_steps, accepted, begin)
+        self.num_tested += len(roots)
+        return accepted
+
+    def _make_room(self, num_features: int) -> None:
+        raise NotImplementedError
+
+    def _accept(self, *wave: Any) -> int:
+        raise NotImplementedError
 
     @property
     def num_refused(self) -> int:
@@ -98,14 +124,13 @@ class _Counted:
         return {"novelty_tested": self.num_tested, "novelty_refused": self.num_refused}
 
 
-class RadiusNovelty(_Counted):
+class RadiusNovelty(_Compiled):
     r"""Refuses a state that lies within a radius of one already in its tree.
 
     .. math:: \text{novel}(s) \iff \min_{s' \in A} \lVert \phi(s) - \phi(s') \rVert \ge r
 
     with :math:`A` the accepted states and :math:`\phi` the entries ``key`` side by side, each times
-    its scale. An option that leads back to a place in the tree is simulated once and not searched
-    further. This makes a search over options in a continuous space finite. The radius must be
+    its scale. This makes a search over options in a continuous space finite. The radius must be
     smaller than the distance that an option covers, or every outcome is refused. An exhausted
     search shrinks the radius and reopens refused nodes.
 
@@ -114,33 +139,28 @@ class RadiusNovelty(_Counted):
 
     .. math:: k(s) < \min_{s' \in A,\, \lVert \phi(s) - \phi(s') \rVert < r} k(s')
 
-    The subtree behind the longer path stays. With a grid of cells, the cost of a test does not
-    depend on the size of the tree; with more than three features the grid spans the three that vary
-    most.
+    States lie in a grid of cells, so that the cost of a test does not depend on the size of the
+    tree.
 
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``.
         radius: in units of the (scaled) entries.
         scale: factor of each entry. Default: all 1.
-        relaxation: factor of the radius when a search is exhausted, in ``(0, 1)``. Default 0.75; a
-            smaller factor reopens more at once, and makes the hardest searches longer.
+        relaxation: factor of the radius when a search is exhausted, in ``(0, 1)``. Default 0.75.
         max_relaxations: how often the radius of a search may be relaxed. Default 14, to a sixtieth.
-        shorter_paths: also accept a state near others if it is reached in fewer base steps. Default
-            False: only the first path to a place is searched. Use it with a budget that continues
-            after the first plan (``improve_expansions``).
+        shorter_paths: also accept a state near others if it is reached in fewer base steps, for a
+            budget that continues after the first plan (``improve_expansions``). Default False.
         encoder (TensorDictModule, optional): writes ``key`` from entries of the state or
-            observation, e.g. a :class:`~torchrl_hmcts.modules.SkillEncoder`; the test then compares
-            learned features. Default: none, ``key`` is an entry itself.
+            observation, e.g. a :class:`~torchrl_hmcts.modules.SkillEncoder`. Default: none.
 
     Raises:
         ValueError: if no key is given, the radius is not positive, the scales do not match the
             keys, or a factor is out of its range.
 
     Reference:
-        The idea for continuous states of width-1 novelty: Lipovetzky, Ramirez and Geffner,
-        "Classical planning with simulators", 2015. Shorter paths: the local dominance of Li,
-        Littlefield and Bekris, "Asymptotically optimal sampling-based kinodynamic planning", 2016
-        (stable sparse RRT).
+        Width-1 novelty: Lipovetzky, Ramirez and Geffner, "Classical planning with simulators",
+        2015. Shorter paths: Li, Littlefield and Bekris, "Asymptotically optimal sampling-based
+        kinodynamic planning", 2016.
 
     Example:
         >>> import numpy as np, torch
@@ -150,6 +170,8 @@ class RadiusNovelty(_Counted):
         >>> novelty.accept(np.array([0, 0, 0]), states, base_steps=np.array([0, 10, 10]))
         array([ True, False,  True])
     """
+
+    _dtype = np.float32
 
     def __init__(
         self,
@@ -195,7 +217,7 @@ class RadiusNovelty(_Counted):
 
     def start(self, num_roots: int) -> None:
         """Forget everything: ``num_roots`` searches begin."""
-        self._num_roots = num_roots
+        self._num_roots, self._num_features = num_roots, -1
         self._known: np.ndarray | None = None  # [B] of novelty_kernels.RADIUS_ROOT
         self._relaxed = np.zeros(num_roots, np.int64)
         self.num_tested = 0
@@ -205,7 +227,7 @@ class RadiusNovelty(_Counted):
         """Allocate for the first states, or double what there is; the grids are built again."""
         from torchrl_hmcts.planners.novelty_kernels import RADIUS_ROOT, accept_distant
 
-        self._accept_distant = accept_distant
+        self._accept_distant, self._num_features = accept_distant, num_features
         if self._known is None:
             self._known = np.zeros(self._num_roots, RADIUS_ROOT)
             self._known["radius"] = self.radii
@@ -243,24 +265,10 @@ class RadiusNovelty(_Counted):
             self._known[root] = 0
             self._known["radius"][root] = self.radius
 
-    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
-        """Return which new states are novel, bool ``[m]``, and remembers those."""
-        features = np.ascontiguousarray(features, np.float32)
-        if self._known is None:
-            self._make_room(features.shape[1])
-        _check_width(self, features, self._seen.shape[2])
-        accepted = np.zeros(len(roots), np.bool_)
-        begin = 0
-        while True:
-            begin = self._accept_distant(
-                self._seen, self._seen_steps, self._links, self._heads, self._known, self._tally,
-                roots, features, base_steps, self.shorter_paths, accepted, begin,
-            )  # fmt: skip
-            if begin == len(roots):
-                break
-            self._make_room(features.shape[1])
-        self.num_tested += len(roots)
-        return accepted
+    def _accept(self, *wave: Any) -> int:
+        arrays = self._seen, self._seen_steps, self._links, self._heads, self._known, self._tally
+        begin: int = self._accept_distant(*arrays, self.shorter_paths, *wave)
+        return begin
 
     def relax(self, root: int) -> bool:
         """Be less strict for one root from now on; False if that is impossible."""
@@ -283,27 +291,22 @@ class RadiusNovelty(_Counted):
         return f"RadiusNovelty({self.keys}, radius={self.radius}{shorter})"
 
 
-class WidthNovelty(_Counted):
+class WidthNovelty(_Compiled):
     r"""Refuses a state in which no feature has a value that is new to its tree.
 
     .. math:: \text{novel}(s) \iff \exists f:\ \lvert \{ s' \in A : s'_f = s_f \} \rvert < n
 
     with :math:`A` the accepted states. :math:`n` is 1, and one more each time a search is
-    exhausted. The number of accepted states is at most the number of values of all features, times
-    :math:`n`. This is width-1 search, the "IW(1)" of classical planning. It is meant for discrete
+    exhausted. This is width-1 search, the "IW(1)" of classical planning, meant for discrete
     features, e.g. the 128 RAM bytes of an Atari game.
-
-    With ``stages`` an exhausted search first compares more features, and only then raises
-    :math:`n`. Put features that tell many states apart last. The test remembers the values of all
-    features from the start.
 
     Args:
         key: entry or entries of the simulator's state or observation, ``[*B, f]``, of an integer
             type or bool.
         max_relaxations: how often :math:`n` may be raised for a search. Default 14; at most 254.
         stages (sequence of int): number of features, counted from the first, to compare at first,
-            after one relaxation, and so on; each larger than the one before. After the last stage
-            all are compared. Default: all at once.
+            after one relaxation, and so on; after the last stage all are compared, and only then
+            :math:`n` is raised. Features that tell many states apart come last. Default: all.
 
     Raises:
         ValueError: if no key is given, ``max_relaxations`` is out of its range, or the stages do
@@ -322,6 +325,8 @@ class WidthNovelty(_Counted):
         >>> novelty.accept(np.array([0, 0, 0, 0]), states, base_steps=np.array([0, 1, 1, 2]))
         array([ True,  True,  True, False])
     """
+
+    _dtype = np.int64
 
     def __init__(
         self,
@@ -350,6 +355,7 @@ class WidthNovelty(_Counted):
         self._limits = np.ones(num_roots, np.int64)
         self._stage = np.zeros(num_roots, np.int64)
         self._used: np.ndarray | None = None
+        self._num_features = -1
         self.num_tested = 0
         self._tally = np.zeros(1, np.int64)
 
@@ -374,18 +380,19 @@ class WidthNovelty(_Counted):
             self._counts[root] = 0
             self._owners[root] = -1
 
-    def _make_room(self, features: np.ndarray) -> None:
+    def _make_room(self, num_features: int) -> None:
         """Allocate the hash tables of values, or double them."""
         from torchrl_hmcts.planners import novelty_kernels
 
         self._kernels = novelty_kernels
-        num_roots, num_features = len(self._limits), features.shape[1]
+        num_roots = len(self._limits)
         if self._used is None:
             if self.stages and self.stages[-1] >= num_features:
                 raise ValueError(
                     f"WidthNovelty(stages={self.stages}) needs more than {self.stages[-1]} "
                     f"features; {self.in_keys} have {num_features}."
                 )
+            self._num_features = num_features
             self._compared = np.array([*self.stages, num_features])  # features, by stage
             self._used = np.zeros(num_roots, np.int64)  # values in the table
             self._slots = np.zeros(num_features, np.int64)
@@ -401,25 +408,11 @@ class WidthNovelty(_Counted):
         self._kernels.move_values(self._values, self._owners, self._counts, values, owners, counts)
         self._values, self._owners, self._counts = values, owners, counts
 
-    def accept(self, roots: np.ndarray, features: np.ndarray, base_steps: np.ndarray) -> np.ndarray:
-        """Return which new states are novel, bool ``[m]``, and remembers those."""
-        features = np.ascontiguousarray(features, np.int64)
-        if self._used is None:
-            self._make_room(features)
-        _check_width(self, features, len(self._slots))
-        accepted = np.zeros(len(roots), np.bool_)
-        begin = 0
-        while True:
-            begin = self._kernels.accept_new(
-                self._values, self._owners, self._counts, self._used, self._limits,
-                self._compared[self._stage], self._tally, roots, features, accepted, self._slots,
-                begin,
-            )  # fmt: skip
-            if begin == len(roots):
-                break
-            self._make_room(features)
-        self.num_tested += len(roots)
-        return accepted
+    def _accept(self, *wave: Any) -> int:
+        arrays = self._values, self._owners, self._counts, self._used, self._limits
+        compared = self._compared[self._stage]
+        begin: int = self._kernels.accept_new(*arrays, compared, self._tally, self._slots, *wave)
+        return begin
 
     def relax(self, root: int) -> bool:
         """Be less strict for one root from now on; False if that is impossible."""
@@ -440,11 +433,3 @@ def _side_by_side(parts: list[torch.Tensor]) -> np.ndarray:
     flat = [part.reshape(len(part), part.shape[1:].numel()) for part in parts]
     joined = flat[0] if len(flat) == 1 else torch.cat(flat, -1)
     return joined.cpu().contiguous().numpy()
-
-
-def _check_width(test: RadiusNovelty | WidthNovelty, features: np.ndarray, width: int) -> None:
-    if features.shape[1] != width:
-        raise ValueError(
-            f"{test} has seen states with {width} features; got {features.shape[1]}. Call "
-            f"start(num_roots) before testing others."
-        )

@@ -1,10 +1,6 @@
-"""The inner loops of the novelty tests and of transpositions, compiled by numba.
+"""The inner loops of the novelty tests, compiled by numba; they stop where they need more room.
 
-Imported when the first state is tested, since numba takes a second to load. Each kernel takes the
-states in order and stops where it needs more room than it has: it returns how far it came.
-
-Letters: ``B`` roots, ``m`` states to test, ``F`` features, ``K`` bytes of a state, ``C`` states a
-root has room for.
+Letters: ``B`` roots, ``m`` states to test, ``F`` features, ``C`` states a root has room for.
 """
 
 # numba compiles these functions; it does not read annotations as strings.
@@ -159,15 +155,13 @@ def _fewest_nearby(seen, seen_steps, links, heads, root, b, features, i, any_is_
 
 @njit()
 def accept_distant(
-    seen, seen_steps, links, heads, known, tally, roots, features, base_steps, shorter_paths,
+    seen, seen_steps, links, heads, known, tally, shorter_paths, roots, features, base_steps,
     accepted, first,
 ):  # fmt: skip
     """Accept, in order, the states outside the radius of every accepted one; return how far.
 
-    With ``shorter_paths`` also a state that needs fewer base steps than all within its radius.
     States of a root lie in a hash grid: ``heads [B, buckets]`` is the last state of a bucket,
-    ``links [B, C]`` the one before it. ``tally`` counts what was refused, and what was accepted for
-    a shorter path.
+    ``links [B, C]`` the one before it. ``tally``: states refused, and accepted for a shorter path.
     """
     for i in range(first, roots.shape[0]):
         b = roots[i]
@@ -213,13 +207,13 @@ def _slot(values, owners, b, f, value):
 
 @njit()
 def accept_new(
-    values, owners, counts, used, limits, compared, tally, roots, features, accepted, slots, first
-):
+    values, owners, counts, used, limits, compared, tally, slots, roots, features, base_steps,
+    accepted, first,
+):  # fmt: skip
     """Accept, in order, the states with a value that was seldom seen; return how far it came.
 
-    The first ``compared [B]`` features count.
-    Slots of ``values``, ``owners`` (the feature, -1 for none) and ``counts``, all ``[B, slots]``,
-    are a hash table of each root, at most half full; ``slots [F]`` is room to work in.
+    The first ``compared [B]`` features count. ``values``, ``owners`` (the feature, -1 for none) and
+    ``counts``, ``[B, slots]``, are a hash table of each root; ``slots [F]`` is room to work in.
     """
     num_features = features.shape[1]
     for i in range(first, roots.shape[0]):
@@ -259,63 +253,3 @@ def move_values(values, owners, counts, to_values, to_owners, to_counts):
                 to_values[b, to] = values[b, slot]
                 to_owners[b, to] = owners[b, slot]
                 to_counts[b, to] = counts[b, slot]
-
-
-# ----------------------------------------------------------------------------------- equal states
-
-
-@njit()
-def _code_bucket(codes, i, num_buckets):
-    mixed = 0x11C9DC5
-    for k in range(codes.shape[1]):  # FNV-1a, cut to 31 bits
-        mixed = ((mixed ^ int(codes[i, k])) * 16777619) & 0x7FFFFFFF
-    return ((mixed * 2654435761) >> 16) & (num_buckets - 1)
-
-
-@njit()
-def _is_equal(codes, i, others, j):
-    for k in range(codes.shape[1]):
-        if codes[i, k] != others[j, k]:
-            return False
-    return True
-
-
-@njit()
-def find_equal(seen, seen_nodes, links, heads, counts, tally, roots, codes, nodes, twins, first):
-    """Write the node of the same state, or remember a new one under its node; return how far.
-
-    States ``seen [B, C, K]`` of a root are chained in buckets, as those of
-    :func:`accept_distant`; ``tally`` counts those that were found.
-    """
-    for i in range(first, roots.shape[0]):
-        b = roots[i]
-        bucket = _code_bucket(codes, i, heads.shape[1])
-        j = heads[b, bucket]
-        while j >= 0 and not _is_equal(codes, i, seen[b], j):
-            j = links[b, j]
-        twins[i] = -1
-        if j >= 0:
-            if seen_nodes[b, j] != nodes[i]:
-                twins[i] = seen_nodes[b, j]
-                tally[0] += 1
-            continue
-        j = counts[b]
-        if j == seen.shape[1]:
-            return i
-        seen[b, j] = codes[i]
-        seen_nodes[b, j] = nodes[i]
-        links[b, j] = heads[b, bucket]
-        heads[b, bucket] = j
-        counts[b] += 1
-    return roots.shape[0]
-
-
-@njit()
-def link_codes(seen, links, heads, counts):
-    """Sort all states into buckets again."""
-    heads[:] = -1
-    for b in range(seen.shape[0]):
-        for j in range(counts[b]):
-            bucket = _code_bucket(seen[b], j, heads.shape[1])
-            links[b, j] = heads[b, bucket]
-            heads[b, bucket] = j

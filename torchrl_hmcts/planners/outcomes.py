@@ -1,13 +1,15 @@
-"""Outcomes of options, as arrays, and the refusal of numbers that no search can use.
+"""Outcomes of options as arrays, answers of evaluators, and the refusal of what no search can use.
 
 Letters: ``m`` outcomes of one wave, or roots; ``A`` options, ``F`` novelty features, ``K`` bytes.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchrl_hmcts.planners.tree import LARGEST, MOST_BASE_STEPS
 
@@ -18,8 +20,8 @@ class Outcomes(NamedTuple):
     rewards: np.ndarray  # [m] float32, R
     discounts: np.ndarray  # [m] float32, D: gamma ** duration, 0 after a terminal state
     durations: np.ndarray  # [m] int64, base steps
-    done: np.ndarray  # [m] bool: terminated or truncated
     values: np.ndarray  # [m] float32, the leaf evaluator's
+    done: np.ndarray  # [m] bool: terminated or truncated
     priors: np.ndarray  # [m, A] float32, or [0, A] for uniform
     masks: np.ndarray  # [m, A] bool: options that may be taken, or [0, A] for all
     features: np.ndarray | None = None  # [m, F], the novelty test's
@@ -70,4 +72,47 @@ def check_durations(durations: np.ndarray, above: np.ndarray) -> None:
             f"The simulator returned a duration of {durations[~good][0]}. An option takes one base "
             f"step or more, and a path {MOST_BASE_STEPS:,} at most; find the step from which the "
             f"env wrote it."
+        )
+
+
+def check_priors(priors: Any, shape: tuple[int, int], reader: str) -> Tensor:
+    """Return probabilities, contiguous on the CPU; refuse numbers that are no probabilities."""
+    _check_tensor(priors, reader)
+    if tuple(priors.shape) != shape:
+        raise ValueError(
+            f"The {reader} returned shape {list(priors.shape)}; it must give one probability per "
+            f"state and option, {list(shape)}."
+        )
+    good = (priors >= 0) & (priors < LARGEST)
+    if not good.all():
+        raise ValueError(
+            f"The {reader} returned {priors[~good][0].item()}. Probabilities must be finite and "
+            f"not negative; apply a softmax to logits."
+        )
+    return priors.detach().cpu().contiguous()
+
+
+def check_values(values: Any, num_states: int, reader: str) -> Tensor:
+    """Return values, float32 ``[m]`` on the CPU; refuse those that no search can use."""
+    _check_tensor(values, reader)
+    if tuple(values.shape) not in ((num_states,), (num_states, 1)):
+        raise ValueError(
+            f"The {reader} returned shape {list(values.shape)}; it must give one value per state, "
+            f"[{num_states}] or [{num_states}, 1]."
+        )
+    found: Tensor = values.detach().reshape(-1).to("cpu", torch.float32)
+    good = found.abs() < LARGEST
+    if not good.all():
+        raise ValueError(
+            f"The {reader} returned {found[~good][0].item()}. Values must be finite and smaller "
+            f"than {LARGEST:g}; check the network's input and weights."
+        )
+    return found
+
+
+def _check_tensor(value: Any, reader: str) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(
+            f"The {reader} must return a tensor; got {type(value).__name__}. Wrap a module in "
+            f"ModulePrior or ValueEvaluator."
         )

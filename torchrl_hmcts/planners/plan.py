@@ -1,10 +1,11 @@
-"""Plans of a search, as tensors.
+"""Plans of a search as tensors, and reports while it runs.
 
 Letters: *B batch of roots, L length of the longest plan.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,9 @@ from torch import Tensor
 from torchrl_hmcts import notebook
 from torchrl_hmcts.planners.drawing import option_color
 from torchrl_hmcts.planners.search import Search
-from torchrl_hmcts.planners.tree import KeepsDocstring
 
 
-class Plan(TensorClass, metaclass=KeepsDocstring):
+class Plan(TensorClass, metaclass=notebook.KeepsDocstring):
     """The best plan of each root: options that earn a reward one after the other.
 
     Attributes:
@@ -112,3 +112,35 @@ def extract_plans(search: Search) -> Plan:
         states=tree.states[torch.from_numpy(rows), torch.from_numpy(nodes)],
         batch_size=[search.num_roots],
     )
+
+
+@dataclass(frozen=True)
+class SearchProgress:
+    """Report to a progress display after every wave.
+
+    Attributes:
+        num_roots (int): roots of the search.
+        num_active (int): roots whose search continues.
+        num_found (int): roots with a plan.
+        expansions (int): nodes expanded so far, of all roots.
+        base_steps (int): base steps simulated so far, of all roots.
+        seconds (float): since the search began.
+        search (Search): the search so far, of B roots; ``extract_plans(search)`` returns its best
+            plans.
+
+    Example:
+        >>> from torchrl_hmcts.planners import MCTSPlanner
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> env, told = ChainEnv(length=4), []
+        >>> _ = MCTSPlanner(env, progress=told.append).plan(env.reset())
+        >>> told[-1].num_found, told[-1].num_roots
+        (1, 1)
+    """
+
+    num_roots: int
+    num_active: int
+    num_found: int
+    expansions: int
+    base_steps: int
+    seconds: float
+    search: Search

@@ -35,10 +35,7 @@ def wave_seeds(
 
 
 def mix(bits: np.ndarray) -> np.ndarray:
-    """Hash 64 bits (the output function of SplitMix64), so that near seeds have nothing in common.
-
-    Reference: Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014.
-    """
+    """Hash 64 bits: SplitMix64 of Steele, Lea and Flood, "Fast splittable generators", 2014."""
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

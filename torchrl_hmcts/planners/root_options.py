@@ -19,9 +19,6 @@ class DirichletNoise:
     .. math:: P(s, a) \leftarrow (1 - \epsilon)\, P(s, a) + \epsilon\, \eta_a,
               \qquad \eta \sim \mathrm{Dir}(\alpha)
 
-    The prior of the options that may be taken is scaled to sum to 1 first. After a subtree is
-    reused the new root gets noise of its own.
-
     Args:
         alpha: of the Dirichlet distribution, about 10 over the number of options. Default 0.3.
         fraction: :math:`\epsilon`. Default 0.25.
@@ -45,12 +42,7 @@ class DirichletNoise:
         real_number("DirichletNoise", "fraction", self.fraction, least=0.0, most=1.0)
 
     def add(self, search: Search, roots: np.ndarray) -> None:
-        """Mix noise into the priors of the options of roots, each with random numbers of its own.
-
-        Args:
-            search: of which node 0 of each root is changed.
-            roots: which of its roots, int64.
-        """
+        """Mix noise into the priors of ``roots`` (int64), each with random numbers of its own."""
         edges = search.tree.edges
         for b in roots.tolist():
             allowed = edges["closed"][b, 0] != FORBIDDEN

@@ -20,8 +20,8 @@ def select_by_scores(
 ) -> int:
     """Descend to the leaves of every active root; return how many outcomes to simulate.
 
-    Python walks the trees down, and :func:`kernels.select` continues from there, with one descent
-    of each root at a time: one that ends in a leaf that is known adds nothing to this wave.
+    Python walks the trees down, one descent of each root at a time; :func:`kernels.select`
+    continues.
     """
     from torchrl_hmcts.planners import kernels
 
@@ -47,7 +47,7 @@ def select_by_scores(
 
 def _walk(tree: TreeArrays, settings: SearchSettings, record: np.ndarray) -> None:
     """Take all active roots down; write their node, and the option to simulate, if any."""
-    from torchrl_hmcts.planners.subtree_kernels import walk_on
+    from torchrl_hmcts.planners.root_kernels import walk_on
 
     roots, scores = tree.roots, settings.tree_policy
     arrays = tree.nodes, tree.edges, roots, record

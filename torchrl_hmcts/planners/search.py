@@ -1,6 +1,4 @@
-"""The search itself, on arrays: it asks for outcomes of options and grows the trees with them.
-
-A wave is :meth:`Search.select`, the simulation of the triples it returns by whoever runs the
+"""The search itself, on arrays: a wave is :meth:`Search.select`, its simulation by whoever runs the
 search, and :meth:`Search.insert`. Nothing here knows tensordicts or environments.
 """
 
@@ -184,9 +182,8 @@ class Search:
             self._forget_in_flight()
             self.roots["scheduled"] = 0
             self.growing = False
-        self._root_kernels.limit(
-            self.roots, NO_LIMIT if num_simulations is None else num_simulations
-        )
+        limit = NO_LIMIT if num_simulations is None else num_simulations
+        self._root_kernels.limit(self.roots, limit)
 
     def _forget_in_flight(self) -> None:
         self.tree.edges["in_flight"] = 0
@@ -252,7 +249,8 @@ class Search:
         novel, twins = np.ones(m, np.bool_), np.empty(0, np.int64)
         if self.transpositions is not None or self.novelty is not None:
             check_rows(outcomes, m, self.num_options)
-            refuse(outcomes, self._kernels.first_bad(*outcomes[:2], *outcomes[4:6]))
+            numbers = outcomes.rewards, outcomes.discounts, outcomes.values, outcomes.priors
+            refuse(outcomes, self._kernels.first_bad(*numbers))
             novel, twins = self._look_up(wave, outcomes)
         self._attach(wave)
         self._reserve_wave()

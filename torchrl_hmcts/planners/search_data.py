@@ -22,14 +22,8 @@ def best_plans_below(search: Search) -> tuple[np.ndarray, np.ndarray]:
 
     .. math:: G(s) = \max_o R(s, o) + D(s, o)\, \max(0, G(s'))
 
-    over the options that lead, at once or later, to a node whose option earned a reward.
-
-    Args:
-        search: with a deterministic simulator.
-
-    Returns:
-        Returns float64 ``[B, N]``, -inf where no plan is known, and options int64 ``[B, N]``, -1
-        there. From the roots it is the return of the plans that ``extract_plans`` reads.
+    over the options that lead to a node whose option earned a reward, in a deterministic simulator:
+    float64 ``[B, N]``, -inf where no plan is known, and int64 ``[B, N]``, -1 there.
 
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner
@@ -97,11 +91,10 @@ def search_examples(
         keys: entries of the states to take. Default: all that the search stored.
 
     Returns:
-        Examples ``[K]``, root by root in the order of their nodes: the entries of the states,
-        ``"policy_target"`` (float32 ``[K, A]``), ``"policy_weight"`` (float32 ``[K]``, 0 where no
-        option has a visit and no plan is known), ``"value_target"`` (float32 ``[K, 1]``),
-        ``"value_weight"`` (float32 ``[K]``), ``"action_mask"`` (bool ``[K, A]``), and ``"root"``
-        and ``"node"`` (int64 ``[K]``) of the tree. Terminal nodes are never among them.
+        Examples ``[K]`` of nodes that are not terminal, in their order: the states' entries,
+        ``"policy_target"`` (float32 ``[K, A]``) and ``"policy_weight"`` (float32 ``[K]``, 0 without
+        visits and plan), ``"value_target"`` (float32 ``[K, 1]``) and ``"value_weight"`` (float32
+        ``[K]``), ``"action_mask"`` (bool ``[K, A]``), ``"root"`` and ``"node"`` (int64 ``[K]``).
 
     Raises:
         ValueError: if ``plan_share`` is outside [0, 1] or ``min_visits`` is below 1.

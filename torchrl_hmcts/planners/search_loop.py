@@ -1,8 +1,5 @@
 """The loop of a search: waves of leaves go to the simulator, their outcomes into the trees.
 
-What a wave is and how outcomes are backed up is in :mod:`~torchrl_hmcts.planners.search`; how a
-state is set and an option taken, in :mod:`~torchrl_hmcts.planners.simulator`.
-
 Letters: B roots, m outcomes of one wave.
 """
 
@@ -22,7 +19,7 @@ from torchrl_hmcts.checks import NO_LIMIT
 from torchrl_hmcts.planners.budget import SearchBudget
 from torchrl_hmcts.planners.evaluation import NodeEvaluator
 from torchrl_hmcts.planners.outcomes import Outcomes, check_durations
-from torchrl_hmcts.planners.progress import SearchProgress
+from torchrl_hmcts.planners.plan import SearchProgress
 from torchrl_hmcts.planners.random_streams import wave_seeds
 from torchrl_hmcts.planners.root_options import halve
 from torchrl_hmcts.planners.search import Search, Wave
@@ -45,11 +42,7 @@ class _UnderWay:
 
 
 class SearchLoop:
-    """Grows the trees of a search until a budget is spent.
-
-    Up to ``waves_in_flight`` waves are under way. The one that was sent first is waited for, its
-    outcomes are inserted, its rollouts continue or a new wave is selected in its place.
-    """
+    """Grows the trees of a search until a budget is spent, with several waves under way."""
 
     def __init__(
         self,
@@ -119,7 +112,7 @@ class SearchLoop:
                     since[first.roots] = search.roots["revisits"][first.roots]
             seconds = time.perf_counter() - begin
             if self.progress is not None:
-                self.progress(SearchProgress.of(search, len(active), seconds))
+                self.progress(self._progress(len(active), seconds))
             if budget.seconds is not None and seconds >= budget.seconds:
                 active = active[:0]
                 continue
@@ -127,6 +120,12 @@ class SearchLoop:
                 revisits = search.roots["revisits"]
                 active = active[revisits[active] - since[active] < _MAX_FRUITLESS_REVISITS]
             active = self._still_active(active)
+
+    def _progress(self, num_active: int, seconds: float) -> SearchProgress:
+        search = self.search
+        num_found, expansions = (search.best_node >= 0).sum(), search.num_expansions.sum()
+        counts = search.num_roots, num_active, int(num_found), int(expansions)
+        return SearchProgress(*counts, int(search.num_base_steps.sum()), seconds, search)
 
     def _still_active(self, active: np.ndarray) -> np.ndarray:
         """The roots among ``active`` that have budget left and something to simulate."""
@@ -156,8 +155,7 @@ class SearchLoop:
 
     def _insert(self, wave: Wave, after: TensorDictBase) -> None:
         search, simulator, settings = self.search, self.simulator, self.search.settings
-        terminated, done = simulator.terminated(after), simulator.done(after)
-        durations = simulator.durations(after)
+        terminated, durations = simulator.terminated(after), simulator.durations(after)
         if simulator.duration_key is None:
             discounts = np.where(terminated, np.float32(0.0), np.float32(self.gamma))
         else:
@@ -170,22 +168,11 @@ class SearchLoop:
             counted = search.num_simulations[wave.roots]
             return wave_seeds(search.seeds[wave.roots], counted, wave.nodes, options)
 
-        priors, values = self.evaluate(after, terminated, seeds)
-        novelty, transpositions = settings.novelty, settings.transpositions
-        outcomes = Outcomes(
-            rewards=simulator.rewards(after),
-            discounts=discounts,
-            durations=durations,
-            done=done,
-            values=values,
-            priors=priors,
-            masks=simulator.masks(after),
-            features=None if novelty is None else novelty.features(after),
-            codes=None if transpositions is None else transpositions.codes(after),
-        )
+        known = self.evaluate.describe(after, simulator, settings, seeds)
+        outcomes = Outcomes(simulator.rewards(after), discounts, durations, *known)
         merges = None
         if settings.chance is not None:
-            merges = find_merges(search.tree, wave, after, done, simulator.state_keys)
+            merges = find_merges(search.tree, wave, after, known.done, simulator.state_keys)
         nodes = search.insert(wave, outcomes, merges)
         search.tree.set_states(wave.roots, nodes, after)
         search.inserting = False

@@ -19,9 +19,8 @@ from torchrl_hmcts.planners.tree_policies import UCT, CompiledPolicy, Gumbel, Tr
 class SearchSettings:
     r"""Holds the parts and numbers of a search, checked once and never changed.
 
-    A planner builds one from its keywords, ``planner.settings``. To assign a part, as in
-    ``planner.tree_policy = UCT(c=5.0)``, replaces it by a changed copy. A search keeps the settings
-    it was planted with, and takes the planner's new ones when it is resumed.
+    A planner builds one from its keywords, ``planner.settings``; to assign one of its parts
+    replaces it. A search takes the planner's new settings when it is resumed.
 
     Args:
         tree_policy: :class:`UCT` (default, ``c=1``), :class:`PUCT`, :class:`Gumbel`,
@@ -42,12 +41,10 @@ class SearchSettings:
             option that the tree policy chooses, as in the textbook.
         leaves_per_wave: leaves of each root that share a simulator call. More are faster for few
             roots and search less selectively. At most 255; default 1.
-        waves_in_flight: waves that are simulated at a time; each is chosen before the outcomes of
-            the earlier ones are known. For a simulator that works beside the planner, such as
-            :class:`~torchrl_hmcts.envs.AtariOptionPool` with processes: with 2 it has work while
-            the planner inserts and selects. Outcomes are inserted in the order of the waves, so the
-            tree is the same each time and on every simulator, unless the budget has ``seconds``.
-            Times ``leaves_per_wave`` at most 255; default 1.
+        waves_in_flight: waves that are simulated at a time, each chosen before the outcomes of the
+            earlier ones are known: with 2 a pool of processes has work while the planner inserts
+            and selects. The tree is the same on every simulator, unless the budget has
+            ``seconds``. Times ``leaves_per_wave`` at most 255; default 1.
         exhausted: what a descent does with an option behind which nothing is left to simulate.
             ``"skip"`` (default): every simulation finds something new. ``"revisit"``: the known
             value is backed up once more, without the simulator, so that visits and mean values are
@@ -89,12 +86,10 @@ class SearchSettings:
         for name in ("leaves_per_wave", "waves_in_flight"):
             object.__setattr__(self, name, whole_number("A search", name, getattr(self, name)))
         leaves, waves = self.leaves_per_wave, self.waves_in_flight
-        if not 1 <= leaves <= 255:
-            raise ValueError(f"A search needs leaves_per_wave from 1 to 255; got {leaves}.")
-        if waves < 1 or leaves * waves > 255:
+        if min(leaves, waves) < 1 or leaves * waves > 255:
             raise ValueError(
-                f"A search needs waves_in_flight >= 1, with leaves_per_wave * waves_in_flight <= "
-                f"255; got waves_in_flight={waves}, leaves_per_wave={leaves}."
+                f"A search needs leaves_per_wave and waves_in_flight from 1 on, their product up "
+                f"to 255; got leaves_per_wave={leaves}, waves_in_flight={waves}."
             )
         for name in ("tree_policy", "novelty"):
             no_class("A search", name, getattr(self, name))
@@ -163,7 +158,3 @@ class SearchSettings:
         for name, number in numbers.items():
             record[name] = number
         return record
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """Return one of the numbers that the kernels read, ``[1]``, e.g. ``settings["c"]``."""
-        return self.record()[name]

@@ -1,12 +1,5 @@
 """A macro environment as the planner uses it: states go in, outcomes of options come out.
 
-Two kinds of env can be set to any state. A stateless one (``batch_locked=False``) keeps its state
-in the tensordict: all states of a wave are one call. If its type has ``step_async(td) -> ticket``,
-``step_wait(ticket) -> next`` and ``step_abandon(ticket)``, as that of :class:`AtariOptionPool`, it
-works on several waves beside the planner. The planner waits for every ticket, and abandons it if
-that fails. One with a state of its own (e.g. TorchRL's MuJoCo envs) is set by ``reset(td,
-set_state=True)`` and steps as many states at a time as its batch size holds.
-
 Letters: ``m`` states of one call, ``A`` options.
 """
 
@@ -26,7 +19,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_hmcts.carried_state import ForeignStates, planning_env
 from torchrl_hmcts.checks import nested_key
-from torchrl_hmcts.direct_calls import put
+from torchrl_hmcts.direct_calls import entry, put
 from torchrl_hmcts.nesting import complete_done, env_name, step_states
 from torchrl_hmcts.planners.simulator_checks import (
     check_durations_and_masks,
@@ -45,15 +38,10 @@ _BESIDE = ("step_async", "step_wait", "step_abandon")
 class Simulator:
     """Sets a macro environment to states and takes one macro-step from each of them.
 
-    Args:
-        env: the macro environment.
-        extra_keys: further entries that novelty tests and evaluators read.
-        duration_key: base steps of a macro-step. None: 1.
-        mask_key: options that may be taken. None: all.
-        reward_key: Default: the env's only reward.
-
-    Raises:
-        ValueError: if the env cannot be set to a state or has no single discrete action.
+    All states of a wave are one call of a stateless env (``batch_locked=False``). If its type has
+    ``step_async(td) -> ticket``, ``step_wait(ticket) -> next`` and ``step_abandon(ticket)``, it
+    works on several waves beside the planner. An env with a state of its own is set to it, see
+    :class:`Turns`.
     """
 
     def __init__(
@@ -88,9 +76,8 @@ class Simulator:
         self.kept_keys = list(self.state_keys)
         self.duration_key = self._optional("duration_key", duration_key)
         self.mask_key = self._optional("mask_key", mask_key)
-        self.root_keys = list(dict.fromkeys([*self.state_keys, *extra]))
-        if self.mask_key is not None:
-            self.root_keys = list(dict.fromkeys([*self.root_keys, self.mask_key]))
+        masks = [] if self.mask_key is None else [self.mask_key]
+        self.root_keys = list(dict.fromkeys([*self.state_keys, *extra, *masks]))
         self._reward_key = find_reward_key(env, reward_key)
         self._done_spec = env.full_done_spec_unbatched  # a call has m states, not env.batch_size
         self._done_keys = [unravel_key(k) for k in env.done_keys]
@@ -172,10 +159,10 @@ class Simulator:
         return option
 
     def _completed(self, states: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
-        if any(_entry(after, key) is None for key in self._done_keys):
+        if any(entry(after, key) is None for key in self._done_keys):
             complete_done(self.env, after, self._done_spec)
         for key in self.state_keys:
-            if _entry(after, key) is None:  # the env leaves it as it was
+            if entry(after, key) is None:  # the env leaves it as it was
                 after.set(key, states.get(key))
         return after
 
@@ -203,13 +190,9 @@ class Simulator:
         return _array(reward if reward.dtype == torch.float32 else reward.to(torch.float32))
 
     def done(self, td: TensorDictBase) -> np.ndarray:
-        """Return which states end the episode, bool ``[m]``; False where a root does not say.
-
-        A rollout marks the elements it no longer steps with ``"_step"`` False and fills them with
-        zeros, which are no state to plan from: they have ended too.
-        """
+        """Return which states have ended, or are no longer stepped by a rollout, bool ``[m]``."""
         done = self._flag(td, self._done_key)
-        stepped = _entry(td, "_step")
+        stepped = entry(td, "_step")
         return done if stepped is None else done | ~_array(stepped)
 
     def terminated(self, td: TensorDictBase) -> np.ndarray:
@@ -233,25 +216,13 @@ class Simulator:
         return masks if masks.dtype == np.bool_ else masks.astype(np.bool_)
 
     def _flag(self, td: TensorDictBase, key: NestedKey) -> np.ndarray:
-        flag = _entry(td, key)
+        flag = entry(td, key)
         return np.zeros(td.batch_size[0], np.bool_) if flag is None else _array(flag)
 
 
-def _entry(td: TensorDictBase, key: NestedKey) -> Tensor | None:
-    """An entry or None; ``TensorDict.get`` unravels its key at ten times the cost of the look-up.
-
-    ``key`` is unravelled already.
-    """
-    if isinstance(key, str):
-        entry: Tensor | None = td._get_str(key, None)
-    else:
-        entry = td._get_tuple(key, None)
-    return entry
-
-
 def _required(td: TensorDictBase, key: NestedKey) -> Tensor:
-    entry = _entry(td, key)
-    return td.get(key) if entry is None else entry  # whose error names the key
+    found = entry(td, key)
+    return td.get(key) if found is None else found  # whose error names the key
 
 
 def _array(value: Tensor) -> np.ndarray:

@@ -26,12 +26,10 @@ def check_env(env: EnvBase) -> None:
     if env.batch_locked and not env._supports_set_state:
         raise ValueError(
             f"MCTSPlanner needs an env it can set to any state; {name} cannot "
-            f"(_supports_set_state={env._supports_set_state}, "
-            f"batch_locked={env.batch_locked}). Make a Gymnasium env by "
-            f"SettableGymEnv(its id). Of others use one that is stateless, e.g. "
-            f"WaterworldMazeEnv(), or one whose reset(td, set_state=True) restores the state "
-            f"in td. If all that its step reads is in the tensordict already, declare it by "
-            f"StatelessSimulator(env)."
+            f"(_supports_set_state=False, batch_locked=True). Make a Gymnasium env by "
+            f"SettableGymEnv(its id). Of others use a stateless one, e.g. WaterworldMazeEnv(), or "
+            f"one whose reset(td, set_state=True) restores the state in td. If all that its step "
+            f"reads is in the tensordict already, declare it by StatelessSimulator(env)."
         )
     if len(env.action_keys) != 1:
         raise ValueError(
@@ -158,8 +156,7 @@ def find_reward_key(env: EnvBase, reward_key: NestedKey | None) -> NestedKey:
 
 
 def _masks_actions_below_options(env: EnvBase, mask_key: NestedKey) -> int:
-    """The number of base actions if the mask is theirs and no transform behind the options wrote
-    it."""
+    """The number of base actions if the mask is theirs, not a transform's behind the options."""
     transforms = flat_transforms(env) if isinstance(env, TransformedEnv) else []
     for transform in reversed(transforms):
         if mask_key in map(unravel_key, transform.out_keys):

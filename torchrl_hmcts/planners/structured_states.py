@@ -17,13 +17,7 @@ _Leaves = dict[str, np.ndarray | Tensor]
 
 
 def as_rows(embedding: Any, as_tensor: bool) -> tuple[Any, Callable[..., Any]]:
-    """Return states as an array of rows, and a wrapper that makes a transition function one of
-    rows.
-
-    Args:
-        embedding: an array; a mapping or tuple of arrays, nested in any way; or a list of states.
-        as_tensor: whether the rows of a list are a tensor.
-    """
+    """Return states as an array of rows, and what makes a transition function one of rows."""
     if isinstance(embedding, (np.ndarray, Tensor)):
         return embedding, lambda transition: transition
     if isinstance(embedding, list):

@@ -19,11 +19,8 @@ from torchrl_hmcts.planners.tree_policies import CompiledPolicy
 
 
 def extend(search: Search, wave: Wave) -> Wave:
-    """Choose an option, by its prior, of every node that a wave has added and that continues.
-
-    Only with ``expand="one"``. Each root draws its own random numbers.
-    """
-    from torchrl_hmcts.planners import subtree_kernels
+    """Choose an option, by its prior, of every node that a wave has added and that continues."""
+    from torchrl_hmcts.planners import root_kernels
 
     draws = np.empty(len(wave))
     for root in sorted(set(wave.roots.tolist())):
@@ -32,7 +29,7 @@ def extend(search: Search, wave: Wave) -> Wave:
         rows = wave.roots == root
         draws[rows] = search.rollouts[root].random(int(rows.sum()))
     tree, ended, further = search.tree, wave.records.copy(), wave.records.copy()
-    count = subtree_kernels.extend(
+    count = root_kernels.extend(
         tree.nodes, tree.edges, tree.roots, search.record, ended, draws, further
     )
     return Wave(further[:count])
@@ -57,13 +54,13 @@ def relax(search: Search, root: int) -> bool:
 
 def _reopen(search: Search, root: int, pruned: np.ndarray) -> None:
     """Put nodes that were refused to the novelty test again."""
-    from torchrl_hmcts.planners import subtree_kernels
+    from torchrl_hmcts.planners import root_kernels
 
     again = np.ones(len(pruned), np.bool_)
     if search.novelty is not None:
         again = ask(search.novelty, *_tested(search.tree, root, pruned))
     for node in pruned[again]:
-        subtree_kernels.reopen(search.tree.nodes, search.tree.edges, root, node)
+        root_kernels.reopen(search.tree.nodes, search.tree.edges, root, node)
 
 
 def _tested(tree: TreeArrays, root: int, nodes: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -78,21 +75,21 @@ def solve(search: Search, root: int, tolerance: float = 1e-7) -> None:
     With a max backup only; without transpositions they are exact already.
     """
     if search.settings.backup == "max" and search.transpositions is not None:
-        from torchrl_hmcts.planners import subtree_kernels
+        from torchrl_hmcts.planners import root_kernels
 
         tree = search.tree
-        subtree_kernels.solve(tree.nodes, tree.edges, tree.roots, root, tolerance, 10_000)
+        root_kernels.solve(tree.nodes, tree.edges, tree.roots, root, tolerance, 10_000)
 
 
 def reroot(search: Search, root: int, node: int) -> None:
     """Make a node the new root: its subtree stays, with all values, the rest is dropped."""
-    from torchrl_hmcts.planners import subtree_kernels
+    from torchrl_hmcts.planners import root_kernels
 
     tree = search.tree
     if not (0 <= root < search.num_roots and 0 <= node < tree.num_nodes[root]):
         raise ValueError(f"Root {root} of {search.num_roots} has no node {node} to move to.")
     kept = np.empty(tree.num_nodes[root], np.int64)
-    count = subtree_kernels.reroot(tree.nodes, tree.edges, tree.roots, root, node, kept)
+    count = root_kernels.reroot(tree.nodes, tree.edges, tree.roots, root, node, kept)
     kept = kept[:count]
     tree.features[root, :count] = tree.features[root, kept]
     tree.codes[root, :count] = tree.codes[root, kept]
@@ -189,10 +186,7 @@ def keep_subtrees(
 
 
 def check_successor(old: SearchSettings, new: SearchSettings) -> None:
-    """Refuse settings with which a search that was planted with others cannot continue.
-
-    Constants of the tree policy, the waves and the rollouts may differ.
-    """
+    """Refuse settings with which a search that was planted with others cannot continue."""
     for name in (part.name for part in fields(old)):
         one, other = getattr(old, name), getattr(new, name)
         if name in ("leaves_per_wave", "waves_in_flight", "rollout"):

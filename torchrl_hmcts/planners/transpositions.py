@@ -1,6 +1,6 @@
 """Transpositions: states that options reach by several ways are searched once.
 
-Letters: ``B`` roots, ``m`` states, ``K`` bytes of a state.
+Letters: ``m`` states, ``K`` bytes of a state.
 """
 
 from __future__ import annotations
@@ -51,31 +51,12 @@ class Transpositions:
 
     def start(self, num_roots: int) -> None:
         """Forget everything: ``num_roots`` searches begin."""
-        self._counts = np.zeros(num_roots, np.int64)
-        self._seen = np.zeros((num_roots, 0, 0), np.uint8)  # [B, room, K]
-        self._nodes = np.zeros((num_roots, 0), np.int32)
-        self.num_tested = 0
-        self._tally = np.zeros(1, np.int64)
-
-    def _make_room(self, num_bytes: int) -> None:
-        """Allocate for the first states, or double what there is."""
-        from torchrl_hmcts.planners.novelty_kernels import find_equal, link_codes
-
-        self._find_equal = find_equal
-        num_roots, old = self._nodes.shape
-        shape = (num_roots, max(64, 2 * old))
-        seen, nodes = np.zeros((*shape, num_bytes), np.uint8), np.zeros(shape, np.int32)
-        if old:
-            seen[:, :old], nodes[:, :old] = self._seen, self._nodes
-        self._seen, self._nodes = seen, nodes
-        self._links, self._heads = np.empty(shape, np.int32), np.empty(shape, np.int32)
-        link_codes(self._seen, self._links, self._heads, self._counts)
+        self._nodes: list[dict[bytes, int]] = [{} for _ in range(num_roots)]  # by state
+        self.num_tested = self.num_found = 0
 
     def restart(self, root: int) -> None:
         """Forget the states of one root."""
-        self._counts[root] = 0
-        if self._seen.shape[1]:
-            self._heads[root] = -1
+        self._nodes[root] = {}
 
     def codes(self, tensordict: TensorDictBase) -> np.ndarray:
         """Return the states as bytes, uint8 ``[m, K]``."""
@@ -91,31 +72,14 @@ class Transpositions:
 
         In order: a state that is new is remembered under its node.
         """
-        if not self._seen.shape[1]:
-            self._make_room(codes.shape[1])
-        if codes.shape[1] != self._seen.shape[2]:
-            raise ValueError(
-                f"{self} has seen states of {self._seen.shape[2]} bytes; got {codes.shape[1]}. "
-                f"Call start(num_roots) before looking others up."
-            )
-        codes = np.ascontiguousarray(codes)
-        twins = np.empty(len(roots), np.int64)
-        begin = 0
-        while True:
-            begin = self._find_equal(
-                self._seen, self._nodes, self._links, self._heads, self._counts, self._tally,
-                roots, codes, nodes, twins, begin,
-            )  # fmt: skip
-            if begin == len(roots):
-                break
-            self._make_room(codes.shape[1])
+        twins = np.full(len(roots), -1, np.int64)
+        for i, (root, node) in enumerate(zip(roots.tolist(), nodes.tolist(), strict=True)):
+            twin = self._nodes[root].setdefault(codes[i].tobytes(), node)
+            if twin != node:
+                twins[i] = twin
         self.num_tested += len(roots)
+        self.num_found += int((twins >= 0).sum())
         return twins
-
-    @property
-    def num_found(self) -> int:
-        """Number of the states that were looked up and known."""
-        return int(self._tally[0])
 
     def statistics(self) -> dict[str, int]:
         """Return how many states were looked up, and how many were known."""

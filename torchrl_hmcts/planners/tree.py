@@ -3,11 +3,9 @@
 Letters, here and in the rest of the package: ``B`` roots searched at once, ``N`` nodes a root has
 room for, ``A`` options, ``m`` outcomes of one wave, ``F`` novelty features.
 
-An edge is one option taken in one node, a node is one outcome of it. The node keeps the SMDP's
-numbers of the step that led to it: the reward ``R`` (discounted sum over the option) and its own
-discount ``D`` (``gamma ** duration``, 0 after a terminal state). With the node's value ``V`` the
-edge's value is ``Q = R + D * V``; where a stochastic simulator gave several outcomes, they are
-linked by ``sibling`` and ``Q`` is their mean, weighted by how often each was drawn.
+An edge is one option taken in one node, a node is one outcome of it, with the reward ``R``, the
+discount ``D`` (``gamma ** duration``, 0 after a terminal state) and its value ``V``. The edge's
+value is ``Q = R + D * V``, the mean over several outcomes, which are linked by ``sibling``.
 """
 
 from __future__ import annotations
@@ -18,11 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.tensorclass import _TensorClassMeta
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.direct_calls import entry, put
 
 NODE = np.dtype(
     [
@@ -135,16 +133,6 @@ SOLVED = 1  # nothing is left to simulate behind it
 FORBIDDEN = 2  # the mask does not allow the option
 
 
-class KeepsDocstring(_TensorClassMeta):
-    """Metaclass of a ``TensorClass`` that keeps its docstring and repr; tensordict's does not."""
-
-    def __new__(mcs, name: str, bases: Any, namespace: dict[str, Any], **kwargs: Any) -> Any:
-        cls = super().__new__(mcs, name, bases, namespace, **kwargs)
-        for kept in {"__doc__", "__repr__"} & set(namespace):
-            setattr(cls, kept, namespace[kept])
-        return cls
-
-
 class TreeArrays:
     """The arrays of a :class:`SearchTree`, without its views."""
 
@@ -215,8 +203,7 @@ class TreeArrays:
             )
         rows = roots * self.capacity + nodes
         for key, column in self._columns().items():
-            # TensorDict.get unravels the key at several times the cost of the look-up
-            value = states._get_str(key, None) if isinstance(key, str) else states.get(key)
+            value = entry(states, key)
             if isinstance(column, np.ndarray):
                 column[rows] = value.detach().numpy()
             else:
@@ -228,28 +215,23 @@ class TreeArrays:
         """Return the states ``[m]`` of nodes ``[m]``."""
         assert self.states is not None
         rows, columns = roots * self.capacity + nodes, self._columns()
-        entries = {}
+        found = TensorDict(batch_size=[len(roots)], device=self.states.device)
         for key in keys:
             column = columns[key]
             if isinstance(column, np.ndarray):
-                entries[key] = torch.from_numpy(column[rows])
+                put(found, key, torch.from_numpy(column[rows]))
             else:
-                entries[key] = column.index_select(0, torch.from_numpy(rows).to(column.device))
-        size = torch.Size([len(roots)])
-        if all(isinstance(key, str) for key in keys):  # the constructor's checks cost more
-            return TensorDict._new_unsafe(entries, size, device=self.states.device)
-        return TensorDict(entries, size, device=self.states.device)
+                index = torch.from_numpy(rows).to(column.device)
+                put(found, key, column.index_select(0, index))
+        return found
 
     def _columns(self) -> dict[NestedKey, Tensor | np.ndarray]:
-        """The states' entries ``[B * N, ...]``, which share their memory.
-
-        As NumPy arrays where there is such a type: indexing one costs half as much for few rows.
-        """
+        """The states' entries ``[B * N, ...]``; NumPy arrays are indexed at half the cost."""
         if self._flat is None or self._flat[0] is not self.states:
             assert self.states is not None
             columns: dict[NestedKey, Tensor | np.ndarray] = {}
-            for key, entry in self.states.items(True, True):
-                flat = entry.flatten(0, 1)
+            for key, value in self.states.items(True, True):
+                flat = value.flatten(0, 1)
                 plain = flat.device.type == "cpu" and flat.dtype != torch.bfloat16
                 columns[key] = flat.numpy() if plain else flat
             self._flat = (self.states, columns)

@@ -1,9 +1,5 @@
 """Tree policies, which choose the option that a descent takes in a node.
 
-:class:`UCT`, :class:`PUCT` and :class:`Gumbel` run inside the compiled descent. A policy of your
-own is any callable over :class:`NodeStatistics`; it sees the nodes of one level of all descents at
-once.
-
 Letters: ``d`` nodes at which descents stand, ``A`` options.
 """
 
@@ -20,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules.mcts.scores import EXP3Score, MCTSScores, UCB1TunedScore
 
+from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.planners.tree import (
     GUMBEL_SCORE,
@@ -28,26 +25,22 @@ from torchrl_hmcts.planners.tree import (
     SIBLINGS,
     UCT_SCORE,
     WHOLE_TREE,
-    KeepsDocstring,
 )
 
 
-class NodeStatistics(TensorClass, metaclass=KeepsDocstring):
+class NodeStatistics(TensorClass, metaclass=notebook.KeepsDocstring):
     """Statistics that a tree policy may read: the nodes where descents of a wave stand, ``[d]``.
 
-    Visits include the options that are being simulated in the same wave. The value of an option
-    that was never tried is 0. Only options with ``allowed`` may be chosen.
+    Visits include the options that are being simulated. Only ``allowed`` options may be chosen.
 
     Attributes:
         node_visits (Tensor): ``[d]`` float32, visits n of the node, its own evaluation included.
         node_values (Tensor): ``[d]`` float32, value V of the node.
         depths (Tensor): ``[d]`` int64, options from the root.
         option_visits (Tensor): ``[d, A]`` float32, n_j.
-        option_values (Tensor): ``[d, A]`` float32, Q_j = R_j + D_j V_j.
-        option_squares (Tensor): ``[d, A]`` float32, sum of the squared returns that Q_j is the mean
-            of.
-        priors (Tensor): ``[d, A]`` float32, P(s, a): sums to 1 over the options that no mask
-            forbids, 0 for the others.
+        option_values (Tensor): ``[d, A]`` float32, Q_j = R_j + D_j V_j; 0 if never tried.
+        option_squares (Tensor): ``[d, A]`` float32, sum of the squared returns of an option.
+        priors (Tensor): ``[d, A]`` float32, P(s, a); 0 for options that a mask forbids.
         allowed (Tensor): ``[d, A]`` bool.
 
     Example:
@@ -95,7 +88,7 @@ class UCT(CompiledPolicy):
     .. math:: \arg\max_j\; X_j + c \sqrt{\ln n / n_j}
 
     :math:`X_j = R_j + D_j V_j` is the value of option :math:`j`, :math:`n_j` its visits, :math:`n`
-    the visits of the node (its own evaluation included). An option without visits comes first.
+    those of the node, its evaluation included. An option without visits comes first.
 
     Args:
         c: exploration constant, in units of the return. Default ``1.0``.
@@ -210,10 +203,9 @@ class Gumbel(CompiledPolicy):
     .. math:: \arg\max_a\; \pi'(a) - \frac{N(s,a)}{1 + \sum_b N(s,b)}, \qquad
               \pi' = \mathrm{softmax}(\ln P + \sigma(\hat Q)).
 
-    :math:`\hat Q` are values scaled to [0, 1] within the node; an option without visits is
-    completed by the mixed value of the node. It chooses well with very few simulations. The
-    planner must know their number (``SearchBudget(simulations=...)``) and takes one option at a
-    time (``expand="one"``, ``leaves_per_wave=1``).
+    :math:`\hat Q` are values scaled to [0, 1] within the node; an option without visits has the
+    mixed value of the node. It chooses well with few simulations, of a known number
+    (``SearchBudget(simulations=...)``), one at a time (``expand="one"``, ``leaves_per_wave=1``).
 
     Args:
         max_considered: options considered at the root. Default 16.
@@ -300,21 +292,19 @@ class TorchRLScore:
 
     In each node the module is given, per option :math:`a` with value :math:`Q_a` and visits
     :math:`n_a`: the win count :math:`n_a Q_a`, the visits, the total :math:`\sum_b n_b`, the prior,
-    and the sum of squared returns. The option of the highest score is taken. An option without
-    visits has :math:`Q_a = 0` in ``PUCTScore`` and ``UCBScore`` (which by themselves give NaN), and
-    comes first in ``UCB1TunedScore``. ``PUCTScore(c=c)`` builds the same trees as the compiled
-    :class:`PUCT`, at the cost of a policy in Python.
+    and the sum of squared returns. An option without visits has :math:`Q_a = 0` in ``PUCTScore``
+    and ``UCBScore`` (which by themselves give NaN), and comes first in ``UCB1TunedScore``.
 
-    ``EXP3Score`` needs adapting. Its weights are those that the importance-weighted returns would
-    have given if each option had been drawn as often as it was expected to be,
+    The weights of ``EXP3Score`` are those that the importance-weighted returns would have given if
+    each option had been drawn as often as it was expected to be,
 
     .. math:: w_a = \exp\Bigl(\frac{\gamma}{K} \sum_{t: a_t = a} \frac{r_t}{p_t}\Bigr) \approx
               \exp\Bigl(\frac{\gamma}{K}\, N Q_a\Bigr), \qquad p_t \approx \frac{n_a}{N}, \quad
               N = \sum_b n_b,
 
-    and nothing is drawn. The option with the largest :math:`p_a / (1 + n_a)` is taken, so visits
-    are in proportion to the probabilities. EXP3's guarantee against an adversary holds for random
-    draws only, not here. Like UCB1-Tuned it is meant for returns in [0, 1].
+    and the option with the largest :math:`p_a / (1 + n_a)` is taken, so visits are in proportion to
+    the probabilities (EXP3's guarantee against an adversary holds for random draws only). Like
+    UCB1-Tuned it is meant for returns in [0, 1].
 
     Args:
         score_module: e.g. ``PUCTScore(c=1.25)``, a member of ``MCTSScores``, or a module of your

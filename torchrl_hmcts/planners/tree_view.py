@@ -8,10 +8,10 @@ from torch import Tensor
 
 from torchrl_hmcts import notebook
 from torchrl_hmcts.planners import drawing, export
-from torchrl_hmcts.planners.tree import KeepsDocstring, TreeArrays
+from torchrl_hmcts.planners.tree import TreeArrays
 
 
-class TreeView(TensorClass, metaclass=KeepsDocstring):
+class TreeView(TensorClass, metaclass=notebook.KeepsDocstring):
     """A search tree as tensors that share the memory of the kernels' records.
 
     Only the first ``num_nodes[b]`` nodes of root ``b`` are in use. Node 0 is the root. Make a new
@@ -22,21 +22,17 @@ class TreeView(TensorClass, metaclass=KeepsDocstring):
         node_visits (Tensor): ``[B, N]`` backups through a node, its own evaluation included.
         node_values (Tensor): ``[B, N]`` value V of a node.
         raw_values (Tensor): ``[B, N]`` the leaf evaluator's value of a node.
-        rewards (Tensor): ``[B, N]`` reward R of the option that led here.
-        discounts (Tensor): ``[B, N]`` its discount D.
-        parents (Tensor): ``[B, N]`` node above, -1 for the root.
-        parent_options (Tensor): ``[B, N]`` option that led here, -1 for the root.
+        rewards, discounts (Tensor): ``[B, N]`` reward R and discount D of the option that led here.
+        parents, parent_options (Tensor): ``[B, N]`` node above and that option, -1 for the root.
         siblings (Tensor): ``[B, N]`` next outcome of the same option, -1 for the last.
         samples (Tensor): ``[B, N]`` how often the simulator gave this outcome.
-        twins (Tensor): ``[B, N]`` node of the same state that is searched in its place, -1 for
-            none.
-        depths (Tensor): ``[B, N]`` options from the root.
-        base_steps (Tensor): ``[B, N]`` base steps from the root.
+        twins (Tensor): ``[B, N]`` node of the same state that is searched in its place, else -1.
+        depths, base_steps (Tensor): ``[B, N]`` options and base steps from the root.
         path_returns (Tensor): ``[B, N]`` discounted reward collected from the root.
         flags (Tensor): ``[B, N]`` bits EXPANDED ... REWARDED of this module.
         children (Tensor): ``[B, N, A]`` first outcome of an option, -1 if not simulated.
-        children_visits (Tensor): ``[B, N, A]`` backups through an option.
-        children_values (Tensor): ``[B, N, A]`` value Q = R + D V of an option.
+        children_visits, children_values (Tensor): ``[B, N, A]`` backups through an option, and its
+            value Q = R + D V.
         children_priors (Tensor): ``[B, N, A]`` prior probability of an option, 0 if forbidden.
         children_closed (Tensor): ``[B, N, A]`` 0 open, SOLVED or FORBIDDEN.
         states (TensorDictBase): ``[B, N]`` what the simulator needs to continue from a node.
@@ -110,36 +106,18 @@ class SearchTree(TreeArrays):
 
     def view(self) -> TreeView:
         """Return the trees as tensors; nothing is copied."""
-        fields = {"num_nodes": self.roots["num_nodes"]}
-        fields.update({name: self.nodes[field] for name, field in _OF_NODES.items()})
-        fields.update({name: self.edges[field] for name, field in _OF_EDGES.items()})
         states = self.states
         if states is None:
             states = TensorDict({}, batch_size=[self.num_roots, self.capacity])
-        tensors = {name: torch.from_numpy(array) for name, array in fields.items()}
+        arrays = [self.roots["num_nodes"], *(self.nodes[name] for name in _OF_NODES)]
+        arrays += [self.edges[name] for name in _OF_EDGES]
+        tensors = dict(zip(TreeView.__annotations__, map(torch.from_numpy, arrays), strict=False))
         return TreeView(**tensors, states=states, batch_size=[self.num_roots])
 
 
-_OF_NODES = {
-    "node_visits": "visits",
-    "node_values": "value",
-    "raw_values": "raw_value",
-    "rewards": "reward",
-    "discounts": "discount",
-    "parents": "parent",
-    "parent_options": "option",
-    "siblings": "sibling",
-    "samples": "samples",
-    "twins": "twin",
-    "depths": "depth",
-    "base_steps": "base_steps",
-    "path_returns": "path_return",
-    "flags": "flags",
-}
-_OF_EDGES = {
-    "children": "child",
-    "children_visits": "visits",
-    "children_values": "value",
-    "children_priors": "prior",
-    "children_closed": "closed",
-}
+# Fields of the records in the order of the view's.
+_OF_NODES = (
+    *("visits", "value", "raw_value", "reward", "discount", "parent", "option", "sibling"),
+    *("samples", "twin", "depth", "base_steps", "path_return", "flags"),
+)
+_OF_EDGES = ("child", "visits", "value", "prior", "closed")

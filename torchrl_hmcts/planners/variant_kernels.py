@@ -1,4 +1,4 @@
-"""What the loops of ``kernels`` call for Gumbel, for chance and for transpositions."""
+"""What the loops of ``kernels`` call: checks of numbers, Gumbel, chance and transpositions."""
 
 # numba compiles these functions; it does not read annotations as strings.
 import math
@@ -7,7 +7,34 @@ import numba
 import numpy as np
 
 from torchrl_hmcts.compiling import njit
-from torchrl_hmcts.planners.tree import FORBIDDEN, MOST_SAMPLES
+from torchrl_hmcts.planners.tree import FORBIDDEN, LARGEST, MOST_SAMPLES
+
+GOOD, MISFIT = -1, -2  # what becomes of a wave's outcomes, if not the row of one that is bad
+
+
+@njit(error_model="numpy", _nrt=False)
+def first_bad(rewards, discounts, values, priors):
+    """The first outcome that is not finite, not below LARGEST or no probability, or GOOD."""
+    for i in range(rewards.shape[0]):
+        good = (abs(rewards[i]) < LARGEST) & (0.0 <= discounts[i]) & (discounts[i] <= 1.0)
+        if values.shape[0]:
+            good &= abs(values[i]) < LARGEST
+        if priors.shape[0]:
+            least, total = priors[i, 0], priors[i, 0]
+            for a in range(1, priors.shape[1]):
+                least = min(least, priors[i, a])
+                total += priors[i, a]
+            good &= (0.0 <= least) & (total < LARGEST)
+        if not good:
+            return i
+    return GOOD
+
+
+@numba.njit(forceinline=True, error_model="numpy", _nrt=False)
+def fits(rows, count, num_options):
+    """Whether there is a row for each outcome, or none for all."""
+    return (rows.shape[0] == count or rows.shape[0] == 0) and rows.shape[1] == num_options
+
 
 # ------------------------------------------------------------------------------------------ Gumbel
 
