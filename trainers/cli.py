@@ -155,19 +155,7 @@ _WORDS = {"list": "NAME", "report": "DIR|key=value", "completion": "SHELL"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit status.
-
-    Args:
-        argv: words after the program's name. Default: those of the process.
-
-    Returns:
-        0; 1 if something outside went wrong (a folder, missing data or packages); 2 if the words
-        were wrong; 130 after Ctrl-C; 143 after SIGTERM; 141 if whoever read the output has stopped.
-
-    Example:
-        >>> main(["demo", "sede=1"])
-        2
-    """
+    """Run the command line; return its exit status: 2 after wrong words, 1 after other errors."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # in a locale without UTF-8
     words = sys.argv[1:] if argv is None else argv

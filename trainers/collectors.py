@@ -44,17 +44,6 @@ class RestartingCollector:
 
     The batch that was under way is lost, and the episodes: new ones begin. All other attributes are
     those of the collector it has built last; ``num_restarts`` counts those after the first.
-
-    Args:
-        make: called with the base steps that are left and the number of deaths so far, it builds a
-            collector, with the weights in place.
-        died: called with the collector and what it raised, it tells whether a process of it died.
-            Anything else is raised as it is.
-        total_frames: base steps in all.
-
-    Raises:
-        CollectorError: when collecting, saving or sending weights, after four deaths with no batch
-            between them.
     """
 
     def __init__(
@@ -149,18 +138,6 @@ def make_ray_collector(
     there is none, one is started in this process and ended with the collector. The env is sent to
     the cluster as it is, each batch comes back, and the policy's weights go there after it. A
     process that dies is started again, see :class:`RestartingCollector`.
-
-    Args:
-        env: that is sent; it must be picklable.
-        policy: acts there with a copy of the weights.
-        frames_per_batch: steps of a batch, all collectors together.
-        total_frames: steps in all.
-        postproc: applied to every batch here. Default: none.
-        num_collectors: processes that collect. Default 1.
-        **collector_kwargs: of the ``Collector`` in each process.
-
-    Raises:
-        ModuleNotFoundError: if ray is not installed.
     """
     import ray
     from torchrl.collectors.distributed import RayCollector

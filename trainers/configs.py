@@ -145,21 +145,7 @@ _BASES = {"loss": LossConfig, "transform": TransformConfig, "env": EnvConfig}
 
 @functools.cache
 def config_of(component: type, base: type = ComponentConfig) -> Any:
-    """Make the config of a class from its signature.
-
-    Args:
-        component: class whose constructor is configured.
-        base: dataclass to inherit from. Default: :class:`ComponentConfig`.
-
-    Returns:
-        A dataclass. Its fields are the keywords of the constructor; a required one is ``MISSING``.
-
-    Example:
-        >>> from hydra.utils import instantiate
-        >>> from torchrl_hmcts.planners import UCT
-        >>> instantiate(config_of(UCT)(c=0.5))
-        UCT(c=0.5)
-    """
+    """Make the config of a class from its signature."""
     path = _public_path(component)
     hints = _hints(component)
     fields: list[Any] = [
@@ -250,18 +236,6 @@ def compose_parts(
 ) -> dict[str, dict[str, Any]]:
     """Compose components with Hydra; return them with all their keywords.
 
-    Args:
-        own: entries of the components at their defaults, by part, e.g. ``"planner"``.
-        words: ``PART=NAME`` and ``PART/GROUP=NAME`` choose a class, by its short name (``puct``) or
-            its own (``PUCT``), ``PART.KEY=VALUE`` a keyword.
-
-    Returns:
-        The components by part.
-
-    Raises:
-        ValueError: if there is no such part, name or keyword (the nearest are named), a value is
-            not of its type, or a keyword without a default is missing.
-
     Example:
         >>> own = {"planner": {"_component_": "torchrl_hmcts.planners.MCTSPlanner"}}
         >>> words = ["planner/tree_policy=puct", "planner.tree_policy.c=2.5"]
@@ -317,15 +291,7 @@ def _compose(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def full(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a component with the defaults of its class.
-
-    Args:
-        node: path of the class in ``"_component_"``, and keywords; nested ones too.
-
-    Example:
-        >>> full({"_component_": "torchrl_hmcts.planners.UCT"})
-        {'c': 1.0, '_component_': 'torchrl_hmcts.planners.UCT'}
-    """
+    """Return the entries of a component with the defaults of its class."""
     defaults: Any = OmegaConf.to_container(
         OmegaConf.structured(config_of(named(node["_component_"])))
     )

@@ -343,11 +343,6 @@ def worker_losses(
 ) -> tuple[type[LossModule], ...]:
     """Returns the losses that train a worker with such actions, the default first.
 
-    Args:
-        action_spec (TensorSpec): discrete, or bounded floats.
-        objective (SkillObjective, optional): what makes skills different. Default ``None``: DIAYN's
-            discriminator, which :class:`DIAYNLoss` builds its objective of.
-
     Examples:
         >>> from torchrl.data import Categorical
         >>> from torchrl_hmcts.trainers.diayn import worker_losses

@@ -94,16 +94,6 @@ class SearchCollector(LocalCollector):
 
     A frame is an example. What the searches of each iteration cost is in ``base_steps`` and
     ``simulations`` of options; ``solved`` counts those that found a plan.
-
-    Args:
-        env: the macro environment whose resets give the starts; batch size ``[]``.
-        first_planner: searches in iteration 0, before anything is learned.
-        planner: searches in the iterations after it.
-        iterations: batches to yield.
-        searches: starts per iteration.
-        keys: entries of the states that the network reads.
-        seed: of the starts: those of iteration i come from ``seed + i``.
-        example_kwargs: passed to :func:`~torchrl_hmcts.planners.search_examples`.
     """
 
     def __init__(

@@ -21,12 +21,6 @@ class ManagerNet(nn.Module):
     .. math:: l, v = f\bigl((x - \mu) / \sigma\bigr)
 
     Letters: F numbers of the entries side by side, A options.
-
-    Args:
-        mean, std: ``[F]``, of the states.
-        num_options: A.
-        bounded: whether values lie in (0, 1), as where there is one reward at the end.
-        hidden: widths of the hidden layers.
     """
 
     def __init__(
@@ -57,16 +51,7 @@ class ManagerNet(nn.Module):
 def make_manager(
     planner: MCTSPlanner, keys: Sequence[NestedKey], *, bounded: bool
 ) -> TensorDictModule:
-    """Build a manager network for a planner's states; :func:`scale_by` sets what it is scaled by.
-
-    Args:
-        planner: over the options.
-        keys: entries of its states that the network reads, each ``[F_i]``.
-        bounded: see :class:`ManagerNet`.
-
-    Returns:
-        A module that writes ``"logits"`` and ``"state_value"``.
-    """
+    """Build a manager network for a planner's states, of the entries ``keys``."""
     planner.simulator.keep(list(keys))
     spec = planner.simulator.env.full_observation_spec_unbatched
     size = sum(spec[key].shape.numel() for key in keys)
@@ -75,13 +60,7 @@ def make_manager(
 
 
 def scale_by(network: TensorDictModule, planner: MCTSPlanner, starts: TensorDictBase) -> None:
-    """Scale a manager network by the states that searches meet.
-
-    Args:
-        network: of :func:`make_manager`; changed in place.
-        planner: that searches.
-        starts: to search from, ``[M]``.
-    """
+    """Scale a manager network by the states that searches meet."""
     tree = planner.search(starts).tree
     assert tree.states is not None
     states = tree.states[torch.arange(tree.capacity) < torch.from_numpy(tree.num_nodes)[:, None]]
@@ -92,13 +71,7 @@ def scale_by(network: TensorDictModule, planner: MCTSPlanner, starts: TensorDict
 
 
 class ManagerPolicy(TensorDictModuleBase):
-    """Takes the option of the highest logit, without a search.
-
-    Args:
-        network: writes ``"logits"``.
-        option_key: entry that the option is written to.
-        mask_key: options that may be taken, where there is such an entry.
-    """
+    """Takes the option of the highest logit, without a search."""
 
     def __init__(
         self,

@@ -45,12 +45,7 @@ def site_target(page: str, target: str) -> str:
 
 
 def repository(root: Path) -> str:
-    """Return the public address of the repository, or "" where none is known.
-
-    Args:
-        root: with pyproject.toml, whose ``[project.urls] Repository`` is taken; where there is
-            none, the address of git's remote ``origin``.
-    """
+    """Return the public address of the repository, or "" where none is known."""
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = project.get("urls", {}).get("Repository", "")
     if named:
@@ -64,14 +59,7 @@ def repository(root: Path) -> str:
 
 
 def public_address(address: str) -> str:
-    """Return an address that everybody can open, or "".
-
-    Example:
-        >>> public_address("https://github.com/somebody/torchrl_hmcts.git")
-        'https://github.com/somebody/torchrl_hmcts'
-        >>> public_address("git@github.com:somebody/torchrl_hmcts.git")
-        ''
-    """
+    """Return an address that everybody can open, or ""."""
     parts = urlsplit(address)
     host = parts.hostname or ""
     hidden = parts.username is not None or parts.port is not None or "." not in host

@@ -88,12 +88,7 @@ def command_of(name: str, data: Any, listed: dict[str, str]) -> str:
 
 
 def page(results: Path = RESULTS, curves: dict[str, dict[str, str]] | None = None) -> str:
-    """Return the page, in Markdown; pictures are named relative to docs/auto_results.
-
-    Args:
-        results: folder of the data.
-        curves: pictures drawn for this page with their captions, by the file whose data they show.
-    """
+    """Return the page, in Markdown; pictures are named relative to docs/auto_results."""
     listed = commands((results / "README.md").read_text())
     parts, shown = [_HEAD, beside_the_source(results)], set()
     for heading, sections in {**SECTIONS, **_ATARI, "Reliability": RELIABILITY}.items():

@@ -42,12 +42,7 @@ def _is_figure(cell: str) -> bool:
 
 
 def number(value: Any) -> str:
-    """Return a number as people write it.
-
-    Example:
-        >>> number(40000), number(0.25), number(1598.0), number("a"), number(float("nan"))
-        ('40,000', '0.25', '1,598', 'a', '')
-    """
+    """Return a number as people write it."""
     if value is None or value != value:
         return ""
     if isinstance(value, bool) or not isinstance(value, (int, float)):

@@ -15,19 +15,7 @@ from torchrl_hmcts.trainers.a3c.actor_learner import COUNTERS
 
 
 class LearnerLog:
-    """The sums on the learners' board, and the curves that follow from them.
-
-    Example:
-        >>> columns = [*COUNTERS, "loss_critic"]
-        >>> log = LearnerLog(torch.zeros(2, len(columns), dtype=torch.float64), columns)
-        >>> log.start()
-        >>> log.board[:, 0] = torch.tensor([30.0, 10.0])  # frames
-        >>> log.board[:, 1] = torch.tensor([3.0, 1.0])  # updates
-        >>> log.board[:, -1] = torch.tensor([6.0, 4.0])  # sum of the loss
-        >>> values = log.log(lr=0.1)
-        >>> values["frames"], values["learner_1_frames"], values["loss_critic"]
-        (40, 10.0, 2.5)
-    """
+    """The sums on the learners' board, and the curves that follow from them."""
 
     def __init__(self, board: Tensor, columns: list[str], logger: Logger | None = None) -> None:
         self.board, self.columns, self.logger = board, columns, logger

@@ -23,19 +23,6 @@ def share_optimizer(optimizer: Optimizer) -> Optimizer:
     torch builds the state at the first step, so that each process would get one of its own. Here
     parameters and state stay what they were, but every process that receives the optimiser changes
     the same numbers when it steps. Learning rates and other settings stay each process's own.
-
-    Raises:
-        TypeError: if it is a kind whose state cannot be built beforehand.
-        ValueError: if a parameter is not on the CPU.
-        OSError: if there is too little shared memory.
-
-    Example:
-        >>> weight = torch.nn.Parameter(torch.ones(2))
-        >>> optimizer = share_optimizer(torch.optim.SGD([weight], lr=0.1, momentum=0.9))
-        >>> weight.is_shared(), optimizer.state[weight]["momentum_buffer"].is_shared()
-        (True, True)
-        >>> weight.tolist()
-        [1.0, 1.0]
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     elsewhere = {str(p.device) for p in parameters if p.device.type != "cpu"}

@@ -43,17 +43,7 @@ def completion(words: Sequence[str]) -> int:
 
 
 def candidates(words: Sequence[str]) -> list[str]:
-    """Return the words that may stand in place of the last one.
-
-    Args:
-        words: typed so far, without ``hmcts``; the last one may be incomplete.
-
-    Example:
-        >>> candidates(["tr"])[:2], candidates(["train", "experiment=l"])[0]
-        (['demo', 'train'], 'experiment=waterworld_goals')
-        >>> "seed=" in candidates(["train", "experiment=labmaze", ""])
-        True
-    """
+    """Return the words that may stand in place of the last one."""
     if len(words) < 2:
         return list(VERBS)
     verb, *rest = words

@@ -40,12 +40,7 @@ def summaries() -> str:
 
 
 def figures() -> str:
-    """Return the figures of the dissertation: what each shows there, and what ours is drawn from.
-
-    Example:
-        >>> print(figures().splitlines()[0])
-          3.1       Waterworld: a random maze with the player and the target
-    """
+    """Return the figures of the dissertation, and what ours are drawn from."""
     lines = []
     for figure in FIGURES.values():
         lines.append(f"  {figure.name:<9} {figure.shows}")

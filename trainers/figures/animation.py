@@ -35,14 +35,6 @@ def write_gif(
     """Write pictures as an endless GIF, and as a video beside it (``.mp4``, H.264).
 
     A video that cannot be written, e.g. without ffmpeg, is left out; a line on stderr says so.
-
-    Args:
-        frames: uint8 ``[height, width, 3]`` each. Where several in a row are the same, one is
-            written into the GIF that is shown as long as all of them.
-        path: GIF to write; the video has the same name.
-        milliseconds: for which a frame is shown.
-        last: milliseconds for which the last one is shown. Default: a second and a half; ``None``:
-            as long as the others.
     """
     kept, durations = [frames[0]], [0.0]
     for frame in frames:

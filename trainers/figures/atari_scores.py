@@ -89,12 +89,7 @@ TABLE_A_1 = {
 
 
 def best_baseline(game: str) -> tuple[str, float]:
-    """Return the best algorithm of Table A.1 in a game, and its mean score.
-
-    Example:
-        >>> best_baseline("Breakout")
-        ('deepq', 131.46)
-    """
+    """Return the best algorithm of Table A.1 in a game, and its mean score."""
     return max(((name, row[game]) for name, row in TABLE_A_1.items()), key=lambda pair: pair[1])
 
 
@@ -130,10 +125,6 @@ def human_normalised(row: Row, key: str) -> float:
 
     Reference:
         Mnih et al., "Human-level control through deep reinforcement learning", 2015.
-
-    Example:
-        >>> human_normalised({"game": "Pong", "score_max": 14.6}, "score_max")
-        1.0
     """
     human, random = HUMAN_AND_RANDOM[row["game"]]
     return float((row[key] - random) / (human - random))
@@ -148,12 +139,6 @@ def aggregate(scores: Sequence[Sequence[float]]) -> tuple[float, float, float]:
     Reference:
         Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
         2021, arXiv 2108.13264.
-
-    Example:
-        >>> aggregate([[1.0], [2.0], [3.0], [10.0]])
-        (2.5, 2.5, 2.5)
-        >>> aggregate([[1.0, 1.0, 1.0], [2.0], [3.0], [10.0]])
-        (2.5, 2.5, 2.5)
     """
     generator = np.random.default_rng(0)
     often = math.lcm(*map(len, scores))
@@ -169,13 +154,7 @@ def aggregate(scores: Sequence[Sequence[float]]) -> tuple[float, float, float]:
 
 
 def best_source(rows: Sequence[Row]) -> list[Row]:
-    """Return the runs of the source of options with the highest mean score of a run of a game.
-
-    Example:
-        >>> rows = [{"source": "goals", "score_mean": 3.0}, {"source": "repeat", "score_mean": 7.0}]
-        >>> best_source(rows) == rows[1:]
-        True
-    """
+    """Return the runs of the source of options with the highest mean score of a run of a game."""
     if not rows:
         return []
     winner = max(rows, key=lambda row: float(row.get("score_mean", float("-inf"))))

@@ -59,14 +59,7 @@ class RunGroup:
 
 
 def group_runs(runs: Sequence[RunFolder]) -> list[RunGroup]:
-    """Put runs that differ in their seeds only into groups, named by what sets them apart.
-
-    Example:
-        >>> configs = [{"seed": seed, "size": size} for size in (9, 15) for seed in (0, 1)]
-        >>> runs = [RunFolder(Path("x"), {"experiment": "x", "config": c}) for c in configs]
-        >>> [(group.name, len(group.runs)) for group in group_runs(runs)]
-        [('x, size=9', 2), ('x, size=15', 2)]
-    """
+    """Put runs that differ in their seeds only into groups, named by what sets them apart."""
     groups: dict[str, list[RunFolder]] = {}
     for run in runs:
         key = json.dumps([run.experiment, _compared(run)], sort_keys=True, default=str)

@@ -30,10 +30,6 @@ def common_steps(curves: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves to common steps, as far as all of them go.
 
     Returns the steps ``[G]`` of the curve that ends first, and values ``[S, G]`` at them.
-
-    Example:
-        >>> common_steps([([0, 10, 20], [0, 1, 2]), ([0, 20], [1, 3])])[1].mean(0).tolist()
-        [0.5, 1.5, 2.5]
     """
     if not curves:
         raise ValueError("common_steps needs the curve of one seed or more; got none.")
@@ -62,15 +58,7 @@ def says_something(steps: Sequence[float], values: Sequence[float]) -> bool:
 def draw_band(
     axes: Axes, curves: Sequence[Points], *, color: str, smooth: bool = False, **line: Any
 ) -> None:
-    """Draw the mean of several seeds' curves, and the band from the least to the largest.
-
-    Args:
-        axes: to draw in.
-        curves: one per seed.
-        color: of line and band.
-        smooth: draw the mean pale, and moving averages over a fortieth of its points above it.
-        **line: of ``axes.plot``.
-    """
+    """Draw the mean of several seeds' curves, and the band from the least to the largest."""
     steps, values = common_steps(curves)
     if smooth:
         axes.plot(steps, values.mean(0), color=_PALE, linewidth=0.8)
@@ -154,14 +142,6 @@ def plot_training(
     x_label: str = "training base steps",
 ) -> None:
     """Draw test curves of agents while they learn; bands go from the least to the largest seed.
-
-    Args:
-        runs: for each agent, the curves of its seeds: ``"training_steps"`` ascending, and the
-            entries of the panels, ``[P]`` each.
-        panels: from left to right.
-        path: PNG to write.
-        title: heading of the picture.
-        x_label: below each panel.
 
     Reference:
         Dissertation, figures 3.6 and 4.10.

@@ -65,12 +65,6 @@ def draw_goals(
 def plot_goals(env: WaterworldMazeEnv, start: TensorDictBase, track: Any, path: Path) -> None:
     """Draw an episode at its start, half way and at its end.
 
-    Args:
-        env: draws the maze.
-        start: first state of the episode, without batch dimensions.
-        track: the episode.
-        path: PNG to write.
-
     Reference:
         Dissertation, figure 3.5.
     """
@@ -95,18 +89,7 @@ def write_goal_gif(
     *,
     steps_per_frame: int = 2,
 ) -> None:
-    """Write an episode as a GIF at twice its real speed; goals vanish as they are met.
-
-    Args:
-        env: draws the frames.
-        start: first state of the episode, without batch dimensions.
-        track: the episode.
-        path: file to write.
-        steps_per_frame: base steps from one frame to the next.
-
-    Raises:
-        ValueError: if ``steps_per_frame`` is below 1.
-    """
+    """Write an episode as a GIF at twice its real speed; goals vanish as they are met."""
     steps = steps_to_show(len(track.positions) - 1, steps_per_frame)
     frames = [draw_goals(env, start, track, step) for step in steps]
     write_gif(frames, path, milliseconds=500.0 * env.TIME_STEP * steps_per_frame)

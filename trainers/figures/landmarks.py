@@ -16,13 +16,7 @@ _GREY, _PALE = "#71717a", "#d4d8e0"
 
 
 def plot_ways(model: LandmarkModel | EffectModel, ways: Sequence[np.ndarray], path: Path) -> None:
-    """Draw where options lead, and a way for each task.
-
-    Args:
-        model: of places, of which the first two numbers are drawn.
-        ways: places ``[steps, F]`` of each episode.
-        path: of the picture.
-    """
+    """Draw where options lead, and a way for each task."""
     places, longest = model.places.numpy()[:, :2], float("inf")
     jumps = np.zeros(len(places), np.bool_)
     figure = Figure(figsize=(7, 6), layout="constrained")

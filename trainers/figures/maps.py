@@ -35,23 +35,13 @@ Path2D = tuple[np.ndarray, np.ndarray]
 
 
 class MapDrawing(Protocol):
-    """Draws the states of an environment; what the pictures of a kit need of it.
-
-    Attributes:
-        env: whose states are drawn.
-        milliseconds: for which a base step is shown in a GIF.
-    """
+    """Draws the states of an environment; what the pictures of a kit need of it."""
 
     env: EnvBase
     milliseconds: float
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
-        """Draw what lies below the states of an episode, e.g. walls and goal.
-
-        Args:
-            axes: to draw in.
-            state: of the episode, without batch dimensions.
-        """
+        """Draw what lies below the states of an episode, e.g. walls and goal."""
 
     def points(self, states: TensorDictBase) -> Tensor:
         """Return where states ``[N]`` lie in such axes, ``[N, 2]``."""
@@ -172,18 +162,7 @@ _ROOMS = ("in an open room", "in a test maze")
 
 @dataclass
 class FeatureMap:
-    """Draws the states of an environment without a map: two of its features against each other.
-
-    Args:
-        env: whose states are drawn.
-        key: entry of the states with the features.
-        features: which two.
-        limits: ``(least, largest)`` of each, for the pictures of a GIF. Default: those of its
-            paths.
-        names: of the features.
-        is_place: whether both are lengths, drawn to one scale.
-        milliseconds: for which a base step is shown in a GIF.
-    """
+    """Draws the states of an environment without a map: two of its features against each other."""
 
     env: EnvBase
     key: Any = "observation"
@@ -235,14 +214,6 @@ def plot_skill_fan(
 ) -> None:
     """Draw the trajectories of each skill, one colour each, in a panel for each room.
 
-    Args:
-        policy: reads ``"skill"`` and what else it needs of the state, writes ``"action"``.
-        rooms: for each title a drawing, whose env is stepped, and the states in one place that the
-            mini-episodes begin in, as many for each skill, e.g. ``WaterworldMap(env).rooms(40)``.
-        path: PNG to write.
-        num_skills: Z.
-        steps: base steps of a mini-episode.
-
     Reference:
         Dissertation, figure 4.5: 10 mini-episodes of 100 frames for each policy.
     """
@@ -270,13 +241,6 @@ def plot_search(
 ) -> None:
     """Draw where the options of a search led on the map, and the tree; the plan stands out.
 
-    Args:
-        drawing: of the env that was searched.
-        search: a finished search that has kept its states.
-        path: PNG to write.
-        root: which of the search's roots.
-        option: what an option is called in the legend.
-
     Reference:
         Dissertation, figure 3.4.
     """
@@ -302,16 +266,7 @@ def write_episode_gif(
     *,
     steps_per_frame: int = 2,
 ) -> None:
-    """Write an episode as a GIF: the plan pale, the way so far in the colours of its options.
-
-    Args:
-        drawing: of the env.
-        states: the first, and that after each base step, ``[T + 1]``, without batch dimensions.
-        options: executed in each base step, ``[T]``.
-        plan: without batch dimensions.
-        path: file to write.
-        steps_per_frame: base steps from one picture to the next.
-    """
+    """Write an episode as a GIF: the plan pale, the way so far in the colours of its options."""
     length = int(plan.lengths)
     colors = _colors(plan.options[:length].tolist())
     planned = drawing.points(plan.states[: length + 1]).numpy()

@@ -49,15 +49,6 @@ def finish(
 
     What cannot be drawn or written is left out, with a line on stderr; the figures are printed
     where ``metrics.json`` cannot be written, e.g. to a full disk.
-
-    Args:
-        out: folder of the run.
-        title: heading of the page.
-        metrics: figures by name.
-        keys: default and meaning of the config's keys. Default: unknown.
-
-    Yields:
-        The pictures to draw.
     """
     written = False
     with left_out("metrics.json"):

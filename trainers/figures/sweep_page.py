@@ -66,10 +66,6 @@ def write_sweep_page(
 def best_words(rows: Sequence[Mapping[str, Any]], objective: str) -> str:
     """Say which trials of a sweep were best; several that are equal are all named.
 
-    Args:
-        rows: the trials, the best first.
-        objective: by which.
-
     Example:
         >>> rows = [{"trial": i, "value": v, "params": {"x": i}} for i, v in ((2, 9.0), (0, 9.0))]
         >>> print(best_words(rows, "solved"))

@@ -39,21 +39,7 @@ class _State:
 
 
 class Bar(tqdm):
-    """A progress bar; where stderr is no terminal, a line every ten seconds.
-
-    Args:
-        total: where it ends; None: unknown.
-        desc: what is done.
-        unit: what is counted, in the plural.
-        scale: units of a step, where steps are of something else.
-
-    Example:
-        >>> bar = Bar(10, desc="learn", unit="frames", scale=4)
-        >>> bar.update(5)
-        >>> bar.n, bar.total
-        (20, 40)
-        >>> bar.close()
-    """
+    """A progress bar; where stderr is no terminal, a line every ten seconds."""
 
     def __init__(
         self, total: int | None = None, *, desc: str = "", unit: str = "steps", scale: int = 1
@@ -113,11 +99,7 @@ class Bar(tqdm):
 
 
 def counted(desc: str, unit: str) -> Callable[[Sequence[Any]], Iterator[Any]]:
-    """Return what goes through a sequence with a bar.
-
-    Args:
-        desc, unit: as of :class:`Bar`.
-    """
+    """Return what goes through a sequence with a bar."""
 
     def through(steps: Sequence[Any]) -> Iterator[Any]:
         bar = Bar(len(steps), desc=desc, unit=unit)
@@ -143,26 +125,14 @@ def _is_known(value: Any) -> bool:
 
 
 def say(words: str, **_: Any) -> None:
-    """Print what begins now; :func:`alive` repeats it while it lasts.
-
-    Args:
-        words: a sentence.
-
-    Example:
-        >>> say("Drawing ...")
-        Drawing ...
-    """
+    """Print what begins now; :func:`alive` repeats it while it lasts."""
     _State.phase, _State.begun = words, time.monotonic()
     _State.spoken = _State.begun
     print(words, flush=True)
 
 
 def note(words: str) -> None:
-    """Print what has happened, above a bar.
-
-    Args:
-        words: a line.
-    """
+    """Print what has happened, above a bar."""
     tqdm.write(words, file=sys.stdout)
 
 
@@ -196,12 +166,7 @@ def alive() -> Iterator[None]:
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
-    """Return names and values as lines of two columns; a number of nothing, NaN, is a dash.
-
-    Example:
-        >>> print(table([("mazes solved", "99 of 100")]))
-          mazes solved                                     99 of 100
-    """
+    """Return names and values as lines of two columns; a number of nothing, NaN, is a dash."""
     shown = [
         (name[:_NAME_WIDTH], "-" if value.startswith("nan") else value) for name, value in rows
     ]

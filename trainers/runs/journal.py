@@ -23,18 +23,6 @@ class CheckedJournal(JournalFileBackend):
 
     A last line that a killed process has written half is cut off, and a line on stderr says so; the
     journal as it was is kept beside it, as ``journal.log.damaged``.
-
-    Args:
-        path: of the file; older ones without checksums are read too.
-
-    Raises:
-        ValueError: if another line is damaged.
-
-    Example:
-        >>> journal = CheckedJournal("journal.log")
-        >>> journal.append_logs([{"op_code": 0}])
-        >>> list(CheckedJournal("journal.log").read_logs(0))
-        [{'op_code': 0}]
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -46,19 +34,11 @@ class CheckedJournal(JournalFileBackend):
             self._lock.release()
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Append lines, each with its checksum.
-
-        Args:
-            logs: of Optuna.
-        """
+        """Append lines, each with its checksum."""
         super().append_logs([{**log, _CHECKSUM: digest(log)} for log in logs])
 
     def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:  # type: ignore[override]
-        """Return the lines from a number on.
-
-        Args:
-            log_number_from: the first.
-        """
+        """Return the lines from a number on."""
         for log in super().read_logs(log_number_from):
             log.pop(_CHECKSUM, None)
             yield log

@@ -49,18 +49,7 @@ class FolderRefused(ExperimentError):
 
 @dataclass
 class Run:
-    """A run that has its folder to itself.
-
-    Args:
-        config: of the experiment, with the folder in ``out``.
-        experiment: its name.
-        resumes: whether there is a checkpoint to continue from, and it was asked for.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.runs.config import RunConfig
-        >>> Run(RunConfig(out="runs/my run"), "demo").resume_command
-        "hmcts train 'resume=runs/my run'"
-    """
+    """A run that has its folder to itself."""
 
     config: Any
     experiment: str
@@ -84,12 +73,7 @@ class Run:
     def write_curves(
         self, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], steps: str
     ) -> None:
-        """Write ``curves.csv``, a value a row: name, step, value.
-
-        Args:
-            curves: steps and values by name.
-            steps: name of the column of the steps, which tells their unit, e.g. ``"base_steps"``.
-        """
+        """Write ``curves.csv``, a value a row: name, step, value."""
         rows = [
             (name, int(step), value)
             for name, (x, y) in curves.items()
@@ -105,14 +89,6 @@ class Run:
         """Write ``metrics.json``, note that the run is finished, then pictures and the page.
 
         What cannot be drawn or written is left out, with a line on stderr.
-
-        Args:
-            metrics: its figures; the configuration and the versions are added to them.
-            config: as it was run. Default: that of the run.
-            title: heading of the page.
-
-        Yields:
-            The pictures to draw.
         """
         from torchrl_hmcts.trainers.figures.run_page import finish
 
@@ -136,19 +112,6 @@ def open_run(
     missing, a folder in use, one that holds a run (unless ``config`` says ``resume`` or
     ``overwrite``), a run with other settings to resume. A run that is open already, with this very
     configuration, stays the same run: the command line opens it for the function of an experiment.
-
-    Args:
-        config: of the experiment; ``out`` is the folder.
-        experiment: its name. Default: that of the configuration's class.
-        command: words of the command line, for the record.
-        fresh: take the first of ``out``, ``out_2``, ``out_3``, ... that holds nothing.
-
-    Raises:
-        FolderRefused: if the folder holds what would be lost, or nothing to resume.
-        FolderInUse: if another process writes to it.
-        ModuleNotFoundError: if a package is missing.
-        ExperimentError: if an input is missing.
-        OSError: if the folder cannot be made or written to.
     """
     outer = _current.get()
     if outer is not None and outer.config is config:
@@ -206,12 +169,7 @@ def _take(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool
 
 
 def free_folder(config: Any, experiment: str) -> str:
-    """Return the first of ``out``, ``out_2``, ... in which a run loses nothing.
-
-    Args:
-        config: of the run.
-        experiment: its name.
-    """
+    """Return the first of ``out``, ``out_2``, ... in which a run loses nothing."""
     for out in _names(config.out):
         try:
             check_folder(dataclasses.replace(config, out=out), experiment)
@@ -229,9 +187,6 @@ def _names(base: str) -> Iterator[str]:
 def next_free(out: str) -> str:
     """Return the first of ``out``, ``out_2``, ``out_3``, ... that does not exist or is empty.
 
-    Args:
-        out: folder.
-
     Example:
         >>> next_free("runs/none_there")
         'runs/none_there'
@@ -241,12 +196,7 @@ def next_free(out: str) -> str:
 
 
 def check_folder(config: Any, experiment: str) -> None:
-    """Refuse a folder in which a run of this configuration would lose or mix up something.
-
-    Args:
-        config: of the run; its folder is ``out``.
-        experiment: its name.
-    """
+    """Refuse a folder in which a run of this configuration would lose or mix up something."""
     path = Path(config.out)
     if path.exists() and not path.is_dir():
         raise FolderRefused(
@@ -320,9 +270,6 @@ def _check_resumable(config: Any, experiment: str) -> None:
 def run_files(path: Path) -> list[str]:
     """Return the names in a folder that a run or a sweep would write.
 
-    Args:
-        path: folder; need not exist.
-
     Example:
         >>> run_files(Path("nowhere"))
         []
@@ -356,9 +303,6 @@ def _clear(path: Path) -> None:
 
 def resume_command(out: str | Path) -> str:
     """Return the command that continues a run exactly, as it can be pasted into a shell.
-
-    Args:
-        out: folder of the run.
 
     Example:
         >>> resume_command("runs/one"), resume_command("true")

@@ -46,24 +46,7 @@ class Pruned(optuna.TrialPruned):
 
 
 def parse_space(config_class: type, words: Sequence[str]) -> tuple[Space, list[str]]:
-    """Take the keys that are varied out of the words of a sweep.
-
-    Args:
-        config_class: of the experiment.
-        words: ``key=[a,b]``, ``key=low..high``, ``key=low..high:log``, ``key=low..high:step``, or
-            ``key=value``, which is the same in all trials.
-
-    Returns:
-        What is varied, as Optuna's distributions, and the words of the rest.
-
-    Raises:
-        ValueError: if a key is given twice, or its values are not of its type.
-
-    Example:
-        >>> space, fixed = parse_space(RunConfig, ["seed=[3,4]", "out=x"])
-        >>> space["seed"].choices, fixed
-        ((3, 4), ['out=x'])
-    """
+    """Take the keys that are varied out of the words of a sweep."""
     types = key_kinds(config_class)
     space: Space = {}
     fixed = []
@@ -116,22 +99,7 @@ def _range(key: str, value: str, kind: str) -> Int | Float:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep: which experiment, what varies, what is improved, where it is kept.
-
-    Args:
-        name: of the experiment.
-        run: runs it with a configuration, and returns its figures.
-        config: values of the keys that do not vary; ``out`` is the folder of the sweep.
-        space: what varies.
-        objective: figure of ``metrics.json``, nested names joined by dots; with a minus before
-            it, less is better.
-        progress: logged value by which trials are given up. Default: none are.
-        storage: URL of an Optuna storage that several machines may share. Default: a journal file
-            in the folder.
-
-    Raises:
-        ValueError: if nothing varies.
-    """
+    """A sweep: which experiment, what varies, what is improved, where it is kept."""
 
     name: str
     run: Callable[[Any], Mapping[str, Any]]
@@ -153,12 +121,7 @@ class Sweep:
         return Path(self.config.out)
 
     def study(self) -> optuna.Study:
-        """Return the study, with the trials so far.
-
-        Raises:
-            ValueError: if the storage has a sweep of another space or objective under this name, or
-                the folder holds something else.
-        """
+        """Return the study, with the trials so far."""
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"out={self.folder} is a file; name a folder.")
         there = run_files(self.folder)
@@ -227,10 +190,6 @@ class Sweep:
         """Run trials until so many are finished, those of earlier calls included.
 
         A trial that was stopped, or whose process died, is continued first.
-
-        Args:
-            trials: finished ones in all.
-            ended: called after each trial.
         """
         study = self.study()
         self._take_up(study)
@@ -312,13 +271,6 @@ def _suggest(trial: optuna.Trial, key: str, space: BaseDistribution) -> Any:
 def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
     """Return a figure of a run by name; not a number counts as the worst there is.
 
-    Args:
-        metrics: of the run.
-        objective: name, nested ones joined by dots, perhaps with a minus before it.
-
-    Raises:
-        ValueError: if there is none of that name.
-
     Example:
         >>> figure_of({"test": {"frames": {"mean": 261.0}}}, "-test.frames.mean")
         261.0
@@ -344,11 +296,7 @@ def _numbers(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, fl
 
 
 def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
-    """Return the trials of a study as plain values, the best first.
-
-    Args:
-        study: of a sweep.
-    """
+    """Return the trials of a study as plain values, the best first."""
     sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
     states = {TrialState.PRUNED: "given up", TrialState.RUNNING: "running or interrupted"}
     rows = []
@@ -371,9 +319,6 @@ def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
 
 def importances(study: optuna.Study) -> dict[str, float]:
     """Return how much of what sets the best trials apart lies in each key; they sum to 1.
-
-    Args:
-        study: of a sweep; empty with fewer than four trials, or if all gave the same.
 
     Reference:
         Watanabe et al., "PED-ANOVA", 2023, arXiv 2304.10255.

@@ -46,19 +46,6 @@ def folder_locked(
 
     The lock is the operating system's (``flock``): it vanishes with the process, however that ends,
     and children do not inherit it. Where a file system has no such locks, a line on stderr says so.
-
-    Args:
-        folder: that exists.
-        name: of the lock's file.
-        wait: wait for the other's end instead of refusing; for what takes a moment.
-
-    Raises:
-        FolderInUse: if another holds it.
-
-    Example:
-        >>> with folder_locked("."):
-        ...     is_locked(".")
-        True
     """
     path = Path(folder, name)
     handle = _take(path, wait)

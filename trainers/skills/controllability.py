@@ -86,16 +86,7 @@ class Controllability:
 
 
 def random_states(pool: Any, count: int, seed: int) -> TensorDictBase:
-    """Return states on the way of random options, of as many episodes as it takes.
-
-    Args:
-        pool: of options, e.g. an :class:`OptionPool`.
-        count: of the states.
-        seed: of the options.
-
-    Returns:
-        The states ``[count]``, without rewards and flags.
-    """
+    """Return states on the way of random options, of as many episodes as it takes."""
     generator = torch.Generator().manual_seed(seed)
     states: list[TensorDictBase] = []
     td = pool.reset(TensorDict(batch_size=[1]))

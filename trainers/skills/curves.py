@@ -40,12 +40,7 @@ def log_curves(optim_steps: int, average_losses: TensorDictBase | None) -> dict[
 
 
 class Curves(dict[str, list[float]]):
-    """Curves by their names; the loss's own names find them as well.
-
-    Example:
-        >>> Curves(actor_loss=[0.5])["loss_actor"]
-        [0.5]
-    """
+    """Curves by their names; the loss's own names find them as well."""
 
     def __missing__(self, key: str) -> list[float]:
         name = curve_name(key)
