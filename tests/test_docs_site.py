@@ -261,9 +261,9 @@ class TestResultsPage:
         (tmp_path / "README.md").write_text("| `skills/training_speed.json` | `run it` |\n")
         (tmp_path / "skills").mkdir()
         (tmp_path / "skills" / "training_speed.json").write_text(
-            '{"runs": [{"seed": 7, "steps_per_second": {"ours": 1234.4, "theirs": 99.0}}]}'
+            '{"runs": [{"seed": 7, "ratio": 0.5, "steps_per_second": {"DIAYNTrainer": 1234.4}}]}'
         )
         page = module.page(tmp_path)
-        assert "| base steps per CPU second | seeds 7 |" in page
-        assert "| ours | 1,234 |" in page
+        assert "| seed | ratio | DIAYNTrainer |" in page
+        assert "| 7 | 0.5 | 1,234 |" in page
         assert "`run it`" in page
