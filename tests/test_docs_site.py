@@ -264,6 +264,6 @@ class TestResultsPage:
             '{"runs": [{"seed": 7, "ratio": 0.5, "steps_per_second": {"DIAYNTrainer": 1234.4}}]}'
         )
         page = module.page(tmp_path)
-        assert "| seed | ratio | DIAYNTrainer |" in page
+        assert "| seed | ratio | steps per second DIAYNTrainer |" in page
         assert "| 7 | 0.5 | 1,234 |" in page
         assert "`run it`" in page

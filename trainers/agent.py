@@ -193,10 +193,7 @@ class HMCTS:
         Args:
             base_steps: of training. Default: 50,000, or what the kit names.
             progress: show a bar; False prints nothing.
-            save_dir: folder of checkpoints. Default: none.
-
-        Raises:
-            ValueError: if the agent is none of a Gymnasium env.
+            save_dir: folder of checkpoints.
         """
         if not isinstance(self._asked, GymConfig):
             raise ValueError(
@@ -229,15 +226,9 @@ class HMCTS:
 
         Args:
             searches: of each iteration.
-            iterations: Default 2.
+            iterations: in all.
             updates: of the network, in each iteration.
             progress: show a bar; False prints nothing.
-
-        Returns:
-            The agent.
-
-        Raises:
-            ValueError: if the planner sees nothing but a snapshot of the state.
 
         Reference:
             Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search",
@@ -305,14 +296,7 @@ class HMCTS:
         )
 
     def start(self, seed: int) -> TensorDictBase:
-        """Begin an episode that depends on nothing but its seed.
-
-        Args:
-            seed: of the start, and of all that is drawn from then on.
-
-        Returns:
-            The state to start from, ``[1]``.
-        """
+        """Begin an episode that depends on nothing but its seed; return its first state ``[1]``."""
         own, seed = self.config, whole_number("HMCTS", "seed", seed)
         with torch.random.fork_rng(devices=[]):  # TorchRL seeds its global generator, too
             self.env.set_seed(seed)
@@ -332,13 +316,6 @@ class HMCTS:
         Args:
             folder: made if absent; ``hmcts play run=FOLDER`` shows the agent.
             overwrite: replace the agent or the run that is in the folder.
-
-        Returns:
-            The folder.
-
-        Raises:
-            ValueError: if the env is a function, which cannot be written, or the folder holds an
-                agent or a run already.
         """
         if isinstance(self.kit, GymKit) and not self.kit.config.id:
             raise ValueError(

@@ -75,11 +75,10 @@ class SharedRMSprop(Optimizer):
 
     Args:
         params (iterable): parameters, or groups of them; moved to shared memory.
-        lr (float): :math:`\eta`. Default 7e-4.
-        alpha (float): memory of the mean, in ``[0, 1)``. Default 0.99, the paper's.
-        eps (float): :math:`\epsilon > 0`, in units of squared gradients. Default 1e-5; the paper's
-            0.1 goes with gradients summed over a segment.
-        weight_decay (float): added to the gradient times the parameter. Default 0.
+        lr, alpha (float): :math:`\eta`, and the memory of the mean, in ``[0, 1)``, the paper's.
+        eps (float): :math:`\epsilon > 0`, in units of squared gradients; the paper's 0.1 goes with
+            gradients summed over a segment.
+        weight_decay (float): added to the gradient times the parameter.
 
     Raises:
         TypeError: if ``params`` is no list of parameters, or a setting is no number.
@@ -125,11 +124,7 @@ class SharedRMSprop(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Changes the parameters by their gradients.
-
-        Args:
-            closure (callable, optional): computes the loss again, with gradients, and returns it.
-        """
+        """Changes the parameters by their gradients."""
         loss = None
         if closure is not None:
             with torch.enable_grad():

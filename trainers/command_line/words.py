@@ -161,12 +161,3 @@ def no_bare_words(words: Sequence[str], folder: str = "") -> None:
         if near:
             key = "experiment" if near[0] in EXPERIMENTS else "kit"
             raise ValueError(f"{word!r} is no key=value. Did you mean {key}={near[0]}?")
-
-
-def folders_of(words: Sequence[str], own: Sequence[str]) -> list[str]:
-    """Return words as folders, none of which may be a key."""
-    for word in words:
-        key, separator, _ = word.partition("=")
-        if separator and not os.path.isdir(home(word)):
-            raise ValueError(unknown_key(key, [*own, "log_level"]))
-    return [home(word) for word in words]

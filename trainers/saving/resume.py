@@ -42,21 +42,17 @@ class ResumableTrainer(Trainer):
     written so that a crash cannot damage one (:class:`DurableRotation`), and read without pickle.
 
     Ctrl-C and SIGTERM stop a training after the batch under way, which is saved; then
-    ``KeyboardInterrupt`` is raised. A second Ctrl-C, a second later or more, stops it at once. One
-    trainer at a time writes to a ``save_dir``.
+    ``KeyboardInterrupt`` is raised. A second Ctrl-C, a second later or more, stops it at once.
 
     Args:
         save_dir (path, optional): folder of the checkpoints; one is written after 5 seconds of
             training, whenever ``save_trainer_interval`` base steps or a minute have passed, and at
-            the end. Default ``None``: no checkpoints.
-        keep_last (int): checkpoints kept. Default ``2``.
-        overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
-            once this run has written one. Default ``False``: ``train()`` refuses such a folder.
+            the end. One trainer at a time writes to it.
+        keep_last, overwrite: see :class:`DurableRotation`.
         **trainer_kwargs: passed to ``torchrl.trainers.Trainer``.
 
     Attributes:
-        run_settings (dict): values that a run must keep when it continues, by name (JSON). They are
-            written into its checkpoints; :meth:`load` refuses others.
+        run_settings (dict): values that a run must keep when it continues, by name (JSON).
 
     Raises:
         ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
@@ -157,17 +153,13 @@ class ResumableTrainer(Trainer):
             path (path): a checkpoint, or a folder of checkpoints (``save_dir``), of which the
                 newest whole one is taken.
             new_episodes (bool, optional): leave the episodes that were under way out, and begin
-                new ones. Default ``None``: only in an env that cannot be set to a state (e.g.
-                ``GymEnv``), and a line on stderr says so; all else continues exactly. False:
-                refuse such an env.
-
-        Returns:
-            ResumableTrainer: itself.
+                new ones. Default: only in an env that cannot be set to a state (e.g. ``GymEnv``),
+                and a line on stderr says so. False: refuse such an env.
 
         Raises:
             FileNotFoundError: if there is no checkpoint.
-            CheckpointError: if the checkpoint is damaged, of a newer version or of other settings,
-                or does not fit, e.g. another number of copies.
+            CheckpointError: if it is damaged, of a newer version or of other settings, or does not
+                fit.
         """
         found = newest_checkpoint(path)
         check_settings(found, self.run_settings)
@@ -189,14 +181,7 @@ class ResumableTrainer(Trainer):
         return count
 
     def train(self) -> None:
-        """Train until ``total_frames`` are collected.
-
-        Raises:
-            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
-            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
-                unless ``overwrite`` is true.
-            FolderInUse: if another run writes to ``save_dir``.
-        """
+        """Train until ``total_frames`` are collected."""
         if isinstance(self.checkpoint_rotation, DurableRotation):
             self.checkpoint_rotation.begin()
         self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
@@ -215,11 +200,7 @@ class ResumableTrainer(Trainer):
                 raise
 
     def save_trainer(self, force_save: bool = False) -> None:
-        """Write a checkpoint if one is due; stops here if a signal has asked for it.
-
-        Args:
-            force_save: write one in any case.
-        """
+        """Write a checkpoint if one is due; stops here if a signal has asked for it."""
         due = stop_asked() or time.monotonic() >= self._save_at
         super().save_trainer(force_save or due)
         raise_if_asked()
@@ -231,11 +212,7 @@ class ResumableTrainer(Trainer):
         self._save_at = time.monotonic() + SAVE_SECONDS
 
     def compute_loss(self, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Return the losses of a batch.
-
-        Raises:
-            FloatingPointError: if one is not finite; nothing has been changed by it.
-        """
+        """Return the losses of a batch; one that is not finite is refused."""
         losses = super().compute_loss(sub_batch)
         for name in losses.keys():
             if name.startswith("loss") and not math.isfinite(losses.get(name).detach().sum()):

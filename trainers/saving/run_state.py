@@ -27,18 +27,16 @@ Generator = torch.Generator | np.random.Generator | random.Random
 class RunningEpisodes:
     """State of the episodes that a collector is in the middle of.
 
-    A collector's own state dict lacks the tensordict from which it takes its next step, so that a
-    resumed run would begin new episodes. This adds it. The env's whole state must be in the
-    tensordict: ``_supports_set_state`` is True or ``batch_locked`` False, as in
-    ``torchrl_hmcts.envs``. In other envs, e.g. ``GymEnv``, new episodes begin on loading.
+    A collector's own state dict lacks the tensordict from which it takes its next step. The env's
+    whole state must be in it, as in ``torchrl_hmcts.envs``; in other envs, e.g. ``GymEnv``, new
+    episodes begin on loading.
 
     Args:
         collector (Collector): single-process collector.
 
     Attributes:
-        new_episodes (bool, optional): whether loading leaves the saved episodes out and begins new
-            ones. Default ``None``: only where the env cannot be set to their states; a line on
-            stderr says so.
+        new_episodes (bool, optional): whether loading begins new episodes. Default: only where the
+            env cannot be set to the saved states; a line on stderr says so.
 
     Raises:
         TypeError: if the collector runs its envs in other processes.
@@ -84,12 +82,7 @@ class RunningEpisodes:
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Let the collector continue the episodes that :meth:`state_dict` returned.
-
-        Raises:
-            ValueError: if the env has another batch size; or if it cannot be set to a state and
-                ``new_episodes`` is False.
-        """
+        """Let the collector continue the episodes that :meth:`state_dict` returned."""
         env = getattr(self.collector.env, "base_env", self.collector.env)
         if self.new_episodes or (self.new_episodes is None and not self.complete):
             if self.new_episodes is None:
@@ -158,10 +151,7 @@ class GeneratorStates:
         self.generators()
 
     def generators(self) -> dict[str, Generator]:
-        """Return the generators by their path, e.g. ``"env._generator"``.
-
-        Those of an env that was closed since, as a ``SerialEnv`` is when a collector ends, too.
-        """
+        """Return the generators by their path, e.g. ``"env._generator"``, also of closed envs."""
         seen: set[int] = set()
         for name, owner in self.owners.items():
             self._known.update(_find(name, owner, seen, True))
