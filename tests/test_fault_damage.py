@@ -194,7 +194,7 @@ def atari_trials(folder: Path) -> Kind:
 
 def run_record(folder: Path) -> Kind:
     config = DemoConfig(seed=3, out=str(folder))
-    start_record("demo", config, ["hmcts", "demo", "seed=3"], {"versions": {"torch": "2"}})
+    start_record("demo", config, ["hmcts", "demo", "seed=3"])
     return folder / "run.json", lambda: vars(load_config(read_run(folder))[1])
 
 

@@ -18,8 +18,9 @@ from torchrl.record.loggers import CSVLogger, Logger
 
 from torchrl_hmcts.trainers import cli
 from torchrl_hmcts.trainers.figures.animation import write_gif
-from torchrl_hmcts.trainers.figures.run_page import finish
+from torchrl_hmcts.trainers.runs.config import RunConfig
 from torchrl_hmcts.trainers.runs.loggers import ScalarLoggers
+from torchrl_hmcts.trainers.runs.run import Run
 from torchrl_hmcts.trainers.saving import files
 from torchrl_hmcts.trainers.saving.files import left_out, replacing, write_text
 
@@ -71,7 +72,8 @@ class TestVideo:
 
 class TestPageAtTheEnd:
     def end(self, out: Path, draw: Callable[[Path], Any]) -> str:
-        with finish(out, "A run", METRICS) as pictures:
+        run = Run(RunConfig(out=str(out)), "demo")
+        with run.finish(dict(METRICS), title="A run") as pictures:
             for name in ("one.png", "two.png"):
                 with pictures.one(name, name) as path:
                     if name == "one.png":

@@ -207,11 +207,9 @@ def evaluate(words: Sequence[str]) -> int:
         "versions": versions(),
         "machine": machine(),
     }
-    written = False
-    with left_out("evaluation.json"):
+    with left_out("evaluation.json") as missing:
         print(f"Figures: {add_evaluation(run.path, evaluation)}")
-        written = True
-    if not written:
+    if missing:
         print(json.dumps(finite(results), indent=1))
     with left_out("index.html"):
         from torchrl_hmcts.trainers.figures.run_page import write_run_page

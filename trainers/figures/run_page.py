@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ from torchrl_hmcts.trainers.figures.pages import (
     plain,
     write_sections,
 )
-from torchrl_hmcts.trainers.figures.pictures import Pictures, refuse_foreign
+from torchrl_hmcts.trainers.figures.pictures import refuse_foreign
 from torchrl_hmcts.trainers.saving.files import left_out, write_json
 from torchrl_hmcts.trainers.saving.run_folder import (
     RunCurve,
@@ -39,30 +37,6 @@ _DECIDING = (  # the first of these that a run has
 
 Keys = Mapping[str, tuple[Any, str]]
 """Default and meaning of each key of an experiment."""
-
-
-@contextlib.contextmanager
-def finish(
-    out: Path, title: str, metrics: Mapping[str, Any], keys: Keys | None = None
-) -> Iterator[Pictures]:
-    """Write what a run leaves: ``metrics.json`` first, then pictures, then the page.
-
-    What cannot be drawn or written is left out, with a line on stderr; the figures are printed
-    where ``metrics.json`` cannot be written, e.g. to a full disk.
-    """
-    written = False
-    with left_out("metrics.json"):
-        write_json(out / "metrics.json", metrics)
-        written = True
-    if not written:
-        print(json.dumps(metrics, indent=1, default=str))
-    pictures = Pictures(out)
-    with left_out("what was still to be drawn"):
-        yield pictures
-    with left_out("index.html"):
-        file = out / "index.html"
-        write_page(file, title=title, metrics=metrics, pictures=pictures.captions, keys=keys)
-        print(f"Pictures and figures: {file}")
 
 
 def write_page(

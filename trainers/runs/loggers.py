@@ -82,11 +82,9 @@ class ScalarLoggers(Logger):
     def _each(self, act: Callable[[Logger], None]) -> None:
         """Do something with every logger; one that fails, e.g. on a full disk, gets no more."""
         for logger in list(self.loggers):
-            failed = True
-            with left_out(f"what {type(logger).__name__} still had to log"):
+            with left_out(f"what {type(logger).__name__} still had to log") as missing:
                 act(logger)
-                failed = False
-            if failed:
+            if missing:
                 self.loggers.remove(logger)
                 with contextlib.suppress(Exception):  # what it could not write, it cannot now
                     _close(logger)

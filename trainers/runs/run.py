@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
@@ -17,12 +18,11 @@ from typing import Any
 
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError, config_keys
-from torchrl_hmcts.trainers.saving.files import left_out, remove, write_csv
+from torchrl_hmcts.trainers.saving.files import left_out, remove, write_csv, write_json
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
     end_record,
-    machine,
     read_run,
     start_record,
     versions,
@@ -88,15 +88,26 @@ class Run:
     ) -> Iterator[Pictures]:
         """Write ``metrics.json``, note that the run is finished, then pictures and the page.
 
-        What cannot be drawn or written is left out, with a line on stderr.
+        What cannot be drawn or written is left out, with a line on stderr; figures that cannot be
+        written, e.g. to a full disk, are printed. ``config`` is what was run, if not that of the
+        run.
         """
-        from torchrl_hmcts.trainers.figures.run_page import finish
-
         metrics.setdefault("config", dataclasses.asdict(self.config if config is None else config))
         metrics.setdefault("versions", versions())
-        with finish(self.path, title, metrics, config_keys(type(self.config))) as pictures:
+        with left_out("metrics.json") as missing:
+            write_json(self.path / "metrics.json", metrics)
+        if missing:
+            print(json.dumps(metrics, indent=1, default=str))
+        pictures = Pictures(self.path)
+        with left_out("what was still to be drawn"):
             end_record(self.path, "finished")
             yield pictures
+        with left_out("index.html"):
+            from torchrl_hmcts.trainers.figures.run_page import write_page
+
+            file, keys = self.path / "index.html", config_keys(type(self.config))
+            write_page(file, title=title, metrics=metrics, pictures=pictures.captions, keys=keys)
+            print(f"Pictures and figures: {file}")
 
 
 _current: ContextVar[Run | None] = ContextVar("run", default=None)
@@ -124,7 +135,7 @@ def open_run(
         run = Run(config, name, config.resume and _has_checkpoint(config.out))
         if config.overwrite:
             _clear(run.path)
-        start_record(name, config, command, {"versions": versions(), "machine": machine()})
+        start_record(name, config, command)
         token = _current.set(run)
         stack.callback(_current.reset, token)
         stack.enter_context(signals_handled())

@@ -31,7 +31,7 @@ from torchrl_hmcts.trainers.runs.config import (
 from torchrl_hmcts.trainers.runs.journal import CheckedJournal
 from torchrl_hmcts.trainers.runs.loggers import observed
 from torchrl_hmcts.trainers.runs.run import next_free, open_run, run_files
-from torchrl_hmcts.trainers.saving.run_folder import read_run
+from torchrl_hmcts.trainers.saving.run_folder import flat, read_run
 
 Space = dict[str, BaseDistribution]
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -82,19 +82,16 @@ def _range(key: str, value: str, kind: str) -> Int | Float:
             f"{key}={value} is no range of {kinds}, e.g. {key}=1..10, {key}=1..10:log or "
             f"{key}=1..10:2 (in steps of 2)."
         ) from None
-    if not (math.isfinite(low) and math.isfinite(high)):
-        raise ValueError(f"{key}={value} needs two finite ends.")
-    if not low < high:
-        raise ValueError(f"{key}={value} is an empty range.")
-    if how == "log" and not low > 0:
-        raise ValueError(f"{key}={value} needs a lower end above 0.")
-    if step is not None and not 0 < step <= high - low:
-        raise ValueError(f"{key}={value} cannot be walked in steps of {step}.")
+    if not (low < high and math.isfinite(high - low)) or (step is not None and step > high - low):
+        raise ValueError(f"{key}={value} leaves nothing to choose.")
     if key == "seed":
         RunConfig(seed=low), RunConfig(seed=high)  # raise
-    if kind == "int":
-        return Int(low, high, log=how == "log", step=step or 1)
-    return Float(low, high, log=how == "log", step=step)
+    try:
+        if kind == "int":
+            return Int(low, high, log=how == "log", step=1 if step is None else step)
+        return Float(low, high, log=how == "log", step=step)
+    except ValueError as error:  # of Optuna, e.g. a logarithm of 0
+        raise ValueError(f"{key}={value}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -269,13 +266,12 @@ def _suggest(trial: optuna.Trial, key: str, space: BaseDistribution) -> Any:
 
 
 def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
-    """Return a figure of a run by name; not a number counts as the worst there is.
-
-    Example:
-        >>> figure_of({"test": {"frames": {"mean": 261.0}}}, "-test.frames.mean")
-        261.0
-    """
-    numbers = dict(_numbers(metrics))
+    """Return a figure of a run by name; not a number counts as the worst there is."""
+    numbers = {
+        name: float(value)
+        for name, value in flat(metrics)
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
     value = numbers.get(objective.removeprefix("-"))
     if value is None:
         raise ValueError(
@@ -283,16 +279,6 @@ def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
         )
     worst = math.inf if objective.startswith("-") else -math.inf
     return value if math.isfinite(value) else worst
-
-
-def _numbers(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, float]]:
-    rows: list[tuple[str, float]] = []
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            rows += _numbers(value, f"{prefix}{name}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            rows.append((prefix + name, float(value)))
-    return rows
 
 
 def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ import shutil
 import sys
 import tempfile
 import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ import torch
 from torchrl.checkpoint import (
     Checkpoint,
     CheckpointError,
-    CheckpointOptions,
     CheckpointRotation,
     StateDictCheckpointAdapter,
 )
@@ -204,34 +203,37 @@ class DurableRotation(CheckpointRotation):
         *,
         step: int,
         metadata: Mapping[str, Any] | None = None,
-        components: Collection[str] | None = None,
-        component_options: Mapping[str, CheckpointOptions] | None = None,
+        **chosen: Any,
     ) -> Path:
         """Write a checkpoint; its name exists only once it is whole and on the disk.
 
-        Raises:
-            OSError: if it cannot be written, e.g. to a full disk. What was there is still there.
+        Those of later steps are removed then: the run has continued from an older one.
         """
         final = self.directory / f"{_PREFIX}-{step:012d}.torchrl"
-        serial = 1 + max((number for number, _ in _ordered(self.directory)), default=0)
-        ours = {"settings": self.settings, "serial": serial}
-        chosen = {"components": components, "component_options": component_options}
+        noted = {**(metadata or {}), "torchrl_hmcts": {"settings": self.settings}}
         try:
-            _write(checkpoint, final, {**(metadata or {}), "torchrl_hmcts": ours}, **chosen)
+            _write(checkpoint, final, noted, **chosen)
         except OSError as error:
-            raise OSError(error.errno, self._not_written(step, error)) from error
-        for path in set(self._others) - {final}:
-            remove(path)
+            free = "unknown"
+            with contextlib.suppress(OSError):
+                free = f"{shutil.disk_usage(self.directory).free / 2**20:,.1f} MiB"
+            kept = ", ".join(path.name for path in self.checkpoints()) or "none"
+            raise OSError(
+                error.errno,
+                f"the checkpoint of step {step} could not be written to {str(self.directory)!r} "
+                f"({error.strerror or error}; {free} free). Kept: {kept}. Make room there, load "
+                "the newest and continue; or choose another folder for checkpoints",
+            ) from error
+        for path in {*self._others, *(p for p in self.checkpoints() if p.name > final.name)}:
+            if path != final:
+                remove(path)
         self._others = ()
         self.prune()
         return final
 
     def checkpoints(self) -> tuple[Path, ...]:
-        """Return all checkpoints, damaged ones too, in the order in which they were written.
-
-        Each has a number one above those that it found. No clock is read: it may be set back.
-        """
-        return tuple(path for _, path in _ordered(self.directory))
+        """Return all checkpoints, damaged ones too, in the order of their steps."""
+        return _ordered(self.directory)
 
     def latest(self) -> Path | None:
         """Return the newest checkpoint that is whole; a line on stderr names damaged ones."""
@@ -248,17 +250,6 @@ class DurableRotation(CheckpointRotation):
                 status = path.stat()
                 whole += _is_good(path, status.st_ino, status.st_size, status.st_mtime_ns)
         return tuple(removed)
-
-    def _not_written(self, step: int, error: OSError) -> str:
-        kept = [path.name for path in self.checkpoints()]
-        free = "unknown"
-        with contextlib.suppress(OSError):
-            free = f"{shutil.disk_usage(self.directory).free / 2**20:,.1f} MiB"
-        return (
-            f"the checkpoint of step {step} could not be written to {str(self.directory)!r} "
-            f"({error.strerror or error}; {free} free). Kept: {', '.join(kept) or 'none'}. Make "
-            "room there, load the newest and continue; or choose another folder for checkpoints"
-        )
 
 
 def newest_checkpoint(path: str | Path) -> Path:
@@ -317,7 +308,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
             if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
                 raise CheckpointError("it would unpack to more than its size")
         ours = dict(Checkpoint.manifest(path).get("metadata", {}).get("torchrl_hmcts", {}))
-        ours["serial"], version = int(ours.get("serial", 0)), int(ours.get("checkpoint_version", 0))
+        version = int(ours.get("checkpoint_version", 0))
         ours["settings"] = dict(ours.get("settings", {}))
     except CheckpointError as error:
         newer = re.match("Unsupported (newer|older)", str(error))
@@ -366,19 +357,13 @@ def _write(checkpoint: Checkpoint, path: Path, metadata: Mapping[str, Any], **kw
     return path
 
 
-def _ordered(directory: Path) -> list[tuple[int, Path]]:
-    """Number and path of each checkpoint; one that cannot be read has that of the step before."""
-    found, before = [], 0
-    for path in sorted(directory.glob(f"{_PREFIX}-*.torchrl")):  # by step
-        with contextlib.suppress(CheckpointError):
-            before = read_manifest(path)["serial"]
-        found.append((before, path))
-    return sorted(found, key=lambda entry: entry[0])  # stable: by step where numbers are equal
+def _ordered(directory: Path) -> tuple[Path, ...]:
+    return tuple(sorted(directory.glob(f"{_PREFIX}-*.torchrl")))
 
 
 def _newest_whole(directory: Path) -> Path | None:
     damaged: list[str] = []
-    for _, path in reversed(_ordered(directory)):
+    for path in reversed(_ordered(directory)):
         damage = find_damage(path)
         if damage is None:
             if damaged:

@@ -87,11 +87,16 @@ def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[Any
 
 
 @contextlib.contextmanager
-def left_out(name: str) -> Iterator[None]:
-    """Continue after an error in the block, without the file it was to write; a line says so."""
+def left_out(name: str) -> Iterator[list[str]]:
+    """Continue after an error in the block, without the file it was to write; a line says so.
+
+    The list that is yielded has the name then.
+    """
+    missing: list[str] = []
     try:
-        yield
+        yield missing
     except Exception as error:
+        missing.append(name)
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         with contextlib.suppress(OSError):  # of a stderr on the same full disk
             print(f"Left out {name}: {reason}", file=sys.stderr, flush=True)

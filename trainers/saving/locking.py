@@ -62,21 +62,15 @@ def folder_locked(
 
 def is_locked(folder: str | Path) -> bool:
     """Return whether a process holds the lock of a folder, which may not exist."""
-    if fcntl is None:
+    if fcntl is None or not Path(folder, LOCK_NAME).exists():
         return False
     try:
-        handle = os.open(Path(folder) / LOCK_NAME, os.O_RDWR)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        with folder_locked(folder):
+            return False
+    except FolderInUse:
         return True
     except OSError:
         return False
-    finally:
-        os.close(handle)
-    return False
 
 
 def _take(path: Path, wait: bool) -> int | None:

@@ -176,9 +176,7 @@ def read_curves(path: Path) -> dict[str, RunCurve]:
     return curves
 
 
-def start_record(
-    experiment: str, config: Any, command: Sequence[str], facts: Mapping[str, Any]
-) -> None:
+def start_record(experiment: str, config: Any, command: Sequence[str]) -> None:
     """Write ``run.json`` into the folder of a run that begins or is resumed, without its path."""
     path = Path(config.out)
     path.mkdir(parents=True, exist_ok=True)
@@ -193,7 +191,8 @@ def start_record(
         "experiment": experiment,
         "config": values,
         "commands": [line for line in commands if line],
-        **facts,
+        "versions": versions(),
+        "machine": machine(),
         "status": "running",
     }
     write_json(path / "run.json", record, checksum=True)
