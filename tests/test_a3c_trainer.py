@@ -214,25 +214,6 @@ class TestInThisProcess:
         assert torch.isfinite(weights(trainer)).all()
         assert trainer.frames == 2 * SEGMENT
 
-    def test_an_env_that_keeps_its_own_state_and_has_no_batch_will_do(self) -> None:
-        torch.manual_seed(0)
-        actor = ProbabilisticActor(
-            TensorDictModule(nn.Linear(4, 2), ["observation"], ["logits"]),
-            in_keys=["logits"],
-            distribution_class=torch.distributions.Categorical,
-        )
-        loss = A3CLoss(actor, ValueOperator(nn.Linear(4, 1), in_keys=["observation"]))
-        trainer = A3CTrainer(
-            lambda: GymEnv("CartPole-v1", categorical_action_encoding=True),
-            loss,
-            total_frames=120,
-            num_learners=0,
-        )
-        history = trainer.train()
-        assert history["frames"] == [120]
-        assert history["episode_return"] == history["episode_length"]  # 1 per step
-        assert history["episodes"][0] >= 2
-
     @pytest.mark.parametrize("functional", [True, False])
     def test_torchrls_a2c_loss_can_be_trained_too(self, functional: bool) -> None:
         loss = A2CLoss(*make_networks(LENGTH), functional=functional)
@@ -284,11 +265,6 @@ class TestCheckpoints:
             learner = ActorLearner(trainer.settings, trainer.shared, 0, frames)
             actions.append(learner.collect()["action"])
         assert not torch.equal(*actions)
-
-    def test_a_run_that_is_done_only_says_so(self, tmp_path: Path) -> None:
-        done = make_trainer(save_dir=tmp_path).train()
-        again = make_trainer().load(tmp_path)
-        assert again.train()["frames"] == done["frames"]
 
     def test_what_cannot_be_loaded_or_saved_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=f"no checkpoint in '{tmp_path}'"):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import importlib
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -195,40 +194,6 @@ def test_pictures_and_links_of_a_page_exist(page: str) -> None:
     for target in re.findall(r"\]\((?!https?:)([^)#\s]+)(?:#[^)]*)?\)", text):
         if not GENERATED & set(target.split("/")):
             assert ((DOCS / page).parent / target).exists(), f"{page} leads to {target}"
-
-
-class TestRepositoryLink:
-    @pytest.fixture
-    def links(self, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.syspath_prepend(str(DOCS / "_extensions"))
-        return importlib.import_module("repository_links")
-
-    def test_the_address_is_that_of_pyproject_or_of_gits_origin(self, links, tmp_path) -> None:
-        project = tmp_path / "pyproject.toml"
-        project.write_text('[project]\nname = "x"\n')
-        assert links.repository(tmp_path) == ""  # no repository at all
-        subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
-        origin = ["git", "-C", str(tmp_path), "remote", "add", "origin"]
-        subprocess.run([*origin, "https://example.org/a/b.git"], check=True)
-        assert links.repository(tmp_path) == "https://example.org/a/b"
-        project.write_text('[project.urls]\nRepository = "https://example.org/c/d"\n')
-        assert links.repository(tmp_path) == "https://example.org/c/d"
-
-    @pytest.mark.parametrize(
-        "address",
-        [
-            "",
-            "/srv/git/x",
-            "git@example.org:a/b.git",
-            "http://example.org/a",
-            "https://box/a/b",
-            "https://10.0.0.7/a/b",
-            "https://me:secret@example.org/a/b",
-            "https://a.b:8443/x",
-        ],
-    )
-    def test_what_is_no_public_address_gives_no_link(self, links, address: str) -> None:
-        assert links.public_address(address) == ""
 
 
 class TestResultsPage:

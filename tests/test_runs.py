@@ -204,17 +204,6 @@ class TestResuming:
         assert "it begins again" in capsys.readouterr().out
         assert ran[0].mazes == 7
 
-    def test_without_a_folder_the_only_run_is_resumed_and_of_several_none(
-        self, ran, capsys
-    ) -> None:
-        assert main(["demo"]) == main(["demo", "resume=true"]) == main(["demo"]) == 0
-        assert [(c.out, c.resume) for c in ran] == [
-            ("runs/demo", False), ("runs/demo", True), ("runs/demo_2", False),
-        ]  # fmt: skip
-        assert main(["demo", "resume=true"]) == 2
-        said = capsys.readouterr().err
-        assert "hmcts train resume=runs/demo, hmcts train resume=runs/demo_2" in said
-
     def test_a_folder_named_like_a_truth_value_can_be_resumed(
         self, ran, monkeypatch, capsys
     ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import logging
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
@@ -34,6 +33,7 @@ from torchrl_hmcts.trainers.experiments.managers import (
 from torchrl_hmcts.trainers.experiments.registry import KITS, find_experiment, load_config
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.manager import ManagerPolicy
+from torchrl_hmcts.trainers.runs.config import unknown_key
 from torchrl_hmcts.trainers.runs.console import Bar
 from torchrl_hmcts.trainers.runs.run import FolderRefused, next_free, open_run, run_files
 from torchrl_hmcts.trainers.saving.run_folder import read_run
@@ -124,12 +124,8 @@ class HMCTS:
             if not issubclass(made, GymConfig):
                 raise ValueError(f"kit={kit!r} is not a kit of Gymnasium envs. Use 'gym' or 'ant'.")
             names = [field.name for field in dataclasses.fields(made)]
-            for key in keys:
-                if key not in names:
-                    near = ", ".join(difflib.get_close_matches(key, names, n=3)) or "none"
-                    raise TypeError(
-                        f"HMCTS has no key {key!r}. Nearest: {near}. hmcts list {kit} names all."
-                    )
+            for key in set(keys) - set(names):
+                raise TypeError(f"HMCTS: {unknown_key(key, names)} hmcts list {kit} names all.")
             config = made(id=env if isinstance(env, str) else "", **keys)
         self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
         self.kit = self._make_kit(config)

@@ -36,7 +36,6 @@ from torchrl_hmcts.objectives import (
 from torchrl_hmcts.trainers.collectors import CollectorError
 from torchrl_hmcts.trainers.off_policy import OffPolicyTrainer, Progress, made_by
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
-from torchrl_hmcts.trainers.skills.curves import Curves, log_curves
 from torchrl_hmcts.transforms import SkillReward
 
 
@@ -319,6 +318,46 @@ def worker_losses(
     if not hasattr(action_spec.space, "n"):
         return (SkillSACLoss,)
     return (DIAYNLoss, DiscreteSkillSACLoss)[objective is not None :]
+
+
+def curve_name(key: str) -> str:
+    """Return the name under which an entry of a loss's output is logged.
+
+    Example:
+        >>> [curve_name(key) for key in ("loss_actor", "qvalue_loss_0", "loss_qvalue", "entropy")]
+        ['actor_loss', 'critic_1_loss', 'critic_loss', 'entropy']
+    """
+    if key == "loss_qvalue":
+        return "critic_loss"
+    if key.startswith("qvalue_loss_"):
+        return f"critic_{int(key.rsplit('_', 1)[1]) + 1}_loss"
+    if key.startswith("loss_"):
+        return f"{key.removeprefix('loss_')}_loss"
+    return key
+
+
+def log_curves(optim_steps: int, average_losses: TensorDictBase | None) -> dict[str, float]:
+    """Name the losses and diagnostics of a batch, averaged over its updates, for the log.
+
+    A hook of any TorchRL ``Trainer`` for the stage ``"post_optim_complete_log"``; turn off the
+    Trainer's own ``auto_log_optim_steps`` with it.
+    """
+    values: dict[str, float] = {"optim_steps": optim_steps}
+    if average_losses is not None:
+        names = [curve_name(key) for key in average_losses.keys()]
+        # One stack and one copy for all of them.
+        values.update(zip(names, torch.stack(list(average_losses.values())).tolist(), strict=True))
+    return values
+
+
+class Curves(dict[str, list[float]]):
+    """Curves by their names; the loss's own names find them as well."""
+
+    def __missing__(self, key: str) -> list[float]:
+        name = curve_name(key)
+        if name == key:
+            raise KeyError(f"{key!r} was not logged; there are {sorted(self)}.")
+        return self[name]
 
 
 def make_skill_optimizer(

@@ -130,13 +130,20 @@ def _section(
     return "\n".join(lines)
 
 
+def draw_games(folder: Path) -> dict[str, str]:
+    """Write the dissertation's figures 5.1 to 5.7 into a folder; return captions by file."""
+    from torchrl_hmcts.trainers.experiments.dissertation_figures import draw_figure
+
+    drawn = [draw_figure(f"5.{number}", [], RESULTS, folder) for number in range(1, 8)]
+    return {path.name: f"Figure 5.{n}. {caption}" for n, (path, caption) in enumerate(drawn, 1)}
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     def write(app: Sphinx) -> None:
-        from results_curves import draw_curves
-
         folder = Path(app.srcdir, "auto_results")
         folder.mkdir(exist_ok=True)
-        (folder / "index.md").write_text(page(RESULTS, draw_curves(RESULTS, folder)))
+        drawn = {"atari/runs.json": draw_games(folder)}
+        (folder / "index.md").write_text(page(RESULTS, drawn))
 
     app.connect("builder-inited", write)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -253,6 +253,8 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             note="The dissertation (Figure 4.10): the time to solve falls until about 40,000 "
             "training steps; after that every random maze is solved at the first trial.",
             pictures={
+                "lab/labmaze_diayn.png": "Figure 4.10: frames to solve a maze while the worker "
+                "learns",
                 "lab/episode.gif": "A test maze: the plan, the player, and what it sees",
                 "lab/skills.png": "Figure 4.5: ten mini-episodes of each skill",
                 "lab/search.png": "Figure 4.4: the search",
@@ -342,7 +344,7 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
         Section(
             "The wheel on several Pythons",
             "pythons.json",
-            "python torch torchrl test_files passed skipped",
+            "python torch torchrl test_files skipped passed",
             rows="pythons",
         ),
     ),

@@ -330,14 +330,14 @@ def what_it_took(runs: Sequence[Row]) -> list[Any]:
         values = [float(row[key]) for row in runs if row.get(key) is not None]
         return round(sum(values) / len(values)) if values else "-"
 
-    per_decision = mean("frames_per_decision")
-    if per_decision == "-" and first.get("episodes"):  # a run of before it was written
-        decisions = sum(int(e["decisions"]) for row in runs for e in row["episodes"])
-        spent = ("frames_finding_options", "frames_tuning")
-        frames = sum(row["frames"] - sum(row.get(key, 0) for key in spent) for row in runs)
-        per_decision = round(frames / max(1, decisions))
     found = f"{len(first.get('options', []))}, {first.get('option_steps', '-')}"
-    return [first.get("source", "-"), found, mean("frames"), per_decision, mean("seconds")]
+    return [
+        first.get("source", "-"),
+        found,
+        mean("frames"),
+        mean("frames_per_decision"),
+        mean("seconds"),
+    ]
 
 
 def _aggregated(ours: Mapping[tuple[str, str], list[Row]], protocol: str, key: str) -> list[Any]:

@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from itertools import count, product
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,12 @@ _PICTURES = (
     *("episode.gif", "episode.mp4", "goals.png", "learning.png", "losses.png", "mazes.png"),
     *("scores.png", "search.png", "skills.png", "solving.png", "view.png"),
 )
-_PLAYED = ("play/index.html", "play/play.gif", "play/play.mp4", "play/search.png")
 _SWEEP = ("sweep.json", "journal.log", "importances.png", "trials.png")
-_IN_CHECKPOINTS = ("checkpoint-*", "worker-*", "run.pt*", "trials.json", ".*writing-*", ".lock")
+_IN_FOLDERS = (  # other files there stay
+    *("checkpoints/checkpoint-*", "checkpoints/run.pt*", "checkpoints/trials.json"),
+    *("checkpoints/.*writing-*", "checkpoints/.lock", "worker/worker-*", "worker/.*writing-*"),
+    *("play/index.html", "play/play.*", "play/search.png", "log", "tensorboard"),
+)
 
 
 class FolderRefused(ExperimentError):
@@ -182,11 +185,9 @@ def _take(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool
 def free_folder(config: Any, experiment: str) -> str:
     """Return the first of ``out``, ``out_2``, ... in which a run loses nothing."""
     for out in _names(config.out):
-        try:
+        with contextlib.suppress(FolderRefused):
             check_folder(dataclasses.replace(config, out=out), experiment)
-        except FolderRefused:
-            continue
-        return out
+            return out
     raise AssertionError("names never end")
 
 
@@ -305,11 +306,10 @@ def _clear(path: Path) -> None:
         run = read_run(path)
     pictures = {name for name in run.pictures if Path(name).name == name}
     videos = {str(Path(name).with_suffix(".mp4")) for name in pictures if name.endswith(".gif")}
-    for name in {*_RECORDS, *_PICTURES, *pictures, *videos, *_PLAYED, "log", "tensorboard"}:
+    for name in {*_RECORDS, *_PICTURES, *pictures, *videos}:
         remove(path / name)
-    for folder, pattern in product(("checkpoints", "worker"), _IN_CHECKPOINTS):
-        for entry in (path / folder).glob(pattern):
-            remove(entry)
+    for entry in [entry for pattern in _IN_FOLDERS for entry in path.glob(pattern)]:
+        remove(entry)
 
 
 def resume_command(out: str | Path) -> str:

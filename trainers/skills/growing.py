@@ -6,7 +6,6 @@ Letters: B searches, Z skills there is room for.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,6 +18,7 @@ from torchrl_hmcts.modules import GrowingSkillPrior, SkillPrior
 from torchrl_hmcts.planners import MCTSPlanner, Search
 from torchrl_hmcts.planners.tree import PRUNED
 
+_MIN_RISE = 0.01  # of the accuracy, below which it has stopped to rise
 _COLUMNS = ("base_steps", "num_active", "accuracy", "coverage", "gain", "better")
 
 
@@ -117,15 +117,11 @@ class GrowSkills(TrainerHookBase):
         patience (int): skills in a row that may add nothing before growing ends. A third skill on a
             plane often has to wait for the fourth.
         prune (bool): drop useless skills among the :math:`n^*` when growing ends.
-        enough (float, optional): coverage from which on no skill is added.
         min_base_steps, max_base_steps (int): base steps that a number of skills is trained before
             it is judged, at least and at most.
-        until (int, optional): base steps of training after which no skill is switched on.
-        window (int): batches over which the accuracy must have stopped to rise.
-        min_rise (float): rise of the mean accuracy, from the first half of the window to the
-            second, below which it has stopped.
-        accuracy_key (str): entry of the losses that is watched; where a loss has none,
-            ``max_base_steps`` decides.
+        window (int): batches over which the mean ``discriminator_accuracy`` must have stopped to
+            rise, from the first half to the second; where a loss has none, ``max_base_steps``
+            decides.
 
     Attributes:
         history: dict of lists, one entry per judgement: ``base_steps`` of training, ``num_active``
@@ -174,33 +170,24 @@ class GrowSkills(TrainerHookBase):
         min_gain: float = 0.05,
         patience: int = 2,
         prune: bool = True,
-        enough: float | None = None,
         min_base_steps: int = 3_200,
         max_base_steps: int = 4_800,
-        until: int | None = None,
         window: int = 40,
-        min_rise: float = 0.01,
-        accuracy_key: str = "discriminator_accuracy",
     ) -> None:
         owner = "GrowSkills"
         instance(owner, "prior", prior, GrowingSkillPrior)
         instance(owner, "coverage", coverage, Callable)
         instance(owner, "prune", prune, bool)
-        instance(owner, "accuracy_key", accuracy_key, str)
         self.prior = prior
         self.coverage = coverage
         self.min_gain = real_number(owner, "min_gain", min_gain, least=0.0)
         self.patience = whole_number(owner, "patience", patience, least=1)
         self.prune = prune
-        self.enough = math.inf if enough is None else real_number(owner, "enough", enough)
         self.min_base_steps = whole_number(owner, "min_base_steps", min_base_steps, least=1)
         self.max_base_steps = whole_number(
             owner, "max_base_steps", max_base_steps, least=self.min_base_steps
         )
-        self.until = math.inf if until is None else whole_number(owner, "until", until)
         self.window = whole_number(owner, "window", window, least=2)
-        self.min_rise = real_number(owner, "min_rise", min_rise)
-        self.accuracy_key = accuracy_key
         self.finished = False
         self.history: dict[str, list[Any]] = {key: [] for key in _COLUMNS}
         self.dropped: list[int] = []
@@ -218,7 +205,7 @@ class GrowSkills(TrainerHookBase):
 
     def watch(self, optim_steps: int, losses: TensorDictBase | None) -> dict[str, float]:
         """Notes a batch's accuracy; returns what to log."""
-        accuracy = None if losses is None else losses.get(self.accuracy_key, None)
+        accuracy = None if losses is None else losses.get("discriminator_accuracy", None)
         if accuracy is not None:
             self._accuracies = [*self._accuracies, float(accuracy)][-self.window :]
         return {"num_active_skills": float(self.prior.active().sum())}
@@ -229,7 +216,7 @@ class GrowSkills(TrainerHookBase):
             return False
         half = self.window // 2
         first, second = self._accuracies[:half], self._accuracies[half:]
-        return float(np.mean(second) - np.mean(first)) < self.min_rise
+        return float(np.mean(second) - np.mean(first)) < _MIN_RISE
 
     def __call__(self) -> None:
         if self._trainer is None:
@@ -259,12 +246,8 @@ class GrowSkills(TrainerHookBase):
             self._best = {"number": number, "coverage": coverage, "weights": weights}
         self._fruitless = 0 if better else self._fruitless + 1
         helped = any(self.history["better"][1:])
-        self.finished = (
-            (helped and self._fruitless >= self.patience)
-            or number == self.prior.num_skills
-            or base_steps >= self.until
-            or coverage >= self.enough
-        )
+        ripe = helped and self._fruitless >= self.patience
+        self.finished = ripe or number == self.prior.num_skills
         if not self.finished:
             self.prior.set_num_active(number + 1)
         else:
