@@ -30,7 +30,6 @@ class ManagerNet(nn.Module):
         num_options: int,
         *,
         bounded: bool = True,
-        hidden: Sequence[int] = (128, 128),
     ) -> None:
         super().__init__()
         self.num_options, self.bounded = num_options, bounded
@@ -38,7 +37,7 @@ class ManagerNet(nn.Module):
         self.std: Tensor
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float().clamp_min(1e-6))
-        self.mlp = MLP(len(mean), num_options + 1, num_cells=list(hidden))
+        self.mlp = MLP(len(mean), num_options + 1, num_cells=[128, 128])
 
     def forward(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
         """Return logits ``[*B, A]`` and values ``[*B, 1]``."""
@@ -73,21 +72,16 @@ def scale_by(network: TensorDictModule, planner: MCTSPlanner, starts: TensorDict
 class ManagerPolicy(TensorDictModuleBase):
     """Takes the option of the highest logit, without a search."""
 
-    def __init__(
-        self,
-        network: TensorDictModuleBase,
-        option_key: NestedKey = "option",
-        mask_key: NestedKey = "action_mask",
-    ) -> None:
+    def __init__(self, network: TensorDictModuleBase) -> None:
         super().__init__()
-        self.network, self.option_key, self.mask_key = network, option_key, mask_key
-        self.in_keys, self.out_keys = list(network.in_keys), [option_key]
+        self.network = network
+        self.in_keys, self.out_keys = list(network.in_keys), ["option"]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the option of each row."""
         logits = self.network(tensordict.select(*self.in_keys))["logits"]
-        mask: Any = tensordict.get(self.mask_key, None)
+        mask: Any = tensordict.get("action_mask", None)
         if mask is not None:
             logits = logits.masked_fill(~mask, -torch.inf)
-        return tensordict.set(self.option_key, logits.argmax(-1))
+        return tensordict.set("option", logits.argmax(-1))

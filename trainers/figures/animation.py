@@ -10,19 +10,13 @@ import numpy as np
 
 from torchrl_hmcts.trainers.saving.files import left_out, replacing
 
+STEPS_PER_FRAME = 2  # base steps from one picture of an episode to the next
 _VIDEO_SECONDS = 300  # after which ffmpeg is given up
 
 
-def steps_to_show(last: int, every: int) -> list[int]:
-    """Return the base steps of an episode of which there is a picture.
-
-    Example:
-        >>> steps_to_show(5, 2)
-        [0, 2, 4, 5]
-    """
-    if every < 1:
-        raise ValueError(f"a GIF needs steps_per_frame >= 1; got {every}.")
-    return [*range(0, last, every), last]
+def steps_to_show(last: int) -> list[int]:
+    """Return the base steps of an episode of which there is a picture."""
+    return [*range(0, last, STEPS_PER_FRAME), last]
 
 
 def write_gif(

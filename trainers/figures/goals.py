@@ -15,7 +15,7 @@ from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, TARGET_COLOR, draw_walls
 from torchrl_hmcts.planners import Search
 from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers.figures.animation import steps_to_show, write_gif
+from torchrl_hmcts.trainers.figures.animation import STEPS_PER_FRAME, steps_to_show, write_gif
 from torchrl_hmcts.trainers.figures.maps import legend_below
 from torchrl_hmcts.trainers.figures.pictures import save_figure
 
@@ -81,18 +81,11 @@ def plot_goals(env: WaterworldMazeEnv, start: TensorDictBase, track: Any, path: 
     save_figure(figure, path)
 
 
-def write_goal_gif(
-    env: WaterworldMazeEnv,
-    start: TensorDictBase,
-    track: Any,
-    path: Path,
-    *,
-    steps_per_frame: int = 2,
-) -> None:
+def write_goal_gif(env: WaterworldMazeEnv, start: TensorDictBase, track: Any, path: Path) -> None:
     """Write an episode as a GIF at twice its real speed; goals vanish as they are met."""
-    steps = steps_to_show(len(track.positions) - 1, steps_per_frame)
+    steps = steps_to_show(len(track.positions) - 1)
     frames = [draw_goals(env, start, track, step) for step in steps]
-    write_gif(frames, path, milliseconds=500.0 * env.TIME_STEP * steps_per_frame)
+    write_gif(frames, path, milliseconds=500.0 * env.TIME_STEP * STEPS_PER_FRAME)
 
 
 def plot_macro_env(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) -> None:

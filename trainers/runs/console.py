@@ -26,7 +26,6 @@ _NAME_WIDTH = 46
 _BAR = (
     "{desc}: {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt}{unit} [{elapsed}<{remaining}{postfix}]"
 )
-_BAR_WIDTH = 12  # at least
 _LINE = "{desc}: {percentage:.0f} % ({n_fmt} of {total_fmt}{unit}) in {elapsed}{postfix}"
 
 
@@ -70,14 +69,8 @@ class Bar(tqdm):
         return super().update(moved)
 
     def set_postfix(self, *_: Any, refresh: bool = True, **figures: Any) -> None:
-        """Show the first figures beside it, as many as fit; unknown numbers are left out."""
-        room = WIDTH - _BAR_WIDTH - len(f"{self.desc}{self.unit}: 100 %|| [00:00<00:00]")
-        room -= 2 * len(str(self.total)) + 2
-        shown = {}
-        for name, value in figures.items():
-            room -= len(f", {name}={value}")
-            if _is_known(value) and room >= 0:
-                shown[name] = value
+        """Show figures beside it; unknown numbers are left out."""
+        shown = {name: value for name, value in figures.items() if _is_known(value)}
         super().set_postfix(refresh=refresh, **shown)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
