@@ -199,7 +199,7 @@ def run_record(folder: Path) -> Kind:
 
 
 def sweep_journal(folder: Path) -> Kind:
-    journal = pytest.importorskip("torchrl_hmcts.trainers.runs.journal")
+    journal = pytest.importorskip("torchrl_hmcts.trainers.runs.sweep")
     folder.mkdir(parents=True)
     path = folder / "journal.log"
     for i in range(20):

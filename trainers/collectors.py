@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -14,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+_ASKED = ("update_policy_weights_", "state_dict", "load_state_dict")  # of the processes
 _MAX_DEATHS = 3  # with no batch between them that are borne
 
 
@@ -61,7 +63,7 @@ class RestartingCollector:
     def __getattr__(self, name: str) -> Any:
         if name == "_collector":  # not built yet
             raise AttributeError(name)
-        return getattr(self._collector, name)
+        return partial(self._ask, name) if name in _ASKED else getattr(self._collector, name)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while self.collected_frames < self.total_frames:
@@ -77,18 +79,6 @@ class RestartingCollector:
                     return
             except Exception as error:
                 self._restart(error)
-
-    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
-        """Send the weights to the processes."""
-        self._ask("update_policy_weights_", *args, **kwargs)
-
-    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """Return the collector's state, of the processes too."""
-        return self._ask("state_dict", *args, **kwargs)
-
-    def load_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        """Put back a state of :meth:`state_dict`."""
-        self._ask("load_state_dict", *args, **kwargs)
 
     def _ask(self, method: str, *args: Any, **kwargs: Any) -> Any:
         while True:

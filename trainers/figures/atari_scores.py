@@ -269,7 +269,7 @@ def write_table(rows: Sequence[Row], path: Path) -> str:
     }
     head = ["game", "dissertation: highest", "its skills, steps", "best of Table A.1"]
     for protocol in protocols:
-        head += [f"ours, {protocol}: mean", "least to largest", "who acts", "seeds"]
+        head += [f"ours, {protocol}: mean", "least to largest", "who acts", "seeds", "frames"]
     cells = []
     for game, source in TABLE_5_1.items():
         algorithm, baseline = best_baseline(game)
@@ -281,20 +281,19 @@ def write_table(rows: Sequence[Row], path: Path) -> str:
             line.append(_interval(means))
             line.append(_range(runs))
             line.append(", ".join(sorted({str(r.get("acts", "rules")) for r in runs})) or "-")
-            line.append(len(runs))
+            frames = [row["frames"] for row in runs if "frames" in row]
+            line += [len(runs), round(sum(frames) / len(frames)) if frames else "-"]
         cells.append(line)
     normalised = [
         [protocol, key.replace("score_", ""), *_aggregated(ours, protocol, key)]
         for protocol in protocols
         for key in ("score_mean", "score_max")
     ]
-    took = [[*names, *what_it_took(runs)] for names, runs in ours.items() if runs]
     baselines = [[name, *(row[game] for game in TABLE_5_1)] for name, row in TABLE_A_1.items()]
     table = Table(cells, head)
     words = ["protocol", "score", "interquartile mean", "95 % interval", "games"]
     sections = [
         Section(words=[_NOTE], tables=[table]),
-        Section("What they took", tables=[Table(took, _TOOK)]),
         Section("Human-normalised scores of all games", tables=[Table(normalised, words)]),
         Section(
             "Table A.1: means of OpenAI Baselines, as the dissertation gives them",
@@ -316,28 +315,6 @@ _NOTE = (
     "interval; beside it the least and the largest score of any episode, and whether rules or a "
     "network act."
 )
-_TOOK = (
-    "game", "protocol", "options from", "options, steps", "frames, all kinds",
-    "frames per decision", "seconds",
-)  # fmt: skip
-
-
-def what_it_took(runs: Sequence[Row]) -> list[Any]:
-    """Return what the runs of a game took, means over the seeds, in the order of the table."""
-    first = runs[0]
-
-    def mean(key: str) -> Any:
-        values = [float(row[key]) for row in runs if row.get(key) is not None]
-        return round(sum(values) / len(values)) if values else "-"
-
-    found = f"{len(first.get('options', []))}, {first.get('option_steps', '-')}"
-    return [
-        first.get("source", "-"),
-        found,
-        mean("frames"),
-        mean("frames_per_decision"),
-        mean("seconds"),
-    ]
 
 
 def _aggregated(ours: Mapping[tuple[str, str], list[Row]], protocol: str, key: str) -> list[Any]:

@@ -6,7 +6,10 @@ import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,25 +19,25 @@ import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution
 from optuna.distributions import FloatDistribution as Float
 from optuna.distributions import IntDistribution as Int
-from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages import BaseStorage, JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError
-from sqlalchemy.pool import NullPool  # Optuna depends on it
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError  # Optuna's
 
 from torchrl_hmcts.trainers.runs.config import (
     RunConfig,
-    home,
     key_kinds,
     parse_overrides,
     read_value,
 )
-from torchrl_hmcts.trainers.runs.journal import CheckedJournal
 from torchrl_hmcts.trainers.runs.loggers import observed
 from torchrl_hmcts.trainers.runs.run import next_free, open_run, run_files
+from torchrl_hmcts.trainers.saving.files import digest
 from torchrl_hmcts.trainers.saving.run_folder import flat, read_run
 
 Space = dict[str, BaseDistribution]
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+_CHECKSUM = "checksum"
 _SPACE = "space"  # attribute of a study
 _NOT_FIXED = ("out", "resume", "overwrite", "logger")  # may differ from one call to the next
 
@@ -94,6 +97,51 @@ def _range(key: str, value: str, kind: str) -> Int | Float:
         raise ValueError(f"{key}={value}: {error}") from None
 
 
+class CheckedJournal(JournalFileBackend):
+    """Optuna's journal file, from which a sweep continues, checked when it is opened.
+
+    A last line that is not whole is cut off, and a line on stderr says so; the journal as it was is
+    kept as ``journal.log.damaged``. Any other damage is refused.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(str(path))
+        self._lock.acquire()
+        try:
+            _check(Path(path))
+        finally:
+            self._lock.release()
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        super().append_logs([{**log, _CHECKSUM: digest(log)} for log in logs])
+
+    def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:  # type: ignore[override]
+        for log in super().read_logs(log_number_from):
+            log.pop(_CHECKSUM, None)
+            yield log
+
+
+def _check(path: Path) -> None:
+    lines = path.read_bytes().splitlines(keepends=True)
+    for number, line in enumerate(lines, 1):
+        try:
+            log = json.loads(line)
+            if line.endswith(b"\n") and log.pop(_CHECKSUM, None) in (None, digest(log)):
+                continue
+            reason = "differs from its checksum"
+        except (ValueError, AttributeError, RecursionError) as error:
+            reason = f"cannot be read: {error}"
+        if number < len(lines):
+            raise ValueError(
+                f"{path} is damaged: line {number} {reason}. Restore it from a backup, or choose "
+                "another folder with out=DIR."
+            )
+        kept = Path(shutil.copy2(path, f"{path}.damaged"))
+        words = f"its last line is not whole and is left out; as it was: {kept.name}"
+        print(f"{path}: {words}.", file=sys.stderr)
+        os.truncate(path, sum(map(len, lines[:-1])))
+
+
 @dataclass(frozen=True)
 class Sweep:
     """A sweep: which experiment, what varies, what is improved, where it is kept."""
@@ -131,8 +179,6 @@ class Sweep:
         study = self._open()
         described = json.loads(json.dumps(self._description()))
         before = study.user_attrs.get(_SPACE, {})
-        if not isinstance(before.get(_SPACE, {}), dict):  # of an older version: another form
-            before = {key: value for key, value in before.items() if key != _SPACE}
         differing = [key for key in before if before[key] != described.get(key)]
         if differing:
             raise ValueError(
@@ -164,12 +210,7 @@ class Sweep:
     def _storage(self) -> BaseStorage:
         if self.storage is None:
             return JournalStorage(CheckedJournal(self.folder / "journal.log"))
-        if self.storage.startswith("redis"):
-            return optuna.storages.get_storage(self.storage)
-        scheme, slashes, place = self.storage.partition(":///")
-        url = f"{scheme}{slashes}{home(place)}"
-        # No pool: its connections would stay open until they are collected.
-        return RDBStorage(url, engine_kwargs={"poolclass": NullPool})
+        return optuna.storages.get_storage(self.storage)
 
     def _study_name(self, storage: BaseStorage) -> str:
         """The folder may have been renamed since its study was named after it."""
