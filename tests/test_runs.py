@@ -233,16 +233,6 @@ class TestWords:
         assert config(out="a/~/x").out == "a/~/x"
         assert home(expanded) == expanded
 
-    def test_every_command_finds_the_home_folder(self, ran, tmp_path) -> None:
-        assert main(["demo", "out=~/runs/x"]) == main(["demo", "out=~/runs/y"]) == 0
-        assert main(["train", "resume=~/runs/x"]) == 0
-        assert main(["report", "~/runs/x", "out=~/page.html"]) == 0
-        assert main(["report", "~/runs/x", "~/runs/y", "out=~/both"]) == 0
-        assert main(["report", "figure=3.1", "results=~", "out=~/figures"]) == 0
-        there = [name for name in os.listdir(tmp_path / "home") if not name.startswith(".")]
-        assert sorted(there) == ["both", "figures", "page.html", "runs"]
-        assert os.listdir(tmp_path) == ["home"]
-
     def test_a_path_that_can_be_no_path_is_refused(self) -> None:
         for out in ("", "a\0b"):
             with pytest.raises(ValueError, match="out "):

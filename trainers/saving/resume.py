@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDictBase
-from torchrl.checkpoint import CheckpointError, GlobalRNGState
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
@@ -166,12 +166,6 @@ class ResumableTrainer(Trainer):
         if self._episodes is not None:
             self._episodes.new_episodes = new_episodes
         self.load_from_file(found)
-        frames, updates = self.collected_frames, self._num_updates()
-        if not all(type(n) is int and n >= 0 for n in (frames, updates)):
-            raise CheckpointError(
-                f"The checkpoint {str(found)!r} has {frames!r} base steps and {updates!r} updates, "
-                "which are not counts. Load an older one."
-            )
         if isinstance(self.checkpoint_rotation, DurableRotation):
             self.checkpoint_rotation.continue_from(found)
         return self
