@@ -34,7 +34,7 @@ from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.experiments.skills import learn, make_loss
 from torchrl_hmcts.trainers.parts import build, differences, keywords_of, merged, named
 
-CONFIGS = [(f"{g}={n}", named(p)) for g, names in COMPONENTS.items() for n, p in names.items()]
+CONFIGS = [(f"{g}={n}", p) for g, names in COMPONENTS.items() for n, p in names.items()]
 INTERNAL = {"_target_", "_component_", "_partial_"}
 
 
@@ -55,10 +55,10 @@ def as_written(value: Any) -> Any:
     return value
 
 
-@pytest.mark.parametrize(("name", "component"), CONFIGS, ids=[name for name, _ in CONFIGS])
-def test_a_config_has_the_keywords_and_defaults_of_its_class(name: str, component: type) -> None:
-    parameters = keywords_of(component)
-    config = {k: v for k, v in vars(config_of(component)()).items() if k not in INTERNAL}
+@pytest.mark.parametrize(("name", "path"), CONFIGS, ids=[name for name, _ in CONFIGS])
+def test_a_config_has_the_keywords_and_defaults_of_its_class(name: str, path: str) -> None:
+    parameters = keywords_of(named(path))
+    config = {k: v for k, v in vars(config_of(path)()).items() if k not in INTERNAL}
     assert sorted(config) == sorted(parameters)
     for key, parameter in parameters.items():
         if parameter.default is inspect.Parameter.empty:
@@ -88,7 +88,7 @@ def test_every_class_that_can_be_swapped_has_a_config(package: str) -> None:
     public = {n for n in module.__all__ if inspect.isclass(getattr(module, n))}
     if package.endswith(".envs"):
         public = {n for n in public if issubclass(getattr(module, n), EnvBase)}
-    configured = {component.__name__ for _, component in CONFIGS}
+    configured = {path.rpartition(".")[2] for _, path in CONFIGS}
     missing = public - configured - NOT_CONFIGURED[package]
     assert not missing, f"without a config in trainers/configs: {sorted(missing)}"
 

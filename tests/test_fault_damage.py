@@ -92,7 +92,7 @@ def _of_trainer(make: Callable[[], Any]) -> Kind:
     first, trainer = make(), make()
     first.train()
     a3c = isinstance(first, A3CTrainer)
-    path = (first.rotation if a3c else first.checkpoint_rotation).latest()
+    path = first.rotation.latest()
 
     def load() -> Any:
         trainer.load(path)

@@ -13,10 +13,9 @@ import pytest
 
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.registry import load_config
-from torchrl_hmcts.trainers.figures.comparison_page import group_runs
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
 from torchrl_hmcts.trainers.figures.pages import picture, plain
-from torchrl_hmcts.trainers.figures.run_page import write_page, write_run_page
+from torchrl_hmcts.trainers.figures.run_page import group_runs, write_page, write_run_page
 from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
     add_evaluation,

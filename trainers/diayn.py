@@ -307,26 +307,14 @@ class DIAYNTrainer(OffPolicyTrainer):
 def worker_losses(
     action_spec: TensorSpec, objective: SkillObjective | None = None
 ) -> tuple[type[LossModule], ...]:
-    """Returns the losses that train a worker with such actions, the default first.
-
-    Examples:
-        >>> from torchrl.data import Categorical
-        >>> from torchrl_hmcts.trainers.diayn import worker_losses
-        >>> [loss.__name__ for loss in worker_losses(Categorical(4))]
-        ['DIAYNLoss', 'DiscreteSkillSACLoss']
-    """
+    """Returns the losses that train a worker with such actions, the default first."""
     if not hasattr(action_spec.space, "n"):
         return (SkillSACLoss,)
     return (DIAYNLoss, DiscreteSkillSACLoss)[objective is not None :]
 
 
 def curve_name(key: str) -> str:
-    """Return the name under which an entry of a loss's output is logged.
-
-    Example:
-        >>> [curve_name(key) for key in ("loss_actor", "qvalue_loss_0", "loss_qvalue", "entropy")]
-        ['actor_loss', 'critic_1_loss', 'critic_loss', 'entropy']
-    """
+    """Return the name under which an entry of a loss's output is logged."""
     if key == "loss_qvalue":
         return "critic_loss"
     if key.startswith("qvalue_loss_"):

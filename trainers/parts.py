@@ -50,13 +50,7 @@ def constructors(component: type) -> Iterator[Any]:
 
 
 def keywords_of(component: type) -> dict[str, inspect.Parameter]:
-    """Return the parameters of a constructor that have a name of their own.
-
-    Example:
-        >>> from torchrl_hmcts.planners import UCT
-        >>> keywords_of(UCT)["c"].default
-        1.0
-    """
+    """Return the parameters of a constructor that have a name of their own."""
     variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     found: dict[str, inspect.Parameter] = {}
     for init in constructors(component):

@@ -1,9 +1,6 @@
 """Draws docs/_static/house.svg from the imports: the rooms of the code, and who uses whom.
 
-    python docs/_extensions/house.py
-
-A room stands above every room that it imports. An arrow is left out where a longer way of arrows
-says the same.
+A room stands above every room that it imports; arrows that a longer way repeats are left out.
 """
 
 from __future__ import annotations

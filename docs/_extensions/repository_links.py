@@ -1,7 +1,6 @@
 """Makes links that are right in the repository right on the site as well.
 
-Pages link to folders and files of the repository, which are shown there by GitHub and the like. On
-the site a folder of results means the page of results, and a file at the top the page made of it.
+A folder of results means the page of results, a file at the top the page made of it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Writes the page of results from the data in docs/results, when the site is built.
 
-Every number on it comes from a file there, with the command that made it: the entry ``command`` of
-the file, or its row in docs/results/README.md.
+How a file was made: its entry ``command``, or its row in docs/results/README.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from types import NoneType
@@ -26,23 +25,21 @@ from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.processes import share
 from torchrl_hmcts.trainers.a3c.actor_learner import (
     ActorLearner,
+    LearnerLog,
     LearnerSettings,
     SharedMemory,
     actor_of,
     board_columns,
     trained_parameters,
 )
-from torchrl_hmcts.trainers.a3c.learner_log import LearnerLog
 from torchrl_hmcts.trainers.a3c.learner_processes import LearnerProcesses
 from torchrl_hmcts.trainers.a3c.shared_optimizers import OptimizerState, SharedRMSprop, share_over
 from torchrl_hmcts.trainers.off_policy import made_by
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
-    check_settings,
-    newest_checkpoint,
     plain_checkpoint,
+    to_continue,
 )
-from torchrl_hmcts.trainers.saving.locking import folder_locked
 from torchrl_hmcts.trainers.saving.resume import FIRST_SAVE_SECONDS, SAVE_SECONDS
 from torchrl_hmcts.trainers.saving.run_state import HistoryState
 from torchrl_hmcts.trainers.saving.stopping import patient, raise_if_asked, unbroken
@@ -254,9 +251,7 @@ class A3CTrainer:
 
     def train(self) -> dict[str, list[float]]:
         """Trains until T reaches ``total_frames`` or ``stop_when`` is true; returns the history."""
-        if self.rotation is not None:
-            self.rotation.begin()
-        with folder_locked(self.rotation.directory) if self.rotation else nullcontext(), patient():
+        with self.rotation.taken() if self.rotation else patient():
             return self._train()
 
     def _train(self) -> dict[str, list[float]]:
@@ -304,11 +299,7 @@ class A3CTrainer:
         The optimiser's settings are the checkpoint's, the learning rate at the start included; the
         schedule and all else are this trainer's. ``path`` may be a folder of checkpoints.
         """
-        found = newest_checkpoint(path)
-        check_settings(found, self.run_settings)
-        self._checkpoint.load(found)
-        if self.rotation is not None:
-            self.rotation.continue_from(found)
+        self._checkpoint.load(to_continue(path, self.run_settings, self.rotation))
         return self
 
     # Running learners

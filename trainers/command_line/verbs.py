@@ -309,13 +309,11 @@ def _pages(own: dict[str, str], folders: list[str]) -> None:
             "figure of the dissertation, e.g. figure=3.6 (all: hmcts list figures)."
         )
     runs = [recognise(read_run(run)) for folder in folders for run in runs_in(folder)]
-    if len(runs) > 1:
-        from torchrl_hmcts.trainers.figures.comparison_page import write_comparison
+    from torchrl_hmcts.trainers.figures.run_page import write_comparison, write_run_page
 
+    if len(runs) > 1:
         print(f"Page: {write_comparison(runs, own.get('out', 'runs/report'))}")
         return
-    from torchrl_hmcts.trainers.figures.run_page import write_run_page
-
     out = own.get("out")
     if out is not None and not out.lower().endswith((".html", ".htm")):
         out = str(Path(out) / "index.html")
@@ -323,12 +321,7 @@ def _pages(own: dict[str, str], folders: list[str]) -> None:
 
 
 def runs_in(folder: str) -> list[str]:
-    """Return a folder of a run, or the runs that a folder holds.
-
-    Example:
-        >>> runs_in("runs/one")
-        ['runs/one']
-    """
+    """Return a folder of a run, or the runs that a folder holds."""
     if is_run(folder):
         return [folder]
     inside = sorted(path.parent for path in Path(folder).glob("*/run.json"))

@@ -125,14 +125,7 @@ def split_words(words: Sequence[str], own: Sequence[str]) -> tuple[dict[str, str
 
 
 def only_words(words: Sequence[str], own: Sequence[str]) -> dict[str, str]:
-    """Read the words of a command that has no keys but its own.
-
-    Example:
-        >>> only_words(["run=runs/gym", "sede=1"], ["run", "seed"])
-        Traceback (most recent call last):
-        ...
-        ValueError: Unknown key 'sede'. Did you mean: seed?
-    """
+    """Read the words of a command that has no keys but its own."""
     found, rest = split_words(words, own)
     no_bare_words(rest, own[0])
     if rest:
@@ -141,14 +134,7 @@ def only_words(words: Sequence[str], own: Sequence[str]) -> dict[str, str]:
 
 
 def no_bare_words(words: Sequence[str], folder: str = "") -> None:
-    """Refuse a word that lacks its key, and say with which key to write it.
-
-    Example:
-        >>> no_bare_words(["labmaze"])
-        Traceback (most recent call last):
-        ...
-        ValueError: 'labmaze' is no key=value. Write experiment=labmaze.
-    """
+    """Refuse a word that lacks its key, and say with which key to write it."""
     for word in words:
         if "=" in word:
             continue

@@ -1,11 +1,6 @@
 """Chapter 5: scores in seven games beside the dissertation's (Tables 5.1 and A.1).
 
-Runs of the experiment ``atari`` have in ``metrics.json`` the entries ``game``, ``protocol``
-(``"deterministic"`` or ``"sticky"``), ``seed``, ``score_max``, ``score_final`` and ``frames``, and
-in ``curves.csv`` the curves ``score`` and ``score_max`` against emulated steps. Files in
-``docs/results/atari`` are lists of such summaries, with an entry ``curves`` for the figures:
-``{"score": {"step": [...], "value": [...]}, "score_max": {...}}``, and RUNNING, the score of the
-episode being played at every 1,000th base step.
+Files in ``docs/results/atari`` are lists of the ``metrics.json`` of runs, with an entry ``curves``.
 """
 
 from __future__ import annotations

@@ -40,12 +40,7 @@ def common_steps(curves: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def says_something(steps: Sequence[float], values: Sequence[float]) -> bool:
-    """Return whether a curve is worth a panel: it is neither constant nor a straight line.
-
-    Example:
-        >>> says_something([0, 1, 2], [5.0, 5.0, 5.0]), says_something([0, 1, 2], [0.0, 2.0, 1.0])
-        (False, True)
-    """
+    """Return whether a curve is worth a panel: it is neither constant nor a straight line."""
     x, y = np.asarray(steps, float), np.asarray(values, float)
     if len(x) < 2:
         return False
@@ -90,12 +85,7 @@ def legend_of_all(figure: Figure, *, ncols: int) -> None:
 
 
 def panel(name: str, groups: Sequence[Sequence[Points]], x_label: str = "steps") -> str:
-    """Draw one logged value of several groups of runs, small enough for a phone.
-
-    Example:
-        >>> panel("entropy", [[([0, 1], [2, 1])]])[:5]
-        '<?xml'
-    """
+    """Draw one logged value of several groups of runs, small enough for a phone."""
     figure = Figure(figsize=(4.3, 2.7), layout="constrained")
     axes = figure.subplots()
     for i, curves in enumerate(groups):

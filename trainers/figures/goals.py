@@ -63,11 +63,7 @@ def draw_goals(
 
 
 def plot_goals(env: WaterworldMazeEnv, start: TensorDictBase, track: Any, path: Path) -> None:
-    """Draw an episode at its start, half way and at its end.
-
-    Reference:
-        Dissertation, figure 3.5.
-    """
+    """Draw an episode at its start, half way and at its end (figure 3.5)."""
     last = len(track.positions) - 1
     captions = {
         0: f"the plan: {len(track.plan_at(0))} goals",

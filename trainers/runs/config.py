@@ -131,11 +131,7 @@ def home(path: str) -> str:
 
 
 def need_package(name: str) -> None:
-    """Import an optional package, so that its absence is noticed before a run begins.
-
-    Example:
-        >>> need_package("json")
-    """
+    """Import an optional package, so that its absence is noticed before a run begins."""
     module = importlib.import_module(name)
     if getattr(module, "__file__", None) is None:
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
@@ -201,24 +197,14 @@ def read_value(key: str, value: str, kind: str) -> Any:
 
 
 def unknown_key(key: str, known: Iterable[str], what: str = "key") -> str:
-    """Return the sentence that refuses a word and names the nearest ones.
-
-    Example:
-        >>> unknown_key("sede", ["seed", "out"])
-        "Unknown key 'sede'. Did you mean: seed?"
-    """
+    """Return the sentence that refuses a word and names the nearest ones."""
     known = list(known)
     near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or known
     return f"Unknown {what} {key!r}. Did you mean: {', '.join(near)}?"
 
 
 def key_kinds(config_class: type) -> dict[str, str]:
-    """Return the types of a configuration's keys: int, float, bool, str or dict.
-
-    Example:
-        >>> key_kinds(RunConfig)["seed"]
-        'int'
-    """
+    """Return the types of a configuration's keys: int, float, bool, str or dict."""
     kinds = {field.name: field.type for field in fields(config_class)}
     return {
         name: str(getattr(kind, "__name__", kind)).partition("[")[0] for name, kind in kinds.items()

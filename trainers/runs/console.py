@@ -19,6 +19,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from torchrl_hmcts.trainers.saving.run_folder import flat
+
 INTERVAL = 9.0  # seconds between two signs of life; looked at every second
 WIDTH = 79
 _NAME_WIDTH = 46
@@ -167,30 +169,12 @@ def table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def figures_table(figures: Mapping[str, Any]) -> str:
-    """Return the numbers of nested figures as a table; of a spread its mean, median and 95 %.
-
-    Example:
-        >>> print(figures_table({"test": {"solved": 2, "starts": 3, "steps": {"median": 7.0}}}))
-          test: solved                                              2
-          test: starts                                              3
-          test: steps, median                                       7
-    """
-    return table(list(_rows(figures, "")))
-
-
-def _rows(figures: Mapping[str, Any], before: str) -> Iterator[tuple[str, str]]:
-    for name, value in figures.items():
-        words = name.replace("_", " ").replace("p95", "95 %")
-        if isinstance(value, Mapping):
-            yield from _rows(value, f"{before}{words}: ")
-        elif isinstance(value, str):
-            yield f"{before}{words}", value
-        elif isinstance(value, numbers.Real) and math.isfinite(value):
-            number = float(value)
-            exact = isinstance(value, numbers.Integral) or abs(number) >= 1e4
-            shown = f"{number:,.0f}" if exact else f"{number:,.4g}"
-            if words in ("mean", "median", "95 %"):  # of a spread
-                words = f"{before.removesuffix(': ')}, {words}"
-            else:
-                words = before + words
-            yield words, shown
+    """Return the numbers of nested figures as a table."""
+    rows = []
+    for name, value in flat(figures):
+        if isinstance(value, numbers.Real) and math.isfinite(value):
+            exact = isinstance(value, numbers.Integral) or abs(value) >= 1e4
+            value = f"{float(value):,.0f}" if exact else f"{float(value):,.4g}"
+        if isinstance(value, str):
+            rows.append((name.replace(".", ": ").replace("_", " "), value))
+    return table(rows)

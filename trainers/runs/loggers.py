@@ -158,13 +158,7 @@ def make_logger(config: Any) -> ScalarLoggers:
 
 @contextlib.contextmanager
 def observed(observer: Observer) -> Iterator[None]:
-    """Tell an observer every value that experiments log in the context.
-
-    Example:
-        >>> with observed(lambda name, value, step: None):
-        ...     len(_OBSERVERS.get())
-        1
-    """
+    """Tell an observer every value that experiments log in the context."""
     token = _OBSERVERS.set((*_OBSERVERS.get(), observer))
     try:
         yield

@@ -197,12 +197,7 @@ def _names(base: str) -> Iterator[str]:
 
 
 def next_free(out: str) -> str:
-    """Return the first of ``out``, ``out_2``, ``out_3``, ... that does not exist or is empty.
-
-    Example:
-        >>> next_free("runs/none_there")
-        'runs/none_there'
-    """
+    """Return the first of ``out``, ``out_2``, ``out_3``, ... that does not exist or is empty."""
     paths = map(Path, _names(out))
     return str(next(p for p in paths if not (p.is_file() or (p.is_dir() and any(p.iterdir())))))
 
@@ -280,12 +275,7 @@ def _check_resumable(config: Any, experiment: str) -> None:
 
 
 def run_files(path: Path) -> list[str]:
-    """Return the names in a folder that a run or a sweep would write.
-
-    Example:
-        >>> run_files(Path("nowhere"))
-        []
-    """
+    """Return the names in a folder that a run or a sweep would write."""
     if not path.is_dir():
         return []
     names = sorted(entry.name for entry in path.iterdir())
@@ -313,12 +303,7 @@ def _clear(path: Path) -> None:
 
 
 def resume_command(out: str | Path) -> str:
-    """Return the command that continues a run exactly, as it can be pasted into a shell.
-
-    Example:
-        >>> resume_command("runs/one"), resume_command("true")
-        ('hmcts train resume=runs/one', 'hmcts train resume=./true')
-    """
+    """Return the command that continues a run exactly, as it can be pasted into a shell."""
     folder = str(out)
     return shlex.join(["hmcts", "train", f"resume={'./' * (folder.lower() in BOOL_WORDS)}{folder}"])
 

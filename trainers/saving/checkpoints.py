@@ -7,7 +7,6 @@ written under another name, sealed with a digest of all its bytes, and only then
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 import re
@@ -15,7 +14,7 @@ import shutil
 import sys
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,8 @@ from torchrl.checkpoint._checkpoint import _encode_state_dict_value  # its forma
 
 from torchrl_hmcts import __version__
 from torchrl_hmcts.trainers.saving.files import remove, remove_leftovers, replacing
+from torchrl_hmcts.trainers.saving.locking import folder_locked
+from torchrl_hmcts.trainers.saving.stopping import patient
 
 CHECKPOINT_VERSION = 1
 """Of what this package puts into a checkpoint; it rises when old ones no longer load."""
@@ -181,6 +182,13 @@ class DurableRotation(CheckpointRotation):
         """Note that the run continues from a checkpoint, perhaps one of those in this folder."""
         self._began = self._began or path.resolve().parent == self.directory.resolve()
 
+    @contextlib.contextmanager
+    def taken(self) -> Iterator[None]:
+        """Keep others from writing to the folder; the first signal only asks for the end."""
+        self.begin()
+        with folder_locked(self.directory), patient():
+            yield
+
     def begin(self) -> None:
         """Refuse the checkpoints of another run, before the first of this one is written.
 
@@ -246,9 +254,9 @@ class DurableRotation(CheckpointRotation):
             if whole == self.keep_last:
                 remove(path)
                 removed.append(path)
-            else:
-                status = path.stat()
-                whole += _is_good(path, status.st_ino, status.st_size, status.st_mtime_ns)
+                continue
+            with contextlib.suppress(NewerCheckpointError):  # not ours to judge, nor to remove
+                whole += find_damage(path) is None
         return tuple(removed)
 
 
@@ -326,6 +334,17 @@ def read_manifest(path: Path) -> dict[str, Any]:
     return ours
 
 
+def to_continue(
+    path: str | Path, settings: Mapping[str, Any], rotation: DurableRotation | None
+) -> Path:
+    """Return the checkpoint that a run of these settings continues from, and note it."""
+    found = newest_checkpoint(path)
+    check_settings(found, settings)
+    if rotation is not None:
+        rotation.continue_from(found)
+    return found
+
+
 def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
     """Refuse a checkpoint of a run with other settings; names that one lacks are skipped."""
     other = read_manifest(Path(path))["settings"]
@@ -376,12 +395,3 @@ def _newest_whole(directory: Path) -> Path | None:
             "another folder, or restore one from a backup."
         )
     return None
-
-
-@functools.lru_cache(maxsize=64)
-def _is_good(path: Path, *identity: int) -> bool:
-    """Whether a file is whole; ``identity`` tells it from the one that takes its place."""
-    try:
-        return find_damage(path) is None
-    except NewerCheckpointError:  # not ours to judge, and not to remove
-        return False

@@ -1,8 +1,4 @@
-"""Files that are written in one move, and files that a run can do without.
-
-Whoever reads a file finds the old content or the new one, never half of it. A picture that cannot
-be drawn or written is left out, with a line on stderr; the run continues.
-"""
+"""Files that are written in one move, and files that a run can do without."""
 
 from __future__ import annotations
 
@@ -69,12 +65,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 
 def digest(content: Any) -> str:
-    """Return the SHA-256 of numbers and texts as they come back from JSON, in any layout.
-
-    Example:
-        >>> digest({"a": 1, "b": (2,)}) == digest({"b": [2], "a": 1})
-        True
-    """
+    """Return the SHA-256 of numbers and texts as they come back from JSON, in any layout."""
     plain = json.loads(json.dumps(content))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 

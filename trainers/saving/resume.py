@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,9 @@ from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
-    check_settings,
-    newest_checkpoint,
     plain_checkpoint,
+    to_continue,
 )
-from torchrl_hmcts.trainers.saving.locking import folder_locked
 from torchrl_hmcts.trainers.saving.run_state import (
     BufferAdapter,
     GeneratorStates,
@@ -55,8 +52,8 @@ class ResumableTrainer(Trainer):
         run_settings (dict): values that a run must keep when it continues, by name (JSON).
 
     Raises:
-        ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
-            ``save_trainer_file``.
+        ValueError: if TorchRL's ``checkpoint``, ``checkpoint_rotation`` or ``save_trainer_file`` is
+            given.
         OSError: if ``save_dir`` cannot be written to.
         FolderInUse: on training, if another run writes to ``save_dir``.
 
@@ -94,30 +91,25 @@ class ResumableTrainer(Trainer):
         for part in ("loss_module", "optimizer"):
             if trainer_kwargs.get(part) is not None:
                 self.run_settings[part] = type(trainer_kwargs[part]).__name__
+        for other in ("checkpoint", "checkpoint_rotation", "save_trainer_file"):
+            if trainer_kwargs.get(other) is not None:
+                raise ValueError(
+                    f"{type(self).__name__} writes its checkpoints to save_dir; leave {other} out."
+                )
+        self.rotation = None
         if save_dir is not None:
-            for other in ("checkpoint_rotation", "save_trainer_file"):
-                if trainer_kwargs.get(other) is not None:
-                    raise ValueError(
-                        f"save_dir={str(save_dir)!r} and {other} both say where checkpoints go. "
-                        "Pass one of them."
-                    )
-            rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
-            rotation.settings = self.run_settings
-            trainer_kwargs["checkpoint_rotation"] = rotation
-        if trainer_kwargs.get("checkpoint") is None and not trainer_kwargs.get("save_trainer_file"):
-            trainer_kwargs["checkpoint"] = plain_checkpoint()
-        trainer_kwargs.setdefault("optimization_stepper", DetachedStepper())
-        checkpoint, buffer = (trainer_kwargs.get(k) for k in ("checkpoint", "replay_buffer"))
-        if checkpoint is not None and buffer is not None and "replay_buffer" not in checkpoint:
+            self.rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
+            self.rotation.settings = self.run_settings
+        checkpoint = plain_checkpoint(rng=GlobalRNGState())
+        if (buffer := trainer_kwargs.get("replay_buffer")) is not None:
             # A buffer's own dump() writes a pickle beside the tensors; its state dict needs none.
             checkpoint.register("replay_buffer", buffer, adapter=BufferAdapter())
-        super().__init__(**trainer_kwargs)
+        trainer_kwargs.setdefault("optimization_stepper", DetachedStepper())
+        super().__init__(checkpoint=checkpoint, checkpoint_rotation=self.rotation, **trainer_kwargs)
         self._save_at = math.inf  # time at which a checkpoint is due
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
         self._last_log: dict[str, Any] = {}
         self._saved_frames = -1  # base steps at the newest checkpoint
-        if self.checkpoint is not None and "rng" not in self.checkpoint:
-            self.checkpoint.register("rng", GlobalRNGState())
         collector = self.collector
         self.register_module("history", HistoryState(self))
         self._episodes: RunningEpisodes | None = None
@@ -142,7 +134,7 @@ class ResumableTrainer(Trainer):
 
     def _shutdown_hook(self) -> None:
         # A collector that ends by itself leaves TorchRL's loop without the checkpoint of the end.
-        if self.checkpoint_rotation is not None and self._saved_frames != self.collected_frames:
+        if self.rotation is not None and self._saved_frames != self.collected_frames:
             self.save_trainer(force_save=True)
         super()._shutdown_hook()
 
@@ -161,13 +153,10 @@ class ResumableTrainer(Trainer):
             CheckpointError: if it is damaged, of a newer version or of other settings, or does not
                 fit.
         """
-        found = newest_checkpoint(path)
-        check_settings(found, self.run_settings)
+        found = to_continue(path, self.run_settings, self.rotation)
         if self._episodes is not None:
             self._episodes.new_episodes = new_episodes
         self.load_from_file(found)
-        if isinstance(self.checkpoint_rotation, DurableRotation):
-            self.checkpoint_rotation.continue_from(found)
         return self
 
     def _num_updates(self) -> int:
@@ -176,11 +165,8 @@ class ResumableTrainer(Trainer):
 
     def train(self) -> None:
         """Train until ``total_frames`` are collected."""
-        if isinstance(self.checkpoint_rotation, DurableRotation):
-            self.checkpoint_rotation.begin()
-        self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
-        folder = getattr(self.checkpoint_rotation, "directory", None)
-        with folder_locked(folder) if folder else nullcontext(), patient():
+        with self.rotation.taken() if self.rotation else patient():
+            self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
             try:
                 if self.collected_frames < self.total_frames:
                     super().train()
@@ -215,8 +201,7 @@ class ResumableTrainer(Trainer):
 
     def last_good_checkpoint(self) -> str:
         """Return a sentence that says how to continue after an error."""
-        rotation = self.checkpoint_rotation
-        saved = None if rotation is None else rotation.latest()
+        saved = None if self.rotation is None else self.rotation.latest()
         if saved is None:
             return "There is no checkpoint: pass save_dir to have some."
         return f"The last good checkpoint is {str(saved)!r}: trainer.load() continues from it."

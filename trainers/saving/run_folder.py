@@ -137,12 +137,7 @@ def read_run(path: str | Path) -> RunFolder:
 
 
 def is_run(path: str | Path) -> bool:
-    """Return whether a folder is that of a run or of a sweep.
-
-    Example:
-        >>> is_run("nowhere")
-        False
-    """
+    """Return whether a folder is that of a run or of a sweep."""
     return any(Path(path, name).is_file() for name in ("run.json", "metrics.json", "sweep.json"))
 
 
