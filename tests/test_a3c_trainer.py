@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_trainers import make_networks
+from small_trainers import Bars, make_networks, weights
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import Tensor, nn
@@ -28,7 +28,6 @@ from torchrl.envs import EnvBase, GymEnv
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import A2CLoss
 from torchrl.record import CSVLogger
-from trainer_parts import Bars, weights
 
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.testing import ChainEnv

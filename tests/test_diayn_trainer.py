@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import Bars, weights
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.objectives import DiscreteSACLoss
 from torchrl.record import CSVLogger
-from trainer_parts import Bars, weights
 
 from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, METRAEncoderLoss

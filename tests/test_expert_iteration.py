@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_trainers import Bars, weights
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from trainer_parts import Bars, weights
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
 from torchrl_hmcts.objectives import ExpertIterationLoss

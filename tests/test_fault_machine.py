@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import make_networks
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
-from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_hmcts import compiling, processes
-from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_pool
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.testing import ChainEnv
@@ -150,30 +150,6 @@ def test_code_is_not_loaded_from_a_temporary_folder_that_others_can_write(
 # ------------------------------------------------------------------ threads and copies
 
 
-def played(env: Any, actions: torch.Tensor) -> torch.Tensor:
-    td = env.reset()
-    root = td.clone()
-
-    def play(row: torch.Tensor) -> torch.Tensor:
-        td = root.clone()
-        for action in row:
-            td = env.step(td.set("action", action))["next"].exclude("reward")
-        return td["position"]
-
-    in_turn = torch.stack([play(row) for row in actions])
-    with ThreadPoolExecutor(4) as pool:
-        together = torch.stack(list(pool.map(play, actions)))
-    assert torch.equal(in_turn, together)
-    return in_turn
-
-
-@pytest.mark.parametrize("kind", [WaterworldMazeEnv, GridworldMazeEnv])
-def test_threads_that_share_an_env_step_as_one_after_the_other(kind: Any) -> None:
-    actions = torch.randint(4, (6, 40), generator=torch.Generator().manual_seed(0))
-    end = played(kind(maze_pool("test")[:1], seed=0, max_steps=1000), actions)
-    assert len(end.unique(dim=0)) > 1
-
-
 def make_planner_env() -> Any:
     worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
     base = WaterworldMazeEnv(maze_pool("test")[:2], seed=0)
@@ -238,15 +214,6 @@ def test_a_look_after_a_long_sleep_counts_two_seconds(monkeypatch: pytest.Monkey
     assert silence.look("b") == 0.0
 
 
-def make_loss() -> A3CLoss:
-    actor = ProbabilisticActor(
-        TensorDictModule(torch.nn.Embedding(4, 2), ["state"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=torch.distributions.Categorical,
-    )
-    return A3CLoss(actor, ValueOperator(torch.nn.Embedding(4, 1), in_keys=["state"]))
-
-
 def stop_a_learner(trainer: A3CTrainer) -> list[int]:
     """Stop learner 1 as soon as it has taken a step, in a thread; its process id comes then."""
     pids: list[int] = []
@@ -262,7 +229,9 @@ def stop_a_learner(trainer: A3CTrainer) -> list[int]:
 
 
 def make_trainer(**kwargs: Any) -> A3CTrainer:
-    return A3CTrainer(lambda: ChainEnv(4), make_loss(), start_method="fork", **kwargs)
+    return A3CTrainer(
+        lambda: ChainEnv(4), A3CLoss(*make_networks(4)), start_method="fork", **kwargs
+    )
 
 
 @linux

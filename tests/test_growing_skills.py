@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 import torch
+from small_trainers import differences
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
-from trainer_parts import differences
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import Bars, differences, weights
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import (
     Binary,
@@ -23,7 +24,6 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase
-from trainer_parts import Bars, differences, weights
 
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer

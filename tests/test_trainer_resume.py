@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import differences
 from torch import nn
 from torchrl.checkpoint import CheckpointError, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, TransformedEnv
-from trainer_parts import differences
 
 from torchrl_hmcts.envs import SettableGymEnv, WaterworldMazeEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
