@@ -194,17 +194,6 @@ class TestInThisProcess:
         assert history["eval_frames"] == [3 * SEGMENT]
         assert history["eval_x"] == [float(next(trainer.policy().parameters()).sum())]
 
-    def test_each_learner_can_be_configured(self) -> None:
-        entropy = []
-        for coefficient in (0.0, 1e6):
-            trainer = make_trainer(
-                configure_learner=lambda loss, i, c=coefficient: loss.entropy_coeff.fill_(c)
-            )
-            entropy.append(trainer.train()["loss_entropy"][-1])
-            assert trainer.loss_module.entropy_coeff.item() == pytest.approx(0.01)
-        assert entropy[0] == 0.0
-        assert entropy[1] < -1e5
-
     def test_a_gradient_that_is_not_finite_is_refused(self) -> None:
         loss = make_loss()
         trainer = make_trainer(loss, lambda: NaNAfter(2 * T))

@@ -155,10 +155,6 @@ class TestDamage:
 
 
 class TestRotation:
-    def test_only_the_newest_are_kept(self, tmp_path) -> None:
-        assert loaded(save(tmp_path, 1, 2, 3, 4, keep_last=2)) == [3.0, 4.0]
-        assert len(names(tmp_path)) == 2
-
     def test_a_damaged_one_does_not_count_so_that_the_last_good_one_stays(self, tmp_path) -> None:
         rotation = save(tmp_path, 1, 2, 3)
         rotation.keep_last = 1

@@ -27,7 +27,7 @@ from torchrl_hmcts.trainers.experiments.settings import (
     WaterworldGoalsConfig,
 )
 from torchrl_hmcts.trainers.runs.config import RunConfig, home, parse_overrides
-from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
+from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
@@ -123,13 +123,6 @@ class TestFolders:
         assert main(["demo", "out=file", "overwrite=true"]) == 1
         assert "out=file is a file" in capsys.readouterr().err
         assert Path("file").read_text() == "mine"
-
-    def test_python_refuses_as_the_command_line_does(self, ran) -> None:
-        with open_run(DemoConfig(out="run")):
-            pass
-        with pytest.raises(FolderRefused, match="run holds a finished run of demo, seed 0"):
-            with open_run(DemoConfig(out="run")):
-                pass
 
     @pytest.mark.parametrize(
         ("words", "package"),

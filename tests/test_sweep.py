@@ -148,13 +148,6 @@ def test_the_key_that_matters_has_the_larger_importance_and_a_picture(tmp_path) 
         assert (tmp_path / picture).stat().st_size > 1_000
 
 
-def test_less_is_better_with_a_minus(tmp_path) -> None:
-    words = ("x=0..6", "trials=8", "objective=-test.cost", "prune=false")
-    assert sweep(tmp_path, *words) == 0
-    values = [t["value"] for t in told(tmp_path)["trials"]]
-    assert values == sorted(values)
-
-
 def test_the_same_command_goes_on(tmp_path) -> None:
     words = ("x=[1,2,3]", "prune=false")
     assert sweep(tmp_path, *words, "trials=3") == 0
