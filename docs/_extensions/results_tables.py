@@ -101,6 +101,8 @@ def _is_figure(cell: str) -> bool:
 
 def number(value: Any) -> str:
     """Return a number as people write it."""
+    if isinstance(value, list):  # of scores: their mean
+        value = sum(value) / len(value) if value else None
     if value is None or value != value:
         return ""
     if isinstance(value, str) and value.replace(".", "", 1).isdigit():  # of a CSV file
@@ -150,6 +152,16 @@ def speed(data: dict[str, Any]) -> str:
         f"`MCTSPlanner` steps a TorchRL env and makes {slow:.1f} times as many with one root, "
         f"{fast:.0f} times with {many:,}."
     )
+
+
+def sticky_means(data: dict[str, Any]) -> str:
+    """Return interquartile means of human-normalised scores, beside Dopamine's training curves."""
+    checkpoints = data["dopamine"]["frames"]
+    ours = {line["frames"]: line for line in data["summary"] if len(line["games"]) == 7}
+    rows = [[name, *values] for name, values in data["dopamine"]["interquartile_mean"].items()]
+    means = [ours[at]["interquartile_mean"] if at in ours else None for at in checkpoints]
+    rows.append(["ours, seven games", *means])
+    return table(["agent", *(f"{at:,} frames" for at in checkpoints)], rows)
 
 
 _SPEED = "agent.frames_per_second bare.frames_per_second ratio.frames_per_cpu_second"
@@ -316,6 +328,17 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             rows="rows",
             note="Ten test episodes for each seed, cut short; no setting was chosen by a score.",
         ),
+        Section(
+            "Sticky actions, whole episodes",
+            "atari/sticky.json",
+            "game seed score_at.2000000 score_at.5000000 score_at.10000000 score_at.40000000 "
+            "reactive_sticky reactive_deterministic frames_before_first_episode frames",
+            rows="rows",
+            note="A score is the mean of the last ten planned episodes that were over at that many "
+            "emulated frames, all kinds; reactive is without search. **The simulator is set** to "
+            "plan; Dopamine's agents never set theirs.",
+        ),
+        Section("Interquartile means, human-normalised", "atari/sticky.json", write=sticky_means),
     ),
     "Reliability": (
         Section(

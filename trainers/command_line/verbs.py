@@ -7,6 +7,7 @@ import os
 import sys
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from torchrl_hmcts.trainers.command_line.words import (
     split_words,
 )
 from torchrl_hmcts.trainers.experiments.dissertation import FIGURES
-from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
+from torchrl_hmcts.trainers.experiments.ogbench.config import split_name
 from torchrl_hmcts.trainers.experiments.registry import (
     ALL_EXPERIMENTS,
     DEMO,
@@ -54,7 +55,7 @@ OWN = {
     "demo": (),
     "train": ("experiment", "kit", "resume", "log_level"),
     "evaluate": ("run", "log_level"),
-    "play": ("run", "seed", "out"),
+    "play": ("run", "seed", "out", "ratio"),
     "report": ("figure", "out", "results"),
     "sweep": ("experiment", "trials", "objective", "storage", "prune", "out"),
     "data": ("id", "out", "seed", "episodes", "walker"),
@@ -236,6 +237,13 @@ def play(words: Sequence[str]) -> int:
         from torchrl_hmcts.trainers.runs.console import alive, say
 
         with alive():
+            experiment, config = load_config(read_run(home(own["run"])))
+            if experiment.name == "atari":
+                film = Path(out or Path(home(own["run"])) / "play.gif")
+                print(f"{_show_atari(config, own, film)}\nFilm: {film}")
+                return 0
+            if "ratio" in own:
+                raise ValueError("ratio is a key of Atari runs: simulated base steps per real one.")
             agent = HMCTS.load(home(own["run"]))
             print(agent)
             say("Planning and acting ...")
@@ -251,6 +259,17 @@ def play(words: Sequence[str]) -> int:
                 print(solution)
                 print(f"Page: {_write_page(agent, solution, folder, seed)}")
     return 0
+
+
+def _show_atari(config: Any, own: dict[str, str], film: Path) -> str:
+    """Write the film of an Atari run with the changes of the command; return what it shows."""
+    from torchrl_hmcts.trainers.experiments.atari.run import show_atari
+
+    if film.suffix == ".mp4":
+        raise ValueError(f"out of an Atari run is a film FILE.gif; got {str(film)!r}.")
+    kinds = {"seed": "int", "ratio": "float"}
+    changes = {key: read_value(key, own[key], kind) for key, kind in kinds.items() if key in own}
+    return show_atari(replace(config, resume=False, **changes), film)
 
 
 def _write_page(agent: HMCTS, solution: Solution, folder: Path, seed: int) -> Path:
