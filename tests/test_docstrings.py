@@ -249,23 +249,6 @@ def test_names_that_are_excused_are_public() -> None:
     assert public >= NOTHING_TO_CITE
 
 
-def test_what_a_docstring_lacks_is_noticed() -> None:
-    def doubled(x: torch.Tensor, times: int) -> torch.Tensor:
-        """Doubles.
-
-        Args:
-            x: what to double.
-        """
-        if times < 0:
-            raise ValueError("times")
-        return 2 * x
-
-    found = shortcomings("torchrl_hmcts.planners", "doubled", doubled)
-    assert found == [
-        "an Example that runs", "parameter times", "Raises ValueError", "a Reference", "shapes",
-    ]  # fmt: skip
-
-
 def test_help_on_a_tensor_class_shows_what_was_written() -> None:
     from torchrl_hmcts.planners import NodeStatistics, Plan, TreeView
 
