@@ -242,6 +242,7 @@ GOOD: dict[str, Good] = {
     **everything(
         trainers,
         SearchGuide={"num_options": 3, "hidden": (4,), "buffer_size": 8},
+        ReactiveManager={"num_options": 3, "hidden": (4,), "buffer_size": 8},
         OptionGoals={"goals": [0, 2]},
         AtariSearch={},
         RuleSource={},

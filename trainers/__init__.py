@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
     from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
     from torchrl_hmcts.trainers.experiments.atari.options import Options
+    from torchrl_hmcts.trainers.experiments.atari.reactive import ReactiveManager
     from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
     from torchrl_hmcts.trainers.experiments.atari.sources import TrainedSource
     from torchrl_hmcts.trainers.experiments.goals import make_maze_networks
