@@ -19,6 +19,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import torch
 from learned_termination import (
     MazeView,
     TerminationConfig,
@@ -34,7 +35,6 @@ from torchrl.envs import Compose, TransformedEnv
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.modules import (
-    AnyTermination,
     LearnedTermination,
     StallTermination,
     TerminationNetwork,
@@ -74,7 +74,11 @@ def make_terminating_env(
     if network is not None:
         seen = TensorDictSequential(MazeView(base.mazes), network)
         conditions.append(LearnedTermination(seen, every=5))
-    options = OptionTransform(worker, 4, max_steps, termination=AnyTermination(*conditions))
+
+    def ends(td: TensorDictBase) -> Tensor:
+        return torch.stack([c(td).reshape(td.batch_size) for c in conditions]).any(0)
+
+    options = OptionTransform(worker, 4, max_steps, termination=ends)
     return TransformedEnv(base, Compose(StallTransform("position", STALL_TOLERANCE), options))
 
 

@@ -146,27 +146,6 @@ def test_it_equals_a2c_with_torchrls_td1(duration: bool) -> None:
         torch.testing.assert_close(actual[key], expected[key], atol=1e-5, rtol=1e-4)
 
 
-def test_without_durations_every_step_counts_as_one() -> None:
-    networks, segment = make_networks(), make_segment()
-    loss = A3CLoss(*networks, gamma=GAMMA)
-    smdp = loss(segment)["loss_critic"]
-    plain = loss(segment.exclude(("next", "duration")))["loss_critic"]
-    segment["next", "duration"].fill_(1)
-    assert loss(segment)["loss_critic"].item() == plain.item() != smdp.item()
-
-
-def test_what_comes_after_an_episode_does_not_reach_back() -> None:
-    segment, (_, critic) = make_segment((1,), 6), make_networks()
-    segment["next", "done"].zero_()[0, 2] = True
-    segment["next", "terminated"].zero_()
-    estimator = NStepReturn(gamma=GAMMA, value_network=critic)
-    before = estimator(segment.clone())["value_target"][0]
-    segment["next", "reward"][0, 3:] += 100.0
-    after = estimator(segment.clone())["value_target"][0]
-    assert torch.equal(before[:3], after[:3])
-    assert (after[3:] - before[3:] > 50.0).all()
-
-
 def test_the_critic_is_asked_for_next_values_only_where_they_are_used() -> None:
     segment, (_, critic) = make_segment((2,), 5), make_networks()
     segment["next", "done"].zero_()[0, 1] = True  # truncated; and two ends of the segment

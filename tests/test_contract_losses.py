@@ -399,26 +399,6 @@ def test_no_loss_that_is_exported_is_left_out() -> None:
 VMAPPED = ["diayn", "discrete_sac", "continuous_sac"]
 
 
-def test_no_choice_of_a_loss_is_left_out() -> None:
-    """Neither target networks, nor value estimators, nor vmap."""
-    vmapped = set()
-    for name, case in CASES.items():
-        loss = case.make(lambda key: key)
-        targets = [
-            key.removeprefix("target_").removesuffix("_params")
-            for key in dir(loss)
-            if key.startswith("target_") and key.endswith("_params")
-        ]
-        held = [t for t in targets if getattr(loss, f"target_{t}_params", None) is not None]
-        assert sorted(case.targets) == held, name
-        for kind in set(ValueEstimators) - set(case.value_estimators):
-            with pytest.raises(NotImplementedError):
-                case.make(lambda key: key).make_value_estimator(kind)
-        if hasattr(loss, "deactivate_vmap"):
-            vmapped.add(name.removesuffix("_one_hot"))
-    assert vmapped == set(VMAPPED)
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt:FutureWarning")
 @pytest.mark.parametrize("name", VMAPPED)

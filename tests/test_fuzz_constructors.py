@@ -299,7 +299,7 @@ EXCLUDED = {  # why public names are not fuzzed here
     "SkillWorker PolicyWorker GridView MujocoBatch HMCTS "
     "EffectModel LandmarkEnv LandmarkModel GoalCloningLoss AttributeSnapshot ReplaySnapshot "
     "SettableGymEnv Snapshot OptionModelEnv TorchRLGymnasiumEnv "
-    "DurableRotation AnyTermination",
+    "DurableRotation",
     "is the base of configs that are fuzzed": "SkillsConfig",
     "hands its arguments to SkillReward": "SkillRewardHook",
     "searches from any object": "ReferenceSearch",

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
-from torchrl.envs import TransformedEnv
+from torchrl.envs import (
+    TransformedEnv,
+)
 
 from torchrl_hmcts.modules import (
     ConcatSkillMLP,
@@ -80,15 +84,6 @@ def test_stacked_parameters_give_each_copys_output(network: type, batch: tuple[i
     torch.testing.assert_close(both, expected)
     assert nets[0].stackable
     assert not network(2, 4, 3, activation=torch.nn.PReLU).stackable
-
-
-@pytest.mark.parametrize("network", NETWORKS)
-def test_the_mlp_can_be_vmapped_over_parameters(network: type) -> None:
-    nets = [network(2, 4, num_skills=3) for _ in range(2)]
-    x, skill = torch.randn(5, 2), torch.randint(3, (5,))
-    params, _ = torch.func.stack_module_state(nets)
-    out = torch.vmap(lambda p: torch.func.functional_call(nets[0], p, (x, skill)))(params)
-    torch.testing.assert_close(out, torch.stack([net(x, skill) for net in nets]))
 
 
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 8)])
@@ -224,3 +219,48 @@ def test_the_policy_samples_continuous_actions_from_the_actors_distribution() ->
     torch.testing.assert_close(ours.std(0), theirs.std(0), atol=0.03, rtol=0)
     again = SkillPolicy(actor, generator=torch.Generator().manual_seed(0))(td)["action"]
     assert torch.equal(ours, again)
+
+
+def test_float64_observations_are_read_in_the_precision_of_the_networks() -> None:
+    seen = torch.randn(5, 4, dtype=torch.float64)
+    td = TensorDict(observation=seen, skill=torch.arange(5) % 3, batch_size=[5])
+    keys: dict[str, Any] = {"in_keys": ["observation"]}
+    for network in (
+        SkillActor(4, Bounded(-1.0, 1.0, shape=(2,)), 3, **keys).module[0],
+        SkillActor(4, Categorical(2), 3, network=ConcatSkillMLP, **keys).module[0],
+        SkillDiscriminator(4, 3, **keys),
+        SkillEncoder(4, 3, linear=SpectralLinear, **keys),
+    ):
+        with torch.no_grad():  # a spectral norm takes a step of its iteration with gradients
+            double = network(td.clone())
+            single = network(td.clone().set("observation", seen.float()))
+        for key in network.out_keys:
+            assert double[key].dtype == torch.float32
+            assert double[key].equal(single[key]), key
+    narrow = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float64)
+    assert SkillPolicy(SkillActor(4, narrow, 3, **keys))(td)["action"].dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("features", "dtype", "message"),
+    [
+        (3, torch.float32, r"for 3 features of torch.float32 was given 4.*in_features=4"),
+        (4, torch.int64, r"of torch.float32 was given 4 of torch.int64.*DTypeCastTransform"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["actor", "discriminator", "concatenated"])
+def test_a_network_that_does_not_fit_what_it_reads_says_so(
+    features: int, dtype: torch.dtype, message: str, kind: str
+) -> None:
+    keys = {"in_keys": ["observation"]}
+    if kind == "discriminator":
+        module: torch.nn.Module = SkillDiscriminator(features, num_skills=3, **keys)
+    else:
+        network = SkillMLP if kind == "actor" else ConcatSkillMLP
+        module = SkillActor(features, Categorical(2), num_skills=3, network=network, **keys)
+    given = 4 if features == 3 else features
+    message = message if kind != "concatenated" else "was given"
+    seen = torch.zeros(5, given, dtype=dtype)
+    td = TensorDict(observation=seen, skill=torch.zeros(5, dtype=torch.int64))
+    with pytest.raises(ValueError, match=message):
+        module(td.auto_batch_size_(1))

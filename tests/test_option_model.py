@@ -137,7 +137,7 @@ def test_a_member_alone_predicts_what_it_predicts_among_the_others() -> None:
     expected = model.outputs(td)
     for index in range(3):
         torch.testing.assert_close(model.member(index).outputs(td)[0], expected[index])
-    with pytest.raises(ValueError, match="0 to 2; got index 3"):
+    with pytest.raises(IndexError):
         model.member(3)
 
 
@@ -163,7 +163,7 @@ def test_features_are_computed_before_the_networks_and_left_out_of_the_data() ->
 
 def test_bad_models_are_refused_with_their_value() -> None:
     shared = Table(5)
-    with pytest.raises(ValueError, match="same module twice"):
+    with pytest.raises(ValueError, match="builds a new one"):
         OptionModel(lambda n: shared, ["option"], {"position": 2}, max_duration=3, num_models=2)
     widths = iter([4, 5])
     with pytest.raises(ValueError, match="alike"):

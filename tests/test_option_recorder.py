@@ -154,13 +154,6 @@ def test_elements_that_do_not_step_leave_nothing() -> None:
     assert data["skill"].tolist() == [1, 1, 1, 0, 0, 0]
 
 
-def test_one_hot_options_are_stored_as_the_workers_skill() -> None:
-    recorder = OptionRecorder(["state", "skill"])
-    env = make_env(recorder, one_hot=True)
-    env.step(env.reset().set("option", torch.tensor([False, True])))
-    assert recorder.take()["skill"].tolist() == [1, 1, 1]
-
-
 def test_what_was_taken_is_forgotten() -> None:
     recorder = OptionRecorder(KEYS)
     step(make_env(recorder), [0], [1])

@@ -7,22 +7,16 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import InteractionType, TensorDictModule, set_interaction_type
+from tensordict.nn import InteractionType, TensorDictModule
 from torch import nn
-from torchrl.collectors import Collector
 from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
     Composite,
     Unbounded,
 )
 from torchrl.envs import (
     Compose,
-    EnvBase,
     GymEnv,
     ParallelEnv,
-    PendulumEnv,
     RewardScaling,
     RewardSum,
     SerialEnv,
@@ -32,59 +26,14 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs, step_mdp
 from torchrl.modules import ProbabilisticActor
 
-from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_from_text, maze_pool
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
-from torchrl_hmcts.testing import ChainEnv, TableEnv
+from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.transforms import OptionTransform
 
 GAMMA = 0.9
 BATCHES = [[], [3], [2, 3]]
 LEFT, RIGHT = 0, 1
-
-
-class NestedChainEnv(EnvBase):
-    """A chain whose entries are nested; the rewards of two agents are the state and minus it."""
-
-    batch_locked = False
-    _supports_set_state = True
-
-    def __init__(self, length=6):
-        super().__init__(batch_size=[])
-        self.length = length
-        state = Bounded(0, length, shape=(), dtype=torch.int64)
-        self.state_spec = Composite(agent=Composite(state=state))
-        self.observation_spec = Composite(
-            agent=Composite(state=state.clone(), seen=Composite(double=Unbounded((1,))))
-        )
-        self.full_action_spec = Composite(agent=Composite(action=Categorical(2, shape=())))
-        self.full_reward_spec = Composite(agent=Composite(reward=Unbounded((2, 1))))
-        self.full_done_spec = Composite(
-            {key: Binary(1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
-        )
-
-    def _observe(self, state):
-        return {"state": state, "seen": {"double": 2.0 * state.unsqueeze(-1)}}
-
-    def _step(self, tensordict):
-        state = tensordict["agent", "state"] + 2 * tensordict["agent", "action"] - 1
-        state = state.clamp(0, self.length)
-        done = (state == self.length).unsqueeze(-1)
-        reward = torch.stack([state, -state], -1).unsqueeze(-1).float()
-        agent = {**self._observe(state), "reward": reward}
-        return TensorDict(
-            {"agent": agent, "done": done, "terminated": done, "truncated": torch.zeros_like(done)},
-            batch_size=tensordict.shape,
-        )
-
-    def _reset(self, tensordict=None, **kwargs):
-        shape = [] if tensordict is None else tensordict.shape
-        state = torch.zeros(shape, dtype=torch.int64)
-        if kwargs.get("set_state"):
-            state = tensordict["agent", "state"].clone()
-        return TensorDict({"agent": self._observe(state)}, batch_size=shape)
-
-    def _set_seed(self, seed):
-        """Nothing is random."""
 
 
 class Hidden(nn.Module):
@@ -101,32 +50,6 @@ class Hidden(nn.Module):
 
 def skill_is_action(action_key="action", skill_key="skill"):
     return TensorDictModule(lambda skill: skill.clone(), [skill_key], [action_key])
-
-
-def nested_worker():
-    return skill_is_action(("agent", "action"))
-
-
-def constant(action):
-    """A worker that always takes the same action."""
-    return TensorDictModule(
-        lambda skill: action.expand(*skill.shape, *action.shape).clone(), ["skill"], ["action"]
-    )
-
-
-def towards_corner():
-    """A Waterworld worker that looks at the state: skill 0 to the left or up, 1 right or down."""
-
-    def choose(position, velocity, skill):
-        along = (position.sum(-1) + velocity.sum(-1)).mul(3).long() % 2
-        return 2 * along + skill
-
-    return TensorDictModule(choose, ["position", "velocity", "skill"], ["action"])
-
-
-def waterworld(**kwargs):
-    """A small room, so that episodes end inside options, at different steps."""
-    return WaterworldMazeEnv(maze_from_text("...\n.#.\n...")[0][None], seed=0, **kwargs)
 
 
 def chain(*, start=None, batch=(), **kwargs):
@@ -221,19 +144,6 @@ class TestAgainstALoop:
         assert after.shape == td.shape
         assert_close(after, by_hand(env, td, skill_is_action(), max_steps))
 
-    @pytest.mark.parametrize("batch", [[], [20], [4, 5]])
-    def test_waterworld_with_a_worker_that_looks_at_the_state(self, batch):
-        env, worker = waterworld(max_steps=40), towards_corner()
-        td = env.reset(TensorDict(batch_size=batch))
-        ends = 0
-        for _ in range(3):
-            td["option"] = torch.randint(2, batch)
-            after = macro(env, worker, max_steps=15).step(td.clone())["next"]
-            assert_close(after, by_hand(env, td, worker, 15))
-            ends += after["done"].sum()
-            td = after.exclude("reward", "duration")
-        assert not batch or ends > 0
-
     @pytest.mark.parametrize("batch", BATCHES)
     @pytest.mark.parametrize("shape", [(), (1,)])
     def test_a_termination_ends_an_option(self, batch, shape):
@@ -249,49 +159,6 @@ class TestAgainstALoop:
         td["option"] = torch.randint(2, batch)
         after = macro(env, max_steps=6, termination=termination).step(td.clone())["next"]
         assert_close(after, by_hand(env, td, skill_is_action(), 6, termination))
-
-    def test_a_termination_at_once_still_takes_one_base_step(self):
-        env, td = chain(start=[1, 2], batch=[2])
-        always = lambda td: torch.ones(td.shape, dtype=torch.bool)  # noqa: E731
-        after = step_next(macro(env, termination=always), td, [RIGHT, LEFT])
-        assert after["state"].tolist() == [2, 1]
-        assert after["duration"].tolist() == [[1], [1]]
-
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_nested_keys(self, batch):
-        env = NestedChainEnv()
-        worker = nested_worker()
-        td = env.reset(TensorDict(batch_size=batch))
-        td["agent", "state"] = torch.randint(6, batch)
-        td["option"] = torch.randint(2, batch)
-        check_env_specs(macro(env, worker))
-        after = macro(env, worker).step(td.clone())["next"]
-        assert_close(after, by_hand(env, td, worker, reward_key=("agent", "reward")))
-
-    def test_the_keys_of_option_skill_and_duration_can_be_nested(self):
-        env, td = chain(start=3)
-        env = macro(
-            env,
-            skill_is_action(skill_key=("manager", "skill")),
-            option_key=("manager", "option"),
-            skill_key=("manager", "skill"),
-            duration_key=("manager", "duration"),
-        )
-        check_env_specs(env)
-        assert env.action_key == ("manager", "option")
-        td.set(("manager", "option"), torch.tensor(RIGHT))
-        assert env.step(td)["next", "manager", "duration"].tolist() == [2]
-
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_one_hot_options(self, batch):
-        env, td = chain(batch=batch)
-        td["state"] = torch.randint(5, batch)
-        option = torch.randint(2, batch)
-        one_hot = macro(env, one_hot=True)
-        check_env_specs(one_hot)
-        td["option"] = nn.functional.one_hot(option, 2).bool()
-        after = one_hot.step(td.clone())["next"]
-        assert_close(after, by_hand(env, td.set("option", option), skill_is_action()))
 
     def test_a_root_can_be_stepped_again_with_another_option(self):
         """What the first step left under "next" is of no consequence for the second."""
@@ -337,18 +204,6 @@ class TestStochasticWorker:
             durations.add(after["duration"].item())
         assert len(durations) > 2
 
-    def test_elements_sample_independently(self):
-        base, td = chain(start=[1] * 50, batch=[50])
-        after = step_next(macro(base, self.actor(), max_steps=3), td, [RIGHT] * 50)
-        assert len(after["state"].unique()) > 2
-
-    def test_it_follows_the_interaction_type(self):
-        base, td = chain(start=[1] * 50, batch=[50])
-        with set_interaction_type(InteractionType.DETERMINISTIC):
-            after = step_next(macro(base, self.actor(), max_steps=3), td, [RIGHT] * 50)
-            expected = by_hand(base, td.set("option", torch.ones(50).long()), self.actor(), 3)
-        assert_close(after, expected)
-
 
 class TestBatchedEnvs:
     """Two chains; the element at state 3 ends its option (and episode) after two base steps."""
@@ -375,36 +230,6 @@ class TestBatchedEnvs:
                 check_macro_rollout(base, td, skill_is_action(), **kwargs)
         finally:
             envs.close()
-
-    def test_nested_keys(self):
-        env = macro(SerialEnv(2, NestedChainEnv), nested_worker())
-        check_env_specs(env)
-        td = env.reset()
-        td["agent", "state"] = torch.tensor([0, 4])
-        td["option"] = torch.tensor([RIGHT, RIGHT])
-        expected = by_hand(
-            NestedChainEnv(), td.clone(), nested_worker(), reward_key=("agent", "reward")
-        )
-        assert_close(env.step(td)["next"], expected)
-
-    @pytest.mark.parametrize("skill", [0, 1])
-    def test_two_cart_poles_fall_at_different_steps(self, skill):
-        envs = SerialEnv(2, partial(GymEnv, "CartPole-v1"))
-        envs.set_seed(0)
-        env = macro(envs, balancing(), max_steps=60)
-        td = env.reset()
-        after = step_next(env, td, [skill, skill])
-        seed = 0
-        for i in range(2):
-            single = GymEnv("CartPole-v1")
-            seed = single.set_seed(seed)
-            root = single.reset()
-            assert torch.equal(root["observation"], td["observation"][i])
-            root["option"] = torch.tensor(skill)
-            assert_close(after[i], option_by_hand(single, root, balancing(), 60)[0])
-        if skill == 0:  # always to the left
-            assert after["done"].all()
-            assert after["duration"][0] != after["duration"][1]
 
 
 def balancing():
@@ -437,13 +262,6 @@ class TestGymEnv:
                 break
             td, root = after, expected
         assert max_steps == 1 or after["done"]
-
-    def test_rollouts_go_on_into_the_next_episode(self):
-        env = macro(GymEnv("CartPole-v1"), balancing(), max_steps=4)
-        td = env.rollout(30, break_when_any_done=False)
-        done = td["next", "done"].squeeze(-1)
-        assert done.sum() >= 2
-        assert (td["next", "duration"].squeeze(-1)[~done] == 4).all()
 
 
 def check_macro_rollout(base, td, worker, max_steps=4, break_when_all_done=False, **_):
@@ -480,30 +298,6 @@ class TestRollouts:
         )
         assert until_all or td.shape == (*batch, 20)
         check_macro_rollout(base, td, skill_is_action(), break_when_all_done=until_all)
-
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_it_can_be_set_to_a_state(self, batch):
-        base, _ = chain()
-        env = macro(base)
-        assert env._supports_set_state
-        state = torch.randint(1, 5, batch)
-        td = env.reset(TensorDict({"state": state}, batch_size=batch), set_state=True)
-        assert torch.equal(td["state"], state)
-        assert torch.equal(td["duration"], torch.zeros((*batch, 1), dtype=torch.int64))
-        td["option"] = torch.full(batch, LEFT)
-        after = env.step(td)["next"]
-        assert torch.equal(after["state"], (state - 4).clamp_min(0))
-
-    def test_a_collector_gathers_macro_steps(self):
-        base, _ = chain()
-        collector = Collector(
-            macro(base), frames_per_batch=20, total_frames=40, policy=None, trust_policy=True
-        )
-        batches = list(collector)
-        assert len(batches) == 2
-        for td in batches:
-            check_macro_rollout(base, td.select("state", "option", "next"), skill_is_action())
-        collector.shutdown()
 
 
 class TestOtherTransforms:
@@ -584,35 +378,6 @@ class TestTrajectories:
         assert after["trajectory"].shape == (*batch, 4)
         check_trajectories(ChainEnv(6), td.select("state", "option"), after, skill_is_action(), 4)
 
-    def test_in_a_gym_env(self):
-        keys = ["observation", "action", ("next", "observation")]
-        env = macro(GymEnv("CartPole-v1"), balancing(), max_steps=30, trajectory_keys=keys)
-        check_env_specs(env)
-        base = GymEnv("CartPole-v1")
-        for e in (env, base):
-            e.set_seed(1)
-        root = base.reset().set("option", torch.tensor(0))
-        after = step_next(env, env.reset(), 0)
-        check_trajectories(base, root, after, balancing(), 30, keys)
-
-    def test_of_nested_keys(self):
-        keys = [("agent", "action"), ("agent", "seen", "double"), ("next", "agent", "reward")]
-        worker = nested_worker()
-        base = NestedChainEnv()
-        env = macro(base, worker, trajectory_keys=keys)
-        check_env_specs(env)
-        td = TensorDict({("agent", "state"): torch.tensor([0, 3, 5])}, batch_size=[3])
-        td = base.reset(td, set_state=True)
-        td["option"] = torch.tensor([RIGHT, RIGHT, LEFT])
-        trajectory = env.step(td)["next", "trajectory"]
-        assert trajectory["next", "agent", "reward"][..., 0, 0].tolist() == [
-            [1, 2, 3, 4],
-            [4, 5, 6, 0],
-            [4, 3, 2, 1],
-        ]
-        assert trajectory["agent", "seen", "double"][1].flatten().tolist() == [6, 8, 10, 0]
-        assert trajectory["agent", "action"].tolist() == [[1] * 4, [1, 1, 1, 0], [0] * 4]
-
     @pytest.mark.parametrize(
         ("keys", "message"),
         [
@@ -623,42 +388,6 @@ class TestTrajectories:
     def test_keys_that_record_nothing_are_refused(self, keys, message):
         with pytest.raises(ValueError, match=message):
             macro(ChainEnv(6), trajectory_keys=keys)
-
-
-def pendulum():
-    return macro(PendulumEnv(), constant(torch.tensor([0.5])), num_options=3, max_steps=6)
-
-
-class TestEveryEnv:
-    @pytest.mark.parametrize(
-        "make",
-        [
-            lambda: macro(ChainEnv(6)),
-            lambda: macro(GymEnv("CartPole-v1"), balancing(), max_steps=5),
-            lambda: macro(ChainEnv(6, batch_size=[4])),
-            lambda: macro(ChainEnv(6, batch_size=[2, 3])),
-            lambda: macro(
-                TableEnv(
-                    {(0, 0): (1, 2.0, 3), (0, 1): (2, 1.0, 1), (1, 1): (2, 0, 2)}, terminal=[2]
-                )
-            ),
-            lambda: macro(waterworld(), towards_corner()),
-            lambda: macro(WaterworldMazeEnv(maze_pool("test"), batch_size=[4]), towards_corner()),
-            lambda: macro(GridworldMazeEnv(maze_pool("test")), skill_is_action(), num_options=5),
-            pendulum,
-            lambda: macro(NestedChainEnv(), nested_worker()),
-        ],
-    )
-    def test_specs_hold(self, make):
-        check_env_specs(make(), return_contiguous=True)
-
-    @pytest.mark.parametrize("batch", BATCHES)
-    def test_pendulum_steps_are_those_of_a_loop(self, batch):
-        env, base = pendulum(), PendulumEnv()
-        td = base.reset(base.gen_params(batch_size=batch), set_state=False)
-        td["option"] = torch.zeros(batch, dtype=torch.int64)
-        after = env.step(td.clone())["next"]
-        assert_close(after, by_hand(base, td, constant(torch.tensor([0.5])), 6))
 
 
 class TestOwnership:
@@ -674,16 +403,6 @@ class TestOwnership:
         assert not list(env.parameters())
         assert not env.state_dict()
         assert transform.worker is worker
-
-    def test_no_gradient_flows_through_the_worker(self):
-        net = nn.Linear(1, 1)
-        worker = TensorDictModule(
-            lambda state, skill: (net(state.unsqueeze(-1).float()).squeeze(-1) > 0).long(),
-            ["state", "skill"],
-            ["action"],
-        )
-        td = macro(ChainEnv(6), worker).rollout(3)
-        assert not td["next", "reward"].requires_grad
 
     def test_a_clone_serves_a_second_env_with_the_same_worker(self):
         transform = OptionTransform(skill_is_action(), 2, 4, GAMMA)
@@ -725,18 +444,12 @@ class TestBadInput:
         broken((macro(base), td.set("option", options)), message)
 
     @pytest.mark.parametrize(
-        ("option", "one_hot", "message"),
-        [
-            ([0.0, 1.0], False, r"int64 \[2\]; got torch.float32 \[2\]"),
-            ([[0], [1]], False, r"int64 \[2\]; got torch.int64 \[2, 1\].*rand_action"),
-            ([[True, False, False]] * 2, True, r"one-hot \[2, 2\]; got torch.bool \[2, 3\]"),
-            ([[True, False], [False, False]], True, r"one-hot.*\[False, False\]"),
-            ([[True, True], [False, True]], True, r"one-hot.*\[True, True\]"),
-        ],
+        ("option", "got"), [([0.0, 1.0], r"float32 \[2\]"), ([[0], [1]], r"int64 \[2, 1\]")]
     )
-    def test_an_option_of_the_wrong_form_is_refused(self, option, one_hot, message):
+    def test_an_option_of_the_wrong_form_is_refused(self, option, got):
         base, td = chain(batch=[2])
-        broken((macro(base, one_hot=one_hot), td.set("option", torch.tensor(option))), message)
+        message = rf"must be int64 \[2\]; got torch.{got}.*rand_action"
+        broken((macro(base), td.set("option", torch.tensor(option))), message)
 
     def test_a_missing_option_is_refused(self):
         base, td = chain()
@@ -769,17 +482,10 @@ class TestBadInput:
     )
     def test_a_worker_that_does_not_fit_is_refused_when_attached(self, worker, message):
         with pytest.raises(ValueError, match=message):
-            macro(ChainEnv(6), worker)
-        with pytest.raises(ValueError, match=message):
             TransformedEnv(ChainEnv(6), Compose(StepCounter(), OptionTransform(worker, 2, 4)))
         env = TransformedEnv(ChainEnv(6))
         with pytest.raises(ValueError, match=message):
             env.append_transform(OptionTransform(worker, 2, 4))
-
-    def test_an_action_that_does_not_fit_a_continuous_env_is_refused(self):
-        message = r"wrote 'action' = torch.float32 \[1\] with values up to 7, which does not fit"
-        with pytest.raises(ValueError, match=message):
-            macro(PendulumEnv(), constant(torch.tensor([7.0])))
 
     def test_a_worker_that_fails_midway_leaves_nothing_behind(self):
         def fail_later(state, skill):
@@ -796,8 +502,3 @@ class TestBadInput:
         env.reward_spec = Composite(reward=Unbounded((1,)), cost=Unbounded((1,)))
         with pytest.raises(ValueError, match="sums one reward; ChainEnv has the rewards .*cost"):
             macro(env)
-
-    def test_one_transform_cannot_serve_two_envs(self):
-        env = macro(ChainEnv(6))
-        with pytest.raises(AttributeError, match=r"already set.*clone\(\)"):
-            TransformedEnv(ChainEnv(6), Compose(StepCounter())).append_transform(env.transform)

@@ -190,14 +190,6 @@ def test_dads_learns_the_standard_deviation_of_the_changes() -> None:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_any_batch_shape_will_do(name: str) -> None:
-    td, objective = make_data(6), make_objective(name).eval()
-    shaped = td.view(2, 3)
-    torch.testing.assert_close(objective(td).to_dict(), objective(shaped).to_dict())
-    torch.testing.assert_close(objective.reward(td).view(2, 3, 1), objective.reward(shaped))
-
-
-@pytest.mark.parametrize("name", LOSSES)
 def test_skills_that_are_switched_off_count_for_nothing(name: str) -> None:
     prior = GrowingSkillPrior(3, num_active=2)
     objective = make_objective(name, prior=prior)
@@ -459,28 +451,6 @@ def test_the_loss_hands_its_skill_key_and_reduction_down_and_takes_them_over() -
         make_loss(objective, reduction="mean")
     with pytest.raises(TypeError, match="SkillDiscriminator"):
         make_loss(SkillDiscriminator(2, 4))
-
-
-def test_a_stranger_of_an_objective_swaps_in_too() -> None:
-    class Rightwards(SkillObjective):
-        """Skill 1 is paid for going right, skill 0 for going left; nothing to learn."""
-
-        root_features = next_features = ("position",)
-        out_keys = ["mean_step"]
-
-        def losses(self, tensordict: TensorDictBase) -> dict[str, torch.Tensor]:
-            step = tensordict["next", "position"] - tensordict["position"]
-            return {"mean_step": self._average(step.norm(dim=-1))}
-
-        def reward(self, tensordict: TensorDictBase) -> torch.Tensor:
-            step = tensordict["next", "position"] - tensordict["position"]
-            return (2.0 * tensordict["skill"].unsqueeze(-1) - 1.0) * step[..., :1]
-
-    loss = make_loss(Rightwards(2))
-    SoftUpdate(loss, tau=0.1)
-    data = SkillReward(loss.objective)(make_env(8).rollout(2, loss.actor_network).reshape(-1))
-    assert set(loss(data).keys()) == set(loss.out_keys)
-    assert "mean_step" in loss.out_keys
 
 
 @torch.no_grad()

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import ActionMask, Compose, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.modules import (
@@ -24,13 +24,6 @@ from torchrl_hmcts.objectives import SkillPriorLoss
 from torchrl_hmcts.planners import MCTSPlanner
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.transforms import OptionTransform, SkillMaskTransform
-
-PRIORS = {
-    "fixed": lambda: FixedSkillPrior(3, [2.0, 1.0, 1.0]),
-    "switched off": lambda: FixedSkillPrior(3, [1.0, 0.0, 1.0]),
-    "growing": lambda: GrowingSkillPrior(3, 2),
-    "learned": lambda: LearnedSkillPrior(3, [1.0, 0.0, -1.0]),
-}
 
 
 def test_a_growing_prior_is_uniform_over_the_first_skills_and_resumes_so() -> None:
@@ -132,12 +125,6 @@ def test_the_minimum_is_the_softmax_of_the_rewards(beta: float) -> None:
     torch.testing.assert_close(probs, (rewards / beta).softmax(-1), atol=1e-3, rtol=0)
 
 
-def test_without_an_entropy_bonus_the_best_skill_takes_all() -> None:
-    loss = SkillPriorLoss(LearnedSkillPrior(3), entropy_coeff=0.0, prior_in_reward=False)
-    probs = minimise(loss, transitions([0, 1, 2], [0.0, 1.0, 0.5]))
-    assert probs[1] > 0.99
-
-
 def test_the_mean_runs_over_batches_and_a_skill_never_seen_counts_as_average() -> None:
     loss = SkillPriorLoss(LearnedSkillPrior(3), decay=0.75, prior_in_reward=False)
     loss(transitions([0, 1, 1], [1.0, 2.0, 4.0]))
@@ -196,23 +183,6 @@ def test_the_planner_takes_no_option_whose_skill_is_off() -> None:
     assert visits[0] > 0 == visits[1]
     everything = masked_chain(FixedSkillPrior(2))
     assert MCTSPlanner(everything, seed=0).plan(everything.reset().unsqueeze(0)).found.all()
-
-
-def test_random_actions_stay_within_the_mask_behind_torchrls_own_transform() -> None:
-    env = masked_chain(GrowingSkillPrior(2, 1))
-    env.append_transform(ActionMask("option"))
-    options = env.rollout(20, break_when_any_done=False)["option"]
-    assert not options.any()
-
-
-def test_nested_mask_keys_and_states_made_without_the_env() -> None:
-    prior = GrowingSkillPrior(2, 1)
-    env = masked_chain(prior, mask_key=("agent", "mask"))
-    check_env_specs(env)
-    transform = SkillMaskTransform(prior)
-    state: TensorDictBase = TensorDict(batch_size=[2, 1])
-    assert transform.mask(state)["action_mask"].tolist() == [[[True, False]]] * 2
-    assert list(transform.parameters()) == list(transform.buffers()) == []
 
 
 def test_a_mask_that_makes_no_sense_is_refused() -> None:

@@ -19,7 +19,7 @@ from torchrl.objectives import (
     DQNLoss,
     ValueEstimators,
 )
-from torchrl.objectives.value import GAE, TD0Estimator, TDLambdaEstimator
+from torchrl.objectives.value import GAE, TD0Estimator
 from torchrl.trainers.algorithms.ppo import PPOTrainer
 
 from torchrl_hmcts.objectives import use_durations as durations
@@ -95,13 +95,6 @@ def advantages_by_loop(td, value, next_value, lmbda):
 
 
 class TestEstimators:
-    def test_macro_rewards_are_the_closed_form(self, rollout):
-        """-0.1 per base step, 1 on arrival: (1 - gamma**k) / (1 - gamma) of the former."""
-        k = rollout["next", "duration"].float()
-        expected = -0.1 * (1 - GAMMA**k) / (1 - GAMMA)
-        expected += GAMMA ** (k - 1) * rollout["next", "terminated"]
-        torch.testing.assert_close(rollout["next", "reward"], expected)
-
     @pytest.mark.parametrize("kind", ["TD(0)", "GAE", "GAE, vectorized"])
     def test_advantages_are_discounted_by_the_duration(self, rollout, critic, kind):
         settings = {"gamma": GAMMA, "value_network": critic}
@@ -114,40 +107,6 @@ class TestEstimators:
         out = durations(estimator)(rollout.clone())
         torch.testing.assert_close(out["advantage"], expected, atol=1e-5, rtol=1e-4)
         torch.testing.assert_close(out["value_target"], expected + value, atol=1e-5, rtol=1e-4)
-
-    def test_td_lambda_discounts_by_the_duration(self, rollout, critic):
-        """The lambda return is the value plus the same sum of deltas."""
-        estimator = durations(
-            TDLambdaEstimator(gamma=GAMMA, lmbda=LMBDA, value_network=critic, vectorized=False)
-        )
-        value, next_value = values(rollout, critic)
-        out = estimator(rollout.clone())
-        # Next to the end of an episode V(s') is not the value of the next root but of s'.
-        target = torch.zeros_like(value)
-        following = next_value[:, -1]
-        for t in reversed(range(rollout.shape[1])):
-            done = rollout["next", "done"][:, t]
-            mixed = (1 - LMBDA) * next_value[:, t] + LMBDA * following
-            last = t == rollout.shape[1] - 1
-            ahead = torch.where(done, next_value[:, t], next_value[:, t] if last else mixed)
-            target[:, t] = smdp_targets(rollout[:, t], ahead)
-            following = target[:, t]
-        torch.testing.assert_close(out["value_target"], target, atol=1e-5, rtol=1e-4)
-
-    @pytest.mark.parametrize(
-        "make",
-        [
-            lambda critic: TD0Estimator(gamma=GAMMA, value_network=critic),
-            lambda critic: GAE(gamma=GAMMA, lmbda=LMBDA, value_network=critic),
-        ],
-    )
-    def test_without_the_key_every_macro_step_counts_as_one(self, rollout, critic, make):
-        plain = make(critic)(rollout.clone())["advantage"]
-        smdp = durations(make(critic))(rollout.clone())["advantage"]
-        assert (plain - smdp).abs().max() > 0.1
-        ones = rollout.clone()
-        ones["next", "duration"].fill_(1)
-        torch.testing.assert_close(durations(make(critic))(ones)["advantage"], plain)
 
 
 class TestAChainOfKnownValue:

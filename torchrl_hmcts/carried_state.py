@@ -222,12 +222,6 @@ class ForeignStates:
                     return f"{_name(transform)}.{name}"
         return None
 
-    def put_back(self, before: list[dict[str, Any]]) -> None:
-        """Write what :meth:`read` returned into the transforms."""
-        for transform, old in zip(self._transforms, before, strict=True):
-            for name, value in old.items():
-                setattr(transform, name, value)
-
     @contextmanager
     def unchanged(self, env: str) -> Iterator[None]:
         """Let nothing that a search does stay in the transforms of ``env``.
@@ -240,8 +234,10 @@ class ForeignStates:
             yield
         finally:
             changed = self.changed(before)
-            if changed is not None:
-                self.put_back(before)
+            if changed is not None:  # put it back
+                for transform, old in zip(self._transforms, before, strict=True):
+                    for name, value in old.items():
+                        setattr(transform, name, value)
         if changed is not None:
             raise ValueError(
                 f"{changed} of {env} changed while MCTSPlanner searched. A transform keeps a state "

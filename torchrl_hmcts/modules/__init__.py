@@ -8,11 +8,14 @@ from torchrl_hmcts.modules.objective_networks import (
     SkillEncoder,
     SpectralLinear,
 )
-from torchrl_hmcts.modules.option_memory import OptionMemory
-from torchrl_hmcts.modules.option_model import OptionModel
+from torchrl_hmcts.modules.option_model import OptionMemory, OptionModel
 from torchrl_hmcts.modules.option_model_env import OptionModelEnv
-from torchrl_hmcts.modules.skill_actor import SkillActor, SkillPolicy
-from torchrl_hmcts.modules.skill_critic import SkillActionCritic, SkillCritic
+from torchrl_hmcts.modules.skill_actor import (
+    SkillActionCritic,
+    SkillActor,
+    SkillCritic,
+    SkillPolicy,
+)
 from torchrl_hmcts.modules.skill_mlp import ConcatSkillMLP, SkillMLP
 from torchrl_hmcts.modules.skill_prior import (
     FixedSkillPrior,
@@ -22,14 +25,12 @@ from torchrl_hmcts.modules.skill_prior import (
 )
 from torchrl_hmcts.modules.skill_spec import UnitSphere, spread_skills
 from torchrl_hmcts.modules.termination import (
-    AnyTermination,
     LearnedTermination,
     StallTermination,
     TerminationNetwork,
 )
 
 __all__ = [
-    "AnyTermination",
     "ConcatSkillMLP",
     "EffectModel",
     "FixedSkillPrior",
@@ -57,9 +58,3 @@ __all__ = [
     "find_jumps",
     "spread_skills",
 ]
-
-
-def __getattr__(name: str) -> type:
-    if name == "GaussianSkillActor":  # its name until SkillActor took bounded specs too
-        return SkillActor
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

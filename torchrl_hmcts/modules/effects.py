@@ -27,8 +27,7 @@ class EffectModel(nn.Module):
     with the setting s of all switches (a number below :math:`2^K`) and the switches :math:`f_a` of
     effect a. Rarer effects are taken for accidents, e.g. two at once.
 
-    :class:`LandmarkEnv` plans in it; a setting is its landmark. Build it by :meth:`fit`;
-    ``load_state_dict`` fills one that was built with the same sizes.
+    :class:`LandmarkEnv` plans in it; a setting is its landmark. Build it by :meth:`fit`.
 
     Args:
         num_switches (int): K, at most 24.
@@ -76,6 +75,8 @@ class EffectModel(nn.Module):
         self.register_buffer("flips", torch.zeros(num_options, dtype=torch.int64))
         self.register_buffer("places", torch.zeros(num_options, num_features))
         self.register_buffer("duration", torch.ones(()))
+        self.num_landmarks, self.num_options = 1 << num_switches, num_options
+        self.num_features = num_switches  # of :meth:`position`
 
     @classmethod
     def fit(
@@ -129,54 +130,17 @@ class EffectModel(nn.Module):
         model.duration.fill_(float(between.median()) if len(between) else 1.0)
         return model
 
-    @property
-    def num_landmarks(self) -> int:
-        """The number of settings, :math:`2^K`."""
-        return 1 << len(self.columns)
-
-    @property
-    def num_options(self) -> int:
-        """A."""
-        return len(self.flips)
-
-    @property
-    def num_features(self) -> int:
-        """Numbers of :meth:`position`: K."""
-        return len(self.columns)
-
     def settings(self, observations: Tensor) -> Tensor:
-        """Return the settings that observations show.
-
-        Args:
-            observations: ``[*B, D]``.
-
-        Returns:
-            int64 ``[*B]``.
-        """
+        """Return the settings, int64 ``[*B]``, that observations ``[*B, D]`` show."""
         return _number(observations, self.columns, self.middles)
 
     def effect(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return the options that made changes; -1: none did.
-
-        Args:
-            before: settings, int64 ``[*B]``.
-            after: settings, int64 ``[*B]``.
-
-        Returns:
-            int64 ``[*B]``.
-        """
+        """Return the options that made changes between settings, int64 ``[*B]``; -1: none did."""
         same = (before ^ after)[..., None] == self.flips
         return torch.where(same.any(-1), same.int().argmax(-1), -1)
 
     def position(self, landmark: Tensor) -> Tensor:
-        """Return what the switches show, 0 or 1.
-
-        Args:
-            landmark: settings, int64 ``[*B]``.
-
-        Returns:
-            float32 ``[*B, K]``.
-        """
+        """Return what the switches show, 0 or 1, float32 ``[*B, K]``."""
         bits = torch.arange(len(self.columns), device=landmark.device)
         return ((landmark[..., None] >> bits) & 1).float()
 
@@ -187,16 +151,7 @@ class EffectModel(nn.Module):
     def lead(
         self, landmark: Tensor, option: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the settings after options, and their base steps.
-
-        Args:
-            landmark: settings, int64 ``[*B]``.
-            option: int64 ``[*B]``.
-            generator: not used: there is no chance.
-
-        Returns:
-            int64 ``[*B]`` and float32 ``[*B]``.
-        """
+        """Return the settings after options, int64 ``[*B]``, and their base steps, float32."""
         return landmark ^ self.flips[option], self.duration.expand(landmark.shape)
 
     @property
@@ -209,14 +164,8 @@ class EffectModel(nn.Module):
 
         .. math:: V(s) = \gamma^{k n(s)}
 
-        with the least number n of options and the duration k; flips lead back as they lead there.
-
-        Args:
-            goal: int64 ``[]`` or ``[1]``.
-            gamma: discount per base step.
-
-        Returns:
-            float32 ``[2^K]``; 0 where no options lead to the goal.
+        with the least number n of options and the duration k: float32 ``[2^K]``, 0 where no options
+        lead there. Flips lead back as they lead there.
         """
         flips = self.flips.cpu().numpy()
         options = np.full(self.num_landmarks, -1, np.int16)

@@ -39,7 +39,7 @@ class LandmarkModel(nn.Module):
     So the model does not take a lucky jump for a reliable path, as relabelling goals in hindsight
     does.
 
-    Build it by :meth:`fit`; ``load_state_dict`` fills one that was built with the same sizes.
+    Build it by :meth:`fit`.
 
     Args:
         num_landmarks (int): N, those of jumps included.
@@ -91,6 +91,8 @@ class LandmarkModel(nn.Module):
         self.register_buffer("outcomes", own)
         self.register_buffer("probabilities", torch.zeros(n, a, num_outcomes))
         self.probabilities[..., 0] = 1.0
+        self.num_landmarks, self.num_options = num_landmarks, num_options
+        self.num_features = num_features
 
     @classmethod
     def fit(
@@ -116,7 +118,6 @@ class LandmarkModel(nn.Module):
             max_steps (float): longest option, base steps; as far as the goals lie ahead by which
                 the worker was trained. Default: as long as it takes.
             jump_factor (float): median steps from which on a step is a jump; infinite: none is.
-                Default 10.
             seed (int): of the states among which landmarks are chosen. Default 0.
 
         Raises:
@@ -179,21 +180,6 @@ class LandmarkModel(nn.Module):
         return model
 
     @property
-    def num_landmarks(self) -> int:
-        """N, those of jumps included."""
-        return len(self.places)
-
-    @property
-    def num_options(self) -> int:
-        """A."""
-        return self.targets.shape[1]
-
-    @property
-    def num_features(self) -> int:
-        """F."""
-        return self.places.shape[1]
-
-    @property
     def device(self) -> torch.device:
         """Device of the model."""
         return self.places.device
@@ -209,16 +195,7 @@ class LandmarkModel(nn.Module):
     def lead(
         self, landmark: Tensor, option: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return where options lead, drawn where there is chance, and their base steps.
-
-        Args:
-            landmark: int64 ``[*B]``.
-            option: int64 ``[*B]``.
-            generator: of the draws. Default: torch's global one.
-
-        Returns:
-            int64 ``[*B]`` and float32 ``[*B]``.
-        """
+        """Return where options lead, drawn where there is chance, and base steps, both ``[*B]``."""
         shares = self.probabilities[landmark, option]
         if shares.shape[-1] == 1:
             which = torch.zeros_like(landmark)
@@ -239,12 +216,7 @@ class LandmarkModel(nn.Module):
 
         .. math:: V(i) = \max_a \gamma^{k_{ia}} \sum_j P(j \mid i, a)\, V(j), \qquad V(g) = 1
 
-        Args:
-            goal: int64 ``[]`` or ``[1]``, the landmark g.
-            gamma: discount per base step.
-
-        Returns:
-            float32 ``[N]``; 0 where no option leads on.
+        for the goal g: float32 ``[N]``; 0 where no option leads on.
         """
         weights = gamma ** self.durations[..., None] * self.probabilities
         values = torch.zeros(self.num_landmarks, device=self.places.device)
@@ -258,14 +230,9 @@ class LandmarkModel(nn.Module):
         return values
 
     def nearest(self, places: Tensor, *, goal: bool = False) -> Tensor:
-        """Return the landmark nearest to each place, of those with options and without jumps.
+        """Return the landmark nearest to each place ``[m, F]``, int64 ``[m]``.
 
-        Args:
-            places: ``[m, F]``.
-            goal: of those to which options lead instead.
-
-        Returns:
-            int64 ``[m]``.
+        Of those with options and without jumps; for a ``goal``, of those to which options lead.
         """
         useful = (self.targets >= 0).any(1)
         if goal:
@@ -278,10 +245,11 @@ class LandmarkModel(nn.Module):
 def find_jumps(places: Tensor, ends: Tensor, jump_factor: float = 10.0) -> Tensor:
     """Return which recorded states are followed by a jump.
 
+    States are ``places`` ``[T, F]``, ``ends`` (bool ``[T]``) closes episodes; a step of
+    ``jump_factor`` times the median is a jump.
+
     Args:
-        places: ``[T, F]``.
-        ends: bool ``[T]``.
-        jump_factor: median steps from which on a step is a jump.
+        places, ends, jump_factor: as in :meth:`LandmarkModel.fit`.
 
     Returns:
         bool ``[T]``.

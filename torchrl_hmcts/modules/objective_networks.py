@@ -32,14 +32,13 @@ class SkillDiscriminator(SkillNetwork):
     .. math:: q(z \mid s') = \mathrm{softmax}_z(\mathrm{MLP}(\phi(s')))
 
     The features :math:`\phi` decide what "different skills" means: with the displacement since the
-    skill began they are directions, with the position they are places. Losses and reward transforms
-    call it on the ``"next"`` part of a transition, so ``in_keys`` are written without ``"next"``.
+    skill began they are directions, with the position places. Losses and rewards call it on the
+    ``"next"`` part of a transition, so ``in_keys`` are written without ``"next"``.
 
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
         num_skills (int or TensorSpec): number of skills ``Z``.
-        in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
-            ``["displacement"]``.
+        in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order.
         skill_logits_key (NestedKey): entry written, ``[*B, Z]``. Default ``"skill_logits"``.
         hidden (sequence of int): widths of the hidden layers. Default ``()``, a linear classifier:
             it extrapolates to places no skill has reached yet, so two skills that go the same way
@@ -81,16 +80,13 @@ class SkillEncoder(SkillNetwork):
 
     .. math:: \phi(s) = \mathrm{MLP}(s) \in \mathbb{R}^Z
 
-    or, where skills are vectors, with their dimensions.
-
-    Its entries decide what "far apart" means: with the position, skills travel through the maze.
-    Losses call it on both ends of a transition, so ``in_keys`` are written without ``"next"``.
+    or, where skills are vectors, with their dimensions. Its entries decide what "far apart" means:
+    with the position, skills travel through the maze. ``in_keys`` are written without ``"next"``.
 
     Args:
         in_features (int): as :class:`SkillDiscriminator`'s.
         num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one that is a vector.
-        in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order. Default
-            ``["position"]``.
+        in_keys (sequence of NestedKey): entries ``[*B, f_i]``, concatenated in order.
         representation_key (NestedKey): entry written, ``[*B, Z]``. Default ``"representation"``.
         hidden (sequence of int): widths of the hidden layers. Default ``(64, 64)``.
         activation (callable): builds the activations. Default ``torch.nn.ReLU``, of slope at most
@@ -195,13 +191,11 @@ class SkillDynamics(TensorDictModuleBase):
         in_features (int): as :class:`SkillDiscriminator`'s.
         num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one that is a vector.
         target_features (int): size ``D`` of the entry whose change is predicted.
-        in_keys (sequence of NestedKey): entries ``[*B, f_i]`` the prediction depends on. Default
-            ``["position"]``.
+        in_keys (sequence of NestedKey): entries ``[*B, f_i]`` the prediction depends on.
         target_key (NestedKey): entry ``[*B, D]`` whose change is predicted. Default ``"position"``.
         std (float): standard deviation :math:`\sigma` of each dimension, in units of the target; at
             the start, if it is learned. Default ``0.1``: about what a body moves in a base step.
         learned_std (bool): learn one :math:`\sigma` per dimension instead of keeping ``std``.
-            Default ``True``.
         min_std (float): lower bound of a learned one. Default ``1e-3``: a target that never
             changes must not get an infinite density.
         loc_key, scale_key (NestedKey): entries written, both ``[*B, Z, D]``, or ``[*B, D]``.

@@ -1,6 +1,7 @@
-"""A learned model of options: where an option leads, what it earns and how long it takes.
+"""A learned model of options, and a memory of what they really led to where the model errs.
 
-Letters: *B batch of the tensordict, K members of the ensemble, D predicted state numbers in all.
+Letters: *B batch of the tensordict, m rows, K members of the ensemble, C contexts, N outcomes kept
+of each, D predicted state numbers in all, f numbers compared.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_hmcts.checks import real_number
 from torchrl_hmcts.modules.skill_mlp import check_sizes, key_list
 
 
@@ -27,16 +29,14 @@ class OptionModel(TensorDictModuleBase):
     .. math:: \hat s' = s + \mu + \sigma f_s(s, o), \quad \hat R(s, o), \quad \hat k(s, o), \quad
         \hat p(s, o) = \operatorname{sigmoid} f_p(s, o)
 
-    with :math:`\mu, \sigma` mean and standard deviation in the data (:meth:`fit_normalization`),
-    so that all outputs are of order 1. What is written is the mean over the members; their
-    disagreement about :math:`s'` tells where data were missing. Entries that are not named in
-    ``delta_keys`` are not predicted: an :class:`OptionModelEnv` carries them over.
+    with :math:`\mu, \sigma` mean and standard deviation in the data (:meth:`fit_normalization`).
+    What is written is the mean over the members; their disagreement about :math:`s'` tells where
+    data were missing. An :class:`OptionModelEnv` carries over what ``delta_keys`` do not name.
 
     Args:
         make_network (callable): ``make_network(out_features) -> nn.Module``, called once for each
             member. The module is called with the entries ``in_keys`` in order and returns ``[*B,
-            out_features]``, with ``out_features`` = D + 3. All members must be built alike; their
-            parameters are stacked and they run as one.
+            out_features]``, with ``out_features`` = D + 3. Members are alike and run as one.
         in_keys (sequence of NestedKey): entries the networks read, the option among them if it is
             one of their inputs.
         delta_keys (mapping): the state entries that are predicted, and the shape of each without
@@ -45,8 +45,7 @@ class OptionModel(TensorDictModuleBase):
         max_duration (int): base steps an option takes at most; predictions lie in 1 to this.
         num_models (int): members of the ensemble, K. Default 1: no disagreement is known.
         features (TensorDictModuleBase, optional): run before the networks, once for all members;
-            what it writes can be named in ``in_keys``. It has no part in the ensemble, but is a
-            sub-module. Default: none.
+            what it writes can be named in ``in_keys``. Default: none.
         reward_key, duration_key, terminated_key (NestedKey): names of the outcomes, under
             ``"next"``. Defaults ``"reward"``, ``"duration"``, ``"terminated"``.
 
@@ -122,10 +121,7 @@ class OptionModel(TensorDictModuleBase):
         self.out_keys = [unravel_key(("next", key)) for key in written]
         networks = [make_network(self.num_deltas + 3) for _ in range(num_models)]
         if len({id(network) for network in networks}) < num_models:
-            raise ValueError(
-                "OptionModel calls make_network once for each member of the ensemble; it returned "
-                "the same module twice. Build a new one at each call."
-            )
+            raise ValueError("OptionModel needs a make_network that builds a new one at each call.")
         try:
             self.network_params = TensorDictParams(TensorDict.from_modules(*networks))
         except (RuntimeError, KeyError) as error:
@@ -209,10 +205,7 @@ class OptionModel(TensorDictModuleBase):
     ) -> Tensor:
         """Return the targets of :meth:`outputs` for recorded transitions, ``[*B, D + 3]``.
 
-        Args:
-            tensordict: macro transitions: root entries and ``"next"``.
-            reward_key, duration_key, terminated_key: of the outcomes. Default: the model's names.
-            normalized: subtract the mean and divide by the scale. Default ``True``.
+        Keys default to the model's; ``normalized`` subtracts the mean and divides by the scale.
         """
         after = tensordict.get("next")
         parts = [after.get(key) - tensordict.get(key) for key in self.delta_keys]
@@ -238,9 +231,8 @@ class OptionModel(TensorDictModuleBase):
     def fit_normalization(self, tensordict: TensorDictBase) -> OptionModel:
         """Take mean and standard deviation of the outputs from recorded transitions ``[*B]``.
 
-        An output that never varies (the duration of options of a fixed length) keeps scale 1: what
-        it always was is then what an untrained network predicts. Call it before training; the
-        meaning of the networks' outputs changes with it.
+        An output that never varies keeps scale 1. Call it before training: the meaning of the
+        networks' outputs changes with it.
         """
         values = self.targets(tensordict, normalized=False).flatten(0, -2)
         deltas, rest = values[:, : self.num_deltas], values[:, self.num_deltas : -1]
@@ -258,12 +250,135 @@ class OptionModel(TensorDictModuleBase):
 
     def member(self, index: int) -> OptionModel:
         """Return a copy with one member only, to measure the worth of the ensemble."""
-        if not 0 <= index < self.num_models:
-            raise ValueError(
-                f"OptionModel has the members 0 to {self.num_models - 1}; got index {index}."
-            )
+
         model = copy.deepcopy(self)
         model.num_models = 1
-        params = self.network_params[index : index + 1].detach().clone()
-        model.network_params = TensorDictParams(params)
+        params = self.network_params[index].detach().clone()
+        model.network_params = TensorDictParams(params.unsqueeze(0))
         return model
+
+
+class OptionMemory:
+    r"""Replaces a prediction by an observed outcome of the same option from nearly the same state.
+
+    With :math:`\phi` the entries ``keys`` side by side and :math:`(s_i, o_i)` the options executed
+    in the same context, a prediction for :math:`(s, o)` gives way to outcome :math:`i` if
+
+    .. math:: o_i = o, \qquad i = \arg\min_j \lVert \phi(s) - \phi(s_j) \rVert, \qquad
+        \lVert \phi(s) - \phi(s_i) \rVert \le r
+
+    A plan that failed because the model erred is else made again and again from the same state.
+    State entries change by what they changed then.
+
+    Args:
+        model (OptionModel): whose predictions are replaced.
+        keys (sequence of NestedKey): entries that are compared, those on which an outcome depends.
+        radius (float): r, in units of the entries.
+        num_contexts (int): C, e.g. the number of mazes.
+        context_key (NestedKey): index of the context, int64 ``[*B]``, e.g. ``"maze_index"``.
+        option_key (NestedKey): int64 ``[*B]``. Default ``"option"``.
+        capacity (int): N; the oldest outcome makes room. Default 64.
+
+    Raises:
+        ValueError: if a number is not positive.
+
+    Reference:
+        Outcomes kept as they were, for cases that return: Lengyel and Dayan, "Hippocampal
+        Contributions to Control: The Third Way", 2007.
+
+    Examples:
+        >>> from torchrl_hmcts.modules import OptionMemory, OptionModel, SkillMLP
+        >>> model = OptionModel(lambda n: SkillMLP(1, n, num_skills=2), ["place", "option"],
+        ...                     {"place": 1}, max_duration=9)
+        >>> memory = OptionMemory(model, ["place"], 0.1, num_contexts=1, context_key="maze")
+        >>> td = TensorDict(place=torch.zeros(1, 1), option=torch.tensor([1]),
+        ...                 maze=torch.tensor([0]), batch_size=[1])
+        >>> after = TensorDict(place=torch.ones(1, 1), reward=torch.zeros(1, 1),
+        ...                    duration=torch.full((1, 1), 9),
+        ...                    terminated=torch.zeros(1, 1, dtype=torch.bool), batch_size=[1])
+        >>> memory.remember(td.clone().set("next", after))
+        >>> memory.recall(td, model.predict(td))["place"].tolist()
+        [[1.0]]
+    """
+
+    def __init__(
+        self,
+        model: OptionModel,
+        keys: Sequence[NestedKey],
+        radius: float,
+        *,
+        num_contexts: int,
+        context_key: NestedKey,
+        option_key: NestedKey = "option",
+        capacity: int = 64,
+    ) -> None:
+        check_sizes("OptionMemory", num_contexts=num_contexts, capacity=capacity)
+        self.model = model
+        self.keys = key_list("OptionMemory", keys)
+        self.radius = real_number("OptionMemory", "radius", radius, above=0.0)
+        self.context_key = unravel_key(context_key)
+        self.option_key = unravel_key(option_key)
+        self.in_keys = [*self.keys, self.context_key, self.option_key]
+        self.capacity = capacity
+        self.num_contexts = num_contexts
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._count = torch.zeros(self.num_contexts, dtype=torch.int64)
+        self._option = torch.full((self.num_contexts, self.capacity), -1)
+        self._place: Tensor | None = None  # [C, N, f]
+        self._outcome: Tensor | None = None  # [C, N, D + 3]
+
+    def remember(self, tensordict: TensorDictBase) -> None:
+        """Keep the outcomes of transitions ``[*B]``; padding (``"_step"`` False) is left out."""
+        td = tensordict.reshape(-1)
+        stepped = td.get("_step", None)
+        if stepped is not None:
+            td = td[stepped.reshape(-1)]
+        if not len(td):
+            return
+        place, outcome = self._places(td), self.model.targets(td, normalized=False)
+        if self._place is None or self._outcome is None:
+            shape = (self.num_contexts, self.capacity)
+            self._option = self._option.to(place.device)
+            self._place = place.new_zeros(*shape, place.shape[-1])
+            self._outcome = outcome.new_zeros(*shape, outcome.shape[-1])
+        options = td.get(self.option_key)
+        for row, context in enumerate(td.get(self.context_key).tolist()):
+            slot = int(self._count[context]) % self.capacity
+            self._option[context, slot] = options[row]
+            self._place[context, slot] = place[row]
+            self._outcome[context, slot] = outcome[row]
+            self._count[context] += 1
+
+    def recall(self, tensordict: TensorDictBase, predicted: TensorDict) -> TensorDict:
+        """Return predictions ``[*B]``, replaced where an outcome is remembered."""
+        if self._place is None or self._outcome is None:
+            return predicted
+        td = tensordict.reshape(-1)
+        context = td.get(self.context_key)
+        distance = (self._place[context] - self._places(td).unsqueeze(1)).norm(dim=-1)  # [m, N]
+        other = self._option[context] != td.get(self.option_key).unsqueeze(-1)
+        nearest, slot = distance.masked_fill(other, torch.inf).min(-1)
+        known = nearest <= self.radius
+        if not known.any():
+            return predicted
+        outcome = self._outcome[context[known], slot[known]]
+        replaced: TensorDict = predicted.reshape(-1).clone()
+        model, (reward, duration, ended) = self.model, outcome[:, -3:].split(1, -1)
+        known_values = {
+            **model.changed(td[known], outcome[:, :-3]),
+            model.reward_key: reward,
+            model.duration_key: duration,
+            model.probability_key: ended,
+            model.terminated_key: ended > 0.5,
+            model.disagreement_key: torch.zeros_like(ended),
+        }
+        for key, value in known_values.items():
+            entry = replaced.get(key)
+            entry[known] = value.to(entry.dtype)
+        return replaced.reshape(predicted.batch_size)
+
+    def _places(self, td: TensorDictBase) -> Tensor:
+        return torch.cat([td.get(key).reshape(len(td), -1).float() for key in self.keys], -1)

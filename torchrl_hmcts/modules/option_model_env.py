@@ -18,8 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_hmcts.checks import real_number
-from torchrl_hmcts.modules.option_memory import OptionMemory
-from torchrl_hmcts.modules.option_model import OptionModel
+from torchrl_hmcts.modules.option_model import OptionMemory, OptionModel
 from torchrl_hmcts.nesting import known_gamma
 
 
@@ -27,9 +26,8 @@ class OptionModelEnv(ModelBasedEnvBase):
     r"""The macro environment of an :class:`OptionModel`, to plan in.
 
     A step is what the model predicts: state, discounted reward, base steps and end of an option.
-    It is stateless, can be set to any state, and has the specs of the env it stands for, so that
-    :class:`~torchrl_hmcts.planners.MCTSPlanner` plans in it as in a simulator. Steps are
-    deterministic and take no gradient.
+    It is stateless, settable, deterministic and without gradients, and has the specs of the env it
+    stands for, so that :class:`~torchrl_hmcts.planners.MCTSPlanner` plans in it as in a simulator.
 
     Predicted entries are brought into the bounds of their specs, and rounded if they are integer.
     Entries that the model does not predict are carried over, counters grow by the predicted base
@@ -47,9 +45,8 @@ class OptionModelEnv(ModelBasedEnvBase):
         counter_keys (sequence of NestedKey): integer state entries that count base steps. Where
             one has a bounded spec, reaching its upper bound is ``truncated``, as a time limit is.
             Default: none.
-        min_reward (float): predicted rewards of smaller magnitude are 0. A regression is never
-            exactly 0, and a planner that stops at the first reward would stop at noise. Default 0:
-            as predicted; for a sparse reward of 1 about 0.25.
+        min_reward (float): predicted rewards of smaller magnitude are 0: a planner that stops at
+            the first reward would stop at noise. Default 0; for a sparse reward of 1 about 0.25.
         disagreement_coeff (float): :math:`\lambda`, reward per unit of disagreement. Default 0.
         max_disagreement (float, optional): :math:`u_{\max}`, in standard deviations of a change.
             Default: none.

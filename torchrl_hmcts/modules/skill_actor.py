@@ -1,4 +1,4 @@
-"""The skill-conditioned actor, for losses and, stripped to its network, for use inside options."""
+"""The skill-conditioned actor, its lean policy for use inside options, and the critics."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from torchrl_hmcts.checks import instance
 from torchrl_hmcts.modules.skill_mlp import (
     SkillMLP,
     SkillNetwork,
+    check_sizes,
     entries,
     key_list,
     skill_network,
@@ -164,8 +165,7 @@ class SkillActor(ProbabilisticActor):
         a = \tfrac{h - l}{2} \tanh(u) + \tfrac{h + l}{2}, \qquad
         u \sim \mathcal{N}(\mu, \sigma^2), \qquad (\mu, \sigma) = \mathrm{SkillMLP}(s, z)
 
-    It is the actor TorchRL's losses want (a ``ProbabilisticTensorDictSequential``). Inside options
-    use the lean :class:`SkillPolicy` over the same parameters.
+    Losses take it as it is. Inside options use the lean :class:`SkillPolicy` over its parameters.
 
     Args:
         in_features (int): summed sizes of the entries ``in_keys``.
@@ -176,8 +176,7 @@ class SkillActor(ProbabilisticActor):
         num_skills (int or TensorSpec): number of skills, or the spec of one skill that is a vector
             ``[D]``, e.g. :class:`UnitSphere`.
         in_keys (sequence of NestedKey): observation entries ``[*B, f_i]``, concatenated in order.
-        skill_key (NestedKey): entry of the skill, int64 ``[*B]``, or float ``[*B, D]``. Default
-            ``"skill"``.
+        skill_key (NestedKey): entry of the skill, int64 ``[*B]``, or float ``[*B, D]``.
         action_key (NestedKey): entry the action is written to. Default ``"action"``.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``.
         activation (callable): builds the activations. Default ``torch.nn.ReLU``.
@@ -269,8 +268,7 @@ def _kind_of_action(spec: TensorSpec, action_key: NestedKey) -> _Choice | _Squas
 class SkillPolicy(TensorDictModuleBase):
     """Acts like a skill actor at a fraction of its cost, sharing its parameters.
 
-    No distribution objects, no spec checks, no gradients: the worker to run inside options and the
-    collection policy of the trainer.
+    The worker to run inside options and to collect with: no distributions, spec checks, gradients.
 
     Args:
         actor (SkillActor): the actor whose parameters are used; later updates are seen.
@@ -326,3 +324,92 @@ class SkillPolicy(TensorDictModuleBase):
         deterministic = not is_to_sample(self.deterministic)
         action = self._choose(outputs, deterministic, self.generator)
         return tensordict.set(self.action_key, action)
+
+
+class SkillCritic(SkillNetwork):
+    r"""Values Q(s, z, .) of discrete actions with shared layers and one head per skill.
+
+    .. math:: Q(s, z, \cdot) = \mathrm{SkillMLP}(s, z) \in \mathbb{R}^A
+
+    Pass one to a loss; TorchRL makes the twin (and the targets) from it.
+
+    Args:
+        num_actions (int): number of actions ``A``.
+        in_features, num_skills, in_keys, skill_key: as :class:`SkillActor`'s.
+        hidden, activation, network: so are these.
+        action_value_key (NestedKey): entry written, ``[*B, A]``. Default ``"action_value"``.
+
+    Reference:
+        Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; heads: Bartley, 2023,
+        chapter 4.
+
+    Examples:
+        >>> from torchrl_hmcts.modules import SkillCritic
+        >>> SkillCritic(2, num_actions=4, num_skills=3, in_keys=["velocity"]).in_keys
+        ['velocity', 'skill']
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        num_actions: int,
+        num_skills: Skills,
+        *,
+        in_keys: Sequence[NestedKey],
+        skill_key: NestedKey = "skill",
+        action_value_key: NestedKey = "action_value",
+        hidden: Sequence[int] = (64, 64),
+        activation: Callable[[], nn.Module] = nn.ReLU,
+        network: Callable[..., nn.Module] = SkillMLP,
+    ) -> None:
+        check_sizes("SkillCritic", in_features=in_features, num_actions=num_actions)
+        net = skill_network(network, in_features, num_actions, num_skills, hidden, activation)
+        keys = [*key_list("SkillCritic", in_keys), skill_key]
+        super().__init__(net, keys, action_value_key)
+        self.num_actions = num_actions
+        self.skill_spec = as_skill_spec("SkillCritic", num_skills)
+        self.num_skills = number_of(self.skill_spec)
+
+
+class SkillActionCritic(SkillNetwork):
+    r"""The value Q(s, z, a) of a continuous action with shared layers and one head per skill.
+
+    .. math:: Q(s, z, a) = \mathrm{SkillMLP}([s; a], z) \in \mathbb{R}
+
+    Args:
+        in_features (int): summed sizes of the entries ``in_keys``, without the action.
+        action_features (int): size of the action, ``D``.
+        num_skills, in_keys, skill_key, hidden, activation, network: as :class:`SkillActor`'s.
+        action_key (NestedKey): entry of the action, ``[*B, D]``. Default ``"action"``.
+        state_action_value_key (NestedKey): entry written, ``[*B, 1]``.
+
+    Reference:
+        As :class:`SkillCritic`.
+
+    Examples:
+        >>> from torchrl_hmcts.modules import SkillActionCritic
+        >>> SkillActionCritic(3, action_features=2, num_skills=4, in_keys=["velocity"]).in_keys
+        ['velocity', 'action', 'skill']
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        action_features: int,
+        num_skills: Skills,
+        *,
+        in_keys: Sequence[NestedKey],
+        skill_key: NestedKey = "skill",
+        action_key: NestedKey = "action",
+        state_action_value_key: NestedKey = "state_action_value",
+        hidden: Sequence[int] = (64, 64),
+        activation: Callable[[], nn.Module] = nn.ReLU,
+        network: Callable[..., nn.Module] = SkillMLP,
+    ) -> None:
+        check_sizes("SkillActionCritic", in_features=in_features, action_features=action_features)
+        width = in_features + action_features
+        net = skill_network(network, width, 1, num_skills, hidden, activation)
+        keys = [*key_list("SkillActionCritic", in_keys), action_key, skill_key]
+        super().__init__(net, keys, state_action_value_key)
+        self.skill_spec = as_skill_spec("SkillActionCritic", num_skills)
+        self.num_skills = number_of(self.skill_spec)

@@ -27,8 +27,7 @@ class SkillMLP(nn.Module):
     .. math:: y = W_z h(x) + b_z, \qquad h = \sigma(A_2 \sigma(A_1 x + a_1) + a_2)
 
     Letters: ``*B`` any batch shape, ``F`` ``in_features``, ``Z`` ``num_skills``, ``O``
-    ``out_features``. All heads are computed in one matrix product and the skill's own is gathered:
-    for the usual handful of skills that is faster than picking weights per element.
+    ``out_features``. All heads are computed in one product and the skill's own is gathered.
 
     Args:
         in_features (int): number of input features ``F``, after concatenation.
@@ -36,8 +35,7 @@ class SkillMLP(nn.Module):
         num_skills (int or TensorSpec): number of skills ``Z``, one head each.
         hidden (sequence of int): widths of the shared layers. Default ``(64, 64)``: two layers, as
             in the dissertation.
-        activation (callable): builds the activation after each shared layer. Default
-            ``torch.nn.ReLU``.
+        activation (callable): builds the activation after each shared layer.
 
     Returns:
         From ``forward(*features, skill)``: Tensor ``[*B, O]``. ``features`` are one or more tensors
@@ -79,10 +77,7 @@ class SkillMLP(nn.Module):
         self, owner: str, hidden: tuple[int, ...], activation: Callable[[], nn.Module]
     ) -> None:
         if not hidden:
-            raise ValueError(
-                f"{owner} needs at least one shared layer, which the heads read; got hidden=(). "
-                "Pass e.g. hidden=(64, 64)."
-            )
+            raise ValueError(f"{owner} needs a shared layer, e.g. hidden=(64, 64); got hidden=().")
         if self.num_skills is None:
             raise ValueError(
                 f"{owner} has one head per skill, so it needs numbered skills; got "
@@ -131,10 +126,6 @@ class SkillMLP(nn.Module):
         """True if the parameters of N copies may be put in stacked, to run all copies at once."""
         return can_stack(self.trunk)
 
-    def extra_repr(self) -> str:
-        """Returns the sizes that ``print`` shows."""
-        return f"{described(self.skill_spec)}, out_features={self.out_features}"
-
 
 class ConcatSkillMLP(SkillMLP):
     r"""Maps features and a skill to outputs by a network that reads the skill beside the features.
@@ -143,8 +134,7 @@ class ConcatSkillMLP(SkillMLP):
 
     with :math:`e_z` the one-hot skill, or a skill that is a vector as it is. It is built and called
     as :class:`SkillMLP` is: pass it as ``network=ConcatSkillMLP`` to an actor or critic. All layers
-    are shared by all skills, as in the paper on DIAYN; its number of weights hardly grows with the
-    number of skills. There may be no hidden layer.
+    are shared by all skills; there may be no hidden one.
 
     Args:
         num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one skill that is a

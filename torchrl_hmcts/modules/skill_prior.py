@@ -55,10 +55,6 @@ class SkillPrior(nn.Module, ABC):
         """Returns which skills are switched on, bool ``[Z]``."""
         return self.probs() > 0
 
-    def forward(self) -> Tensor:
-        """Returns the probabilities of the skills, ``[Z]``."""
-        return self.probs()
-
     def extra_repr(self) -> str:
         """Returns the number of skills that ``print`` shows."""
         return f"num_skills={self.num_skills}"

@@ -33,10 +33,9 @@ class UnitSphere(Unbounded, metaclass=_KeepsItsClass):
 
     .. math:: z = \frac{x}{\|x\|}, \qquad x \sim \mathcal{N}(0, I)
 
-    A TorchRL spec, to be passed wherever a number of skills can be: to a
-    :class:`~torchrl_hmcts.transforms.SkillTransform`, to actor and critics, to the network of an
-    objective. TorchRL's own specs are passed in the same way: ``Unbounded(shape=(D,))`` draws
-    from :math:`\mathcal{N}(0, I)`, ``Bounded(low, high, shape=(D,))`` evenly from a box.
+    A TorchRL spec, to be passed wherever a number of skills can be, as TorchRL's own:
+    ``Unbounded(shape=(D,))`` draws from :math:`\mathcal{N}(0, I)`, ``Bounded(low, high,
+    shape=(D,))`` evenly from a box.
 
     Args:
         shape (int or torch.Size): D, or ``[*B, D]``.

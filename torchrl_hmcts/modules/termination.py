@@ -19,8 +19,6 @@ from torchrl_hmcts.checks import real_number, whole_number
 from torchrl_hmcts.modules.skill_actor import is_to_sample
 from torchrl_hmcts.modules.skill_mlp import SkillMLP, SkillNetwork, key_list
 
-Condition = Callable[[TensorDictBase], Tensor]
-
 
 class StallTermination:
     r"""Ends an option in which nothing has changed for some base steps; a call gives bool ``[*B]``.
@@ -71,51 +69,6 @@ class StallTermination:
         return f"StallTermination({self.num_steps})"
 
 
-class AnyTermination:
-    r"""Ends an option as soon as one of several conditions does; a call gives bool ``[*B]``.
-
-    .. math:: \text{ends} \iff c_1 \lor c_2 \lor \dots
-
-    Every condition is asked every time, so that one that draws random numbers draws as many
-    independent of the others.
-
-    Args:
-        *conditions: callables ``condition(td) -> bool [*B]`` or ``[*B, 1]``, at least one.
-
-    Raises:
-        TypeError: if there is no condition, or one cannot be called.
-
-    Reference:
-        As :class:`StallTermination`.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from torchrl_hmcts.modules import AnyTermination, StallTermination
-        >>> late = lambda td: td["duration"] >= 9
-        >>> td = TensorDict(stalled_steps=torch.tensor([[0], [3], [0]]),
-        ...                 duration=torch.tensor([[9], [5], [5]]), batch_size=[3])
-        >>> AnyTermination(StallTermination(3), late)(td)
-        tensor([ True,  True, False])
-    """
-
-    def __init__(self, *conditions: Condition) -> None:
-        if not conditions or not all(callable(condition) for condition in conditions):
-            raise TypeError(
-                f"AnyTermination needs one or more callables condition(td) -> bool [*B]; got "
-                f"{conditions!r}."
-            )
-        self.conditions = conditions
-        keys = [key for condition in conditions for key in getattr(condition, "in_keys", ())]
-        self.in_keys: list[NestedKey] = list(dict.fromkeys(keys))
-
-    def __call__(self, td: TensorDictBase) -> Tensor:
-        ends = [condition(td).reshape(td.batch_size) for condition in self.conditions]
-        return torch.stack(ends).any(0)
-
-    def __repr__(self) -> str:
-        return f"AnyTermination({', '.join(map(repr, self.conditions))})"
-
-
 class TerminationNetwork(SkillNetwork):
     r"""Logits of :math:`\beta(s, o)`, the probability that option o ends in state s.
 
@@ -127,8 +80,7 @@ class TerminationNetwork(SkillNetwork):
         in_features (int): summed sizes of the entries ``in_keys``.
         num_options (int): number of options.
         in_keys, skill_key, hidden, activation: as :class:`SkillActor`'s.
-        termination_logits_key (NestedKey): entry written, ``[*B, 1]``. Default
-            ``"termination_logits"``.
+        termination_logits_key (NestedKey): entry written, ``[*B, 1]``.
         initial_probability (float): where :math:`\beta` begins, about, 0.001 to 0.999. Default 0.5.
 
     Raises:

@@ -1,17 +1,15 @@
 """Losses of the worker: actor and critics beside interchangeable skill objectives."""
 
-from collections.abc import Callable
-
 from torchrl_hmcts.objectives.a3c import A3CLoss, NStepReturn
-from torchrl_hmcts.objectives.diayn import DIAYNLoss, _continuous_diayn
+from torchrl_hmcts.objectives.diayn import DIAYNLoss
 from torchrl_hmcts.objectives.discovery import (
     LSDEncoderLoss,
     METRAEncoderLoss,
     SkillDiscriminatorLoss,
     SkillDynamicsLoss,
 )
-from torchrl_hmcts.objectives.durations import use_durations
 from torchrl_hmcts.objectives.goal_cloning import GoalCloningLoss
+from torchrl_hmcts.objectives.loss import use_durations
 from torchrl_hmcts.objectives.option_critic import IntraOptionQLoss, OptionTerminationLoss
 from torchrl_hmcts.objectives.option_model_loss import OptionModelLoss
 from torchrl_hmcts.objectives.search_distillation import ExpertIterationLoss
@@ -38,9 +36,3 @@ __all__ = [
     "SkillSACLoss",
     "use_durations",
 ]
-
-
-def __getattr__(name: str) -> Callable[..., SkillSACLoss]:
-    if name == "ContinuousDIAYNLoss":  # its name until SkillSACLoss took any objective
-        return _continuous_diayn
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -25,15 +25,7 @@ from torchrl_hmcts.objectives.loss import DISTANCES, REDUCTIONS
 def n_step_returns(
     reward: Tensor, discount: Tensor, next_value: Tensor, done: Tensor, terminated: Tensor
 ) -> Tensor:
-    """Returns the targets of :class:`NStepReturn`; all tensors are ``[*B, T, F]``.
-
-    The value V(s') is read where a step is truncated or the last, and otherwise of no account.
-
-    Examples:
-        >>> one, no = torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.bool)
-        >>> n_step_returns(one, 0.5 * one, 8 * one, done=no, terminated=no).flatten().tolist()
-        [2.75, 3.5, 5.0]
-    """
+    """Returns the targets of :class:`NStepReturn`; all tensors are ``[*B, T, F]``."""
     ends = done.clone()
     ends[..., -1, :] = True
     own = torch.addcmul(reward, discount * (ends & ~terminated), next_value.nan_to_num())
@@ -59,13 +51,9 @@ class NStepReturn(TD1Estimator):
         \end{cases}
 
     for steps that take :math:`k_t` base steps, and the advantage :math:`G_t - V(s_t)`, both without
-    gradients.
-    TorchRL's ``TD1Estimator`` computes the same from the values of all next states. What else it
-    can do (critics with a memory, ``differentiable``, ``average_rewards``, ``shifted``) is left to
-    it.
-
-    In an ``OnPolicyTrainer``, which shuffles steps before the loss sees them, it goes where GAE
-    goes: ``A2CTrainer(..., gae=NStepReturn(gamma=0.99, value_network=critic))``.
+    gradients. TorchRL's ``TD1Estimator`` computes the same from the values of all next states; what
+    else that can do (critics with a memory, ``differentiable`` ...) is left to it. In an
+    ``OnPolicyTrainer`` it goes where GAE goes: ``A2CTrainer(..., gae=NStepReturn(...))``.
 
     Args:
         gamma (float): discount per base step.
@@ -173,29 +161,25 @@ class A3CLoss(A2CLoss):
             - c_H\, \mathcal{H}\bigl(\pi(\cdot \mid s_t)\bigr)
 
     with :math:`G_t` of :class:`NStepReturn`, and :math:`G_t - V(s_t)` constant in the first term.
-    It is TorchRL's ``A2CLoss`` with another default value estimator, :class:`NStepReturn`, which is
-    built with it and knows durations: on a macro env a step of k base steps discounts what follows
-    by gamma to the power of k. It takes segments ``[*B, T]``, within which episodes may end; an
-    ``advantage`` that is already there is used as it is, as ``OnPolicyTrainer`` does with GAE.
+    It is TorchRL's ``A2CLoss`` with :class:`NStepReturn` as its value estimator, built with it. It
+    takes segments ``[*B, T]``, within which episodes may end; an ``advantage`` that is already
+    there is used as it is.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
         critic_network (TensorDictModule): writes ``state_value`` ``[*B, T, 1]``, or the value as
             its first entry of another name.
-        gamma (float): discount per base step, in ``(0, 1]``. Default 0.99.
+        gamma (float): discount per base step, in ``(0, 1]``.
         entropy_coeff (float): :math:`c_H \ge 0`, nats to return. Default 0.01, the paper's.
         critic_coeff (float): :math:`c_v > 0`. Default 0.5: half the squared error.
         reduction (str): ``"mean"`` (default), ``"sum"``, which is the paper's accumulation, or
-            ``"none"``. With the mean a learning rate does not depend on the segment's length.
+            ``"none"``.
         loss_critic_type (str): ``"l2"`` (default), ``"l1"`` or ``"smooth_l1"``.
         **kwargs: of ``torchrl.objectives.A2CLoss``, e.g. ``separate_losses`` or ``functional``.
 
     Returns:
         TensorDict with ``loss_objective``, ``loss_critic`` and ``loss_entropy``, and the detached
         ``entropy``, nats. With ``reduction="none"`` the losses are ``[*B, T]``.
-
-    Raises:
-        ValueError: if gamma, a coefficient or the reduction is out of range.
 
     Keys (``set_keys``): those of ``A2CLoss``, and ``duration`` (int64 ``[*B, T, 1]``, base steps,
     default ``("next", "duration")``; 1 if absent).
@@ -274,10 +258,10 @@ class A3CLoss(A2CLoss):
         if isinstance(value_type, type) and not isinstance(value_type, ValueEstimators):
             hyperparams.setdefault("value_network", self.critic_network)
         out = super().make_value_estimator(value_type, **hyperparams)
-        self._forward_value_estimator_keys()
+        self.value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)
         return out
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         super()._forward_value_estimator_keys(**kwargs)
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)
+        if hasattr(self, "_discount"):  # TorchRL's constructor is over
+            self.value_estimator.set_keys(steps_to_next_obs=self.tensor_keys.duration)

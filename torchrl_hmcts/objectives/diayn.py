@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_hmcts.modules.skill_prior import SkillPrior
 from torchrl_hmcts.objectives.discovery import SkillDiscriminatorLoss
-from torchrl_hmcts.objectives.skill_sac import DiscreteSkillSACLoss, SkillSACLoss
+from torchrl_hmcts.objectives.skill_sac import DiscreteSkillSACLoss
 
 
 class DIAYNLoss(DiscreteSkillSACLoss):
@@ -21,9 +21,7 @@ class DIAYNLoss(DiscreteSkillSACLoss):
     .. math:: L = L_Q(\theta) + L_\pi + L_\phi, \qquad L_\phi = -\log q_\phi(z \mid s')
 
     It is a :class:`DiscreteSkillSACLoss` with a :class:`SkillDiscriminatorLoss`: for continuous
-    actions give that to a :class:`SkillSACLoss`. The reward is the entry ``("next", "reward")``:
-    put a :class:`~torchrl_hmcts.transforms.SkillReward` with ``loss.objective`` on the replay
-    buffer.
+    actions give that to a :class:`SkillSACLoss`.
 
     Args:
         actor_network, qvalue_network: as in :class:`DiscreteSkillSACLoss`.
@@ -36,9 +34,6 @@ class DIAYNLoss(DiscreteSkillSACLoss):
     Returns:
         TensorDict with the entries of :class:`DiscreteSkillSACLoss`, among them
         ``loss_discriminator`` and the detached ``discriminator_accuracy``.
-
-    Raises:
-        ValueError, TypeError: as :class:`DiscreteSkillSACLoss`.
 
     Keys (``set_keys``): those of ``DiscreteSACLoss`` and of :class:`SkillDiscriminatorLoss`
     (``skill``, ``skill_logits``).
@@ -53,9 +48,7 @@ class DIAYNLoss(DiscreteSkillSACLoss):
         >>> loss = DIAYNLoss(
         ...     SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"]),
         ...     SkillCritic(2, 4, num_skills=3, in_keys=["velocity"]),
-        ...     SkillDiscriminator(2, num_skills=3),
-        ...     action_space="categorical",
-        ... )
+        ...     SkillDiscriminator(2, num_skills=3), action_space="categorical")
         >>> [key for key in loss.out_keys if key.startswith("loss")]
         ['loss_actor', 'loss_qvalue', 'loss_alpha', 'loss_discriminator']
     """
@@ -87,18 +80,6 @@ class DIAYNLoss(DiscreteSkillSACLoss):
     def discriminator(self) -> TensorDictModuleBase:
         """The discriminator module; its live parameters are those this loss trains."""
         return self.objective.discriminator
-
-
-def _continuous_diayn(
-    actor_network: ProbabilisticTensorDictSequential,
-    qvalue_network: TensorDictModuleBase,
-    discriminator: TensorDictModuleBase,
-    **given: Any,
-) -> SkillSACLoss:
-    """Return a SkillSACLoss with a discriminator, by the arguments of an older class."""
-    own = {key: given.pop(key) for key in ("num_skills", "prior", "reduction") if key in given}
-    objective = SkillDiscriminatorLoss(discriminator, **own)
-    return SkillSACLoss(actor_network, qvalue_network, objective, **given)
 
 
 def _rename_discriminator_objective(

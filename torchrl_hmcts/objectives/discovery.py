@@ -28,20 +28,19 @@ class SkillDiscriminatorLoss(SkillObjective):
 
         L(\phi) = -\log q_\phi(z \mid s'), \qquad r = \log q_\phi(z \mid s') - \log p(z)
 
-    ``s'`` stands for the entries ``("next", key)`` with ``key`` in ``discriminator.in_keys``.
     Skills that the prior switches off are never guessed: their logits count as ``-inf``.
 
     Args:
-        discriminator (TensorDictModuleBase): reads its ``in_keys`` and writes ``skill_logits``
-            ``[*B, Z]``, e.g. a :class:`~torchrl_hmcts.modules.SkillDiscriminator`.
+        discriminator (TensorDictModuleBase): reads its ``in_keys`` from ``"next"`` and writes
+            ``skill_logits`` ``[*B, Z]``, e.g. a
+            :class:`~torchrl_hmcts.modules.SkillDiscriminator`.
         num_skills, prior, reduction: as in :class:`SkillObjective`.
 
     Returns:
         TensorDict with ``loss_discriminator`` and the detached ``discriminator_accuracy`` (fraction
-        of transitions whose skill has the highest logit); with ``reduction="none"`` both ``[*B]``.
+        of transitions whose skill has the highest logit).
 
-    Keys (``set_keys``): those of :class:`SkillObjective` and ``skill_logits`` (default
-    ``"skill_logits"``).
+    Keys (``set_keys``): those of :class:`SkillObjective` and ``skill_logits``.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070, algorithm 1.
@@ -121,13 +120,10 @@ class EncoderObjective(SkillObjective):
     def skill_vectors(self) -> Tensor:
         r"""Returns the zero-centred vector of each skill under the prior of now, ``[Z, Z]``.
 
-        Skills that are vectors have no other.
-
         .. math:: \bar e_z = \frac{e_z - p}{1 - \sum_i p_i^2}
 
         with :math:`e_z` the one-hot skill and :math:`p` the prior. For a uniform prior over n
-        skills it is 1 for the skill and -1 / (n - 1) for the others, as in the papers; under any
-        prior the mean is zero.
+        skills it is 1 for the skill and -1 / (n - 1) for the others, as in the papers.
         """
         p = self.prior.probs().detach()
         spread = 1.0 - p.square().sum()
@@ -166,11 +162,9 @@ class METRAEncoderLoss(EncoderObjective):
         r = (\phi(s') - \phi(s))^\top \bar e_z
 
     with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`), or
-    the skill itself if it is a vector, as the authors' on the :class:`UnitSphere` are. The distance
-    in latent space is thus the number of steps between two states, and skills are the directions in
-    which one can get furthest from elsewhere. :math:`\lambda` is held fixed in the first loss and
-    the encoder in the second; :math:`\log \lambda` is the parameter, so that :math:`\lambda` stays
-    positive, and its gradient does not depend on :math:`\lambda`.
+    the skill itself if it is a vector, as the authors' on the :class:`UnitSphere` are. Distances
+    are thus numbers of steps. :math:`\lambda` is held fixed in the first loss and the encoder in
+    the second; :math:`\log \lambda` is the parameter.
 
     Args:
         encoder (TensorDictModuleBase): reads its ``in_keys`` and writes ``representation``
@@ -182,15 +176,9 @@ class METRAEncoderLoss(EncoderObjective):
 
     Returns:
         TensorDict with ``loss_encoder``, ``loss_dual`` and the detached ``latent_distance`` (the
-        mean of :math:`\|\phi(s') - \phi(s)\|`) and ``dual`` (:math:`\lambda`); with
-        ``reduction="none"`` all are ``[*B]``.
+        mean of :math:`\|\phi(s') - \phi(s)\|`) and ``dual`` (:math:`\lambda`).
 
-    Raises:
-        ValueError: if ``dual_init`` is not positive or ``slack`` is negative; see also
-            :class:`SkillObjective`.
-
-    Keys (``set_keys``): those of :class:`SkillObjective` and ``representation`` (default
-    ``"representation"``).
+    Keys (``set_keys``): those of :class:`SkillObjective` and ``representation``.
 
     Reference:
         Park, Rybkin, Levine, "METRA: Scalable Unsupervised RL with Metric-Aware Abstraction", 2023,
@@ -241,10 +229,8 @@ class LSDEncoderLoss(EncoderObjective):
         L(\phi) = -r, \qquad r = (\phi(s') - \phi(s))^\top \bar e_z, \qquad
         \|\phi(x) - \phi(y)\| \le \|x - y\|
 
-    with :math:`\bar e_z` the zero-centred one-hot vector of the skill (:meth:`skill_vectors`), or
-    the skill itself if it is a vector, as the authors' from a normal distribution are. Spectral
-    normalisation keeps the encoder 1-Lipschitz, so only moving far in the units of what it reads
-    gives a large reward; scale it by the ``intrinsic_coeff`` of
+    with :math:`\bar e_z` as in :class:`METRAEncoderLoss`. The reward is in the units of what the
+    encoder reads; scale it by the ``intrinsic_coeff`` of
     :class:`~torchrl_hmcts.transforms.SkillReward`.
 
     Args:
@@ -254,11 +240,10 @@ class LSDEncoderLoss(EncoderObjective):
 
     Returns:
         TensorDict with ``loss_encoder`` and the detached ``latent_distance``, the mean of
-        :math:`\|\phi(s') - \phi(s)\|`; with ``reduction="none"`` both ``[*B]``.
+        :math:`\|\phi(s') - \phi(s)\|`.
 
     Raises:
-        ValueError: if a linear layer of the encoder is not normalised; see also
-            :class:`SkillObjective`.
+        ValueError: if a linear layer of the encoder is not normalised.
 
     Keys (``set_keys``): those of :class:`METRAEncoderLoss`.
 
@@ -301,11 +286,9 @@ class SkillDynamicsLoss(SkillObjective):
         L(\phi) = -\log q_\phi(s' \mid s, z), \qquad
         r = \log q_\phi(s' \mid s, z) - \log \sum_i p(z_i)\, q_\phi(s' \mid s, z_i)
 
-    with the skill dynamics :math:`q` a Gaussian of the change :math:`s' - s`. Where the paper draws
-    skills from the prior for the second term, this sums over all of them, which for discrete skills
-    is exact. The reward is at most :math:`-\log p(z)`, as DIAYN's. Skills that are vectors are
-    drawn as in the paper, ``prior_samples`` of them, and averaged together with the skill itself,
-    as in the authors' code: the reward is at most the logarithm of their number.
+    with the skill dynamics :math:`q` a Gaussian of the change :math:`s' - s`. The sum is over all
+    skills, so the reward is at most :math:`-\log p(z)`. Of vectors ``prior_samples`` are drawn, as
+    in the paper, and averaged together with the skill itself, as in the authors' code.
 
     Args:
         dynamics (TensorDictModuleBase): reads its ``in_keys`` of a state and writes ``skill_loc``
@@ -313,19 +296,13 @@ class SkillDynamicsLoss(SkillObjective):
             its attribute ``target_key`` under each skill; e.g. a
             :class:`~torchrl_hmcts.modules.SkillDynamics`.
         num_skills, prior, reduction: as in :class:`SkillObjective`.
-        prior_samples (int): vectors drawn at each call, for skills that are vectors. Default 64;
-            the authors take up to 500.
+        prior_samples (int): vectors drawn at each call. Default 64; the authors take up to 500.
 
     Returns:
         TensorDict with ``loss_dynamics`` (nats) and the detached ``dynamics_accuracy`` (fraction
-        of transitions for which the skill is the most probable one given the change); with
-        ``reduction="none"`` both ``[*B]``.
+        of transitions for which the skill is the most probable one given the change).
 
-    Raises:
-        AttributeError: if the dynamics have no ``target_key``.
-
-    Keys (``set_keys``): those of :class:`SkillObjective`, ``skill_loc`` and ``skill_scale``
-    (defaults ``"skill_loc"``, ``"skill_scale"``).
+    Keys (``set_keys``): those of :class:`SkillObjective`, ``skill_loc`` and ``skill_scale``.
 
     Reference:
         Sharma et al., "Dynamics-Aware Unsupervised Discovery of Skills", 2019, arXiv 1907.01657,

@@ -27,20 +27,17 @@ class GoalCloningLoss(Loss):
 
     with the places x and x' before and after the action a and the goal g, a place that was reached
     later in the episode. The weights have mean 1 in a batch; A is cut at 3 both ways.
-    :math:`\beta = 0` is plain cloning, which is as slow and as noisy as what was recorded.
+    :math:`\beta = 0` is plain cloning.
 
     Args:
         actor_network (TensorDictModuleBase): reads its ``in_keys``, the goal among them, and writes
             ``action``, without a draw.
-        progress_coeff (float): :math:`\beta`. Default ``2.0``.
+        progress_coeff (float): :math:`\beta`, not negative.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Returns:
         TensorDict with ``loss_actor`` and the detached ``action_error`` (mean absolute, without
         weights). With ``reduction="none"`` both are ``[*B]``.
-
-    Raises:
-        ValueError: if ``progress_coeff`` is negative.
 
     Keys (``set_keys``): ``action`` (float ``[*B, D]``), ``position`` (float ``[*B, F]``, read
     before the step and from ``"next"``), ``goal`` (float ``[*B, F]``), ``priority_weight``; each by

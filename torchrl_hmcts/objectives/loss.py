@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,8 +12,9 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
+from torchrl.objectives.value import ValueEstimatorBase
 
-from torchrl_hmcts.checks import one_of
+from torchrl_hmcts.checks import instance, one_of, real_number
 from torchrl_hmcts.modules.skill_mlp import SkillNetwork, entries
 
 _Base: Any = LossModule if TYPE_CHECKING else object
@@ -146,3 +147,59 @@ def run_network(module: SkillNetwork, params: TensorDictBase, tensordict: Tensor
         weights = list(params.parameters()) or list(params.buffers())
     weights = weights or list(params.values(True, True))
     return network.run(weights, *entries(module, tensordict, module.in_keys))
+
+
+Discounting = TypeVar("Discounting", LossModule, ValueEstimatorBase)
+
+
+def use_durations(
+    module: Discounting,
+    *,
+    gamma: float | None = None,
+    duration_key: NestedKey = "duration",
+) -> Discounting:
+    r"""Tell a loss or a value estimator to discount each macro-step by its base steps.
+
+    .. math:: R + \gamma^k (1 - d) V(s')
+
+    TorchRL's on-policy trainers estimate advantages by a ``GAE`` of their own: give them
+    ``gae=use_durations(GAE(...))``. Call this again after each ``make_value_estimator``.
+
+    Args:
+        module (LossModule or ValueEstimatorBase): what discounts, e.g. a ``DQNLoss`` or a ``GAE``.
+        gamma (float, optional): discount per base step, in ``(0, 1]``, for a loss, whose default
+            value estimator is made with it. Default: that of the estimator it has.
+        duration_key (NestedKey): base steps of a macro-step, int64 ``[*B, 1]``, under ``"next"``.
+
+    Returns:
+        The module.
+
+    Raises:
+        ValueError: if ``gamma`` is given for an estimator, which has its own.
+
+    Reference:
+        Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import ValueOperator
+        >>> from torchrl.objectives.value import GAE
+        >>> from torchrl_hmcts.objectives import use_durations
+        >>> critic = ValueOperator(torch.nn.Linear(2, 1), in_keys=["velocity"])
+        >>> gae = use_durations(GAE(gamma=0.99, lmbda=0.95, value_network=critic))
+        >>> gae.tensor_keys.steps_to_next_obs
+        ('next', 'duration')
+    """
+    instance("use_durations", "module", module, LossModule, ValueEstimatorBase)
+    if gamma is not None:
+        real_number("use_durations", "gamma", gamma, above=0.0, most=1.0)
+        if isinstance(module, ValueEstimatorBase):
+            raise ValueError(
+                f"use_durations got gamma={gamma} for a {type(module).__name__}, which has its "
+                f"own. Pass gamma where you make it."
+            )
+        module.make_value_estimator(gamma=gamma)
+    # A loss makes one with its defaults where there is none.
+    estimator = module if isinstance(module, ValueEstimatorBase) else module.value_estimator
+    estimator.set_keys(steps_to_next_obs=unravel_key(("next", duration_key)))
+    return module

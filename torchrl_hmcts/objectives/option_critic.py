@@ -62,22 +62,17 @@ class OptionTerminationLoss(_OptionLoss):
         A(s', o) = Q_\Omega(s', o) - V_\Omega(s')
 
     with the advantage detached, so that :math:`-\nabla L` is the gradient of the expected return by
-    the termination's parameters (theorem 2 of the paper, for states :math:`s'` met while options
-    run). :math:`V_\Omega(s') = \max_o Q_\Omega(s', o)`, or the mean over a policy's options. Where
-    o is the best option the advantage is 0: the deliberation cost :math:`\xi` makes it continue
-    there, and end only where continuing costs more than :math:`\xi`.
-
-    Each transition is one base step (or several) of an option: root and ``"next"``, with the option
-    that runs at the root. Where the option values come from is not this loss's business: TorchRL's
-    ``DQNLoss`` on a macro env, :class:`IntraOptionQLoss`, or the values of a search tree.
+    the termination's parameters. :math:`V_\Omega(s') = \max_o Q_\Omega(s', o)`, or the mean over a
+    policy's options. With the deliberation cost :math:`\xi` an option ends only where continuing
+    costs more than that. A transition is one base step (or several) of an option.
 
     Args:
         termination_network (TensorDictModuleBase): writes ``termination_logits`` ``[*B, 1]`` from
             entries of the next state and the option ``skill``, e.g. a
             :class:`~torchrl_hmcts.modules.TerminationNetwork`.
         qvalue_network (TensorDictModuleBase, optional): writes ``action_value`` ``[*B, A]`` from
-            entries of the next state. It stays its owner's: it is read as it is at every call, and
-            neither trained nor saved here. Default: ``("next", action_value)`` of the data.
+            entries of the next state; read as it is at every call, its owner's. Default: ``("next",
+            action_value)`` of the data.
         deliberation_cost (float): :math:`\xi \ge 0`, in units of return. Default 0.
         option_policy (callable, optional): ``option_policy(td) -> probabilities [*B, A]`` in the
             next state, e.g. a :class:`~torchrl_hmcts.planners.ModulePrior`. Default: the best.
@@ -88,12 +83,10 @@ class OptionTerminationLoss(_OptionLoss):
         ``option_advantage``; with ``reduction="none"`` all ``[*B]``.
 
     Raises:
-        ValueError: if the deliberation cost is negative or the reduction is unknown; at the call if
-            a shape does not fit.
+        ValueError: at the call if a shape does not fit.
 
-    Keys (``set_keys``): ``skill`` (the option, int64 ``[*B]``, default ``"skill"``),
-    ``termination_logits``, ``action_value``, ``terminated`` (:math:`d`, default ``"terminated"``),
-    ``priority_weight``.
+    Keys (``set_keys``): ``skill`` (the option, int64 ``[*B]``), ``termination_logits``,
+    ``action_value``, ``terminated`` (:math:`d`), ``priority_weight``.
 
     Reference:
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140, theorem 2;
@@ -177,18 +170,16 @@ class IntraOptionQLoss(_OptionLoss):
         L(\theta) &= \ell\bigl(Q_\theta(s, o),\; R + \gamma^k (1 - d)\, U(s', o)\bigr) \\
         U(s', o) &= (1 - \beta(s', o))\, \bar Q(s', o) + \beta(s', o) \max_{o'} \bar Q(s', o')
 
-    A transition is any piece of an option of :math:`k` base steps, one of them or all: what the
-    option would have done afterwards is :math:`\beta`'s to say, so that data of options that ended
+    A transition is any piece of an option of :math:`k` base steps; data of options that ended
     otherwise serve as well. With :math:`\beta = 1` it is Q-learning on the macro env.
 
     Args:
         qvalue_network (TensorDictModuleBase): writes ``action_value`` ``[*B, A]``.
-        termination_network (TensorDictModuleBase, optional): writes ``termination_logits``. It
-            stays its owner's, and is read as it is at every call. Default: options end (beta = 1).
-        gamma (float): discount per base step, in ``(0, 1]``. Default 0.99.
+        termination_network (TensorDictModuleBase, optional): writes ``termination_logits``; read as
+            it is at every call, its owner's. Default: options end (beta = 1).
+        gamma (float): discount per base step, in ``(0, 1]``.
         loss_function (str): ``"l2"`` (default), ``"l1"`` or ``"smooth_l1"``.
-        delay_value (bool): bootstrap from target parameters, to be moved by ``SoftUpdate``. Default
-            ``True``.
+        delay_value (bool): bootstrap from target parameters, to be moved by ``SoftUpdate``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Returns:
@@ -196,12 +187,10 @@ class IntraOptionQLoss(_OptionLoss):
         ``reduction="none"`` both ``[*B]``.
 
     Raises:
-        ValueError: if ``gamma`` or the reduction is out of range; at the call if a shape does not
-            fit.
+        ValueError: at the call if a shape does not fit.
 
-    Keys (``set_keys``): ``skill`` (the option), ``termination_logits``, ``action_value``,
-    ``reward``, ``terminated``, ``duration`` (:math:`k`, int64 ``[*B, 1]``, under ``"next"``; 1
-    where the data have none), ``priority_weight``.
+    Keys (``set_keys``): those of :class:`OptionTerminationLoss`, ``reward`` and ``duration``
+    (:math:`k`, int64 ``[*B, 1]``, under ``"next"``; 1 where the data have none).
 
     Reference:
         Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999, section 6; Bacon, Harb and

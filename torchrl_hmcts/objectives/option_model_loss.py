@@ -30,16 +30,12 @@ class OptionModelLoss(Loss):
         + c_R\, \ell_R(f^j_R, y_R) + c_k\, \ell_k(f^j_k, y_k)
         + c_p\, \mathrm{BCE}(f^j_p, y_p) \big]
 
-    with :math:`\ell_s` and :math:`\ell_k` Huber's: the outcome at a corner is one of two, of which
-    it favours the likelier while the square prefers a place between them. :math:`\ell_R` is the
-    square: a sparse reward is to be met in the mean.
+    with :math:`\ell_s` and :math:`\ell_k` Huber's, which favours the likelier of two outcomes at a
+    corner, and the square as :math:`\ell_R`: a sparse reward is to be met in the mean.
 
     Members differ by their first weights and, if the data hold ``bootstrap_mask``, by which
-    transitions each of them learns from; store such a mask with the data, so that a member never
-    sees what it is to be surprised by.
-
-    An option that the time limit cut short has no true outcome: leave such transitions out (those
-    with ``truncated`` and fewer base steps than the option would have taken).
+    transitions each of them learns from; store such a mask with the data. An option that the time
+    limit cut short has no true outcome: leave such transitions out.
 
     Args:
         model (OptionModel): what is trained; it stays a sub-module as it is.
@@ -52,12 +48,9 @@ class OptionModelLoss(Loss):
         and detached ``delta_error`` (mean absolute error of the normalised changes, over members)
         and ``terminated_accuracy``; with ``reduction="none"`` all ``[*B]``.
 
-    Raises:
-        ValueError: if the reduction or a weight is not usable.
-
     Keys (``set_keys``): ``reward``, ``duration``, ``terminated`` (under ``"next"``; defaults: the
-    model's), ``bootstrap_mask`` (``[*B, K]``, any number >= 0, read if it is there; default
-    ``"bootstrap_mask"``), ``priority_weight``.
+    model's), ``bootstrap_mask`` (``[*B, K]``, any number >= 0, if it is there),
+    ``priority_weight``.
 
     Reference:
         Bootstrapped ensembles: Chua et al. 2018, arXiv 1805.12114; masks: Osband et al., "Deep
@@ -104,13 +97,9 @@ class OptionModelLoss(Loss):
         owner = type(self).__name__
         instance(owner, "model", model, OptionModel)
         self.model = model
-        coefficients = {
-            "delta_coeff": delta_coeff,
-            "reward_coeff": reward_coeff,
-            "duration_coeff": duration_coeff,
-            "terminated_coeff": terminated_coeff,
-        }
-        for name, coeff in coefficients.items():
+        names = ("delta_coeff", "reward_coeff", "duration_coeff", "terminated_coeff")
+        given = (delta_coeff, reward_coeff, duration_coeff, terminated_coeff)
+        for name, coeff in zip(names, given, strict=True):
             self.register_coeff_buffer(name, real_number(owner, name, coeff, least=0.0))
         self.set_keys(
             reward=model.reward_key, duration=model.duration_key, terminated=model.terminated_key

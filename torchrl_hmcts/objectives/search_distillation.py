@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_hmcts.checks import one_of, real_number
+from torchrl_hmcts.modules.skill_mlp import entries
 from torchrl_hmcts.objectives.loss import Loss, run_module
 
 _VALUE_LOSSES = ("l2", "smooth_l1", "log", "cross_entropy")
@@ -35,26 +36,22 @@ class ExpertIterationLoss(Loss):
     - ``"l2"``: :math:`(v - G)^2`;
     - ``"smooth_l1"``: Huber's, with its corner at 1;
     - ``"log"``: Huber's of :math:`\ln v - \ln G`, for positive values. With one reward at the end
-      :math:`\ln G = n \ln \gamma`: the error counts base steps, however far the reward is;
+      it counts base steps, however far the reward is;
     - ``"cross_entropy"``: :math:`-G \ln v - (1 - G) \ln(1 - v)`, for values that are probabilities.
 
     Args:
         network (TensorDictModuleBase): reads its ``in_keys`` and writes ``logits`` ``[*B, A]`` and
             ``state_value`` ``[*B, 1]``, the prior and the value of a planner.
-        value_coeff (float): :math:`c_v`. Default ``1.0``.
+        value_coeff (float): :math:`c_v`.
         value_loss (str): ``"l2"`` (default), ``"smooth_l1"``, ``"log"`` or ``"cross_entropy"``.
         reduction (str): ``"mean"`` (default; over all examples, not over their weights), ``"sum"``
             or ``"none"``.
 
     Returns:
-        TensorDict with ``loss_policy`` and ``loss_value``, and the detached diagnostics
-        ``policy_accuracy`` (fraction of examples whose target's best option has the highest logit),
-        ``policy_divergence`` (nats above the target's entropy) and ``value_error`` (mean absolute),
-        the last three over examples that have a weight. With ``reduction="none"`` all are ``[*B]``.
-
-    Raises:
-        ValueError: if ``value_coeff`` is negative, or a name is none of those above.
-        KeyError: at the call, if the examples have no targets.
+        TensorDict with ``loss_policy`` and ``loss_value``, and detached diagnostics over examples
+        that have a weight: ``policy_accuracy`` (fraction whose target's best option has the highest
+        logit), ``policy_divergence`` (nats above the target's entropy) and ``value_error`` (mean
+        absolute). With ``reduction="none"`` all are ``[*B]``.
 
     Keys (``set_keys``): ``logits``, ``state_value``, ``policy_target`` (float ``[*B, A]``),
     ``policy_weight`` (float ``[*B]``, 1 if absent), ``value_target`` (float ``[*B, 1]``),
@@ -123,8 +120,8 @@ class ExpertIterationLoss(Loss):
         mask = tensordict.get(keys.action_mask, None)
         if mask is not None:
             logits = logits.masked_fill(~mask, torch.finfo(logits.dtype).min)
-        target = self._required(tensordict, keys.policy_target)
-        goal = self._required(tensordict, keys.value_target).reshape(value.shape)
+        target, goal = entries(self, tensordict, [keys.policy_target, keys.value_target])
+        goal = goal.reshape(value.shape)
         # 0 for what may not be taken, whose log-probability is a very large number.
         cross_entropy = -torch.where(target > 0, target * logits.log_softmax(-1), 0.0).sum(-1)
         entropy = -torch.special.xlogy(target, target).sum(-1)
@@ -149,16 +146,6 @@ class ExpertIterationLoss(Loss):
         if self.value_loss_name == "log":
             value, goal = value.clamp_min(_SMALLEST).log(), goal.clamp_min(_SMALLEST).log()
         return F.smooth_l1_loss(value, goal, reduction="none")
-
-    def _required(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        entry = tensordict.get(key, None)
-        if entry is None:
-            raise KeyError(
-                f"ExpertIterationLoss reads {key!r}, which the examples do not have; they have "
-                f"{sorted(map(str, tensordict.keys(True, True)))}. Name their entries with "
-                f"set_keys(policy_target=..., value_target=...)."
-            )
-        return entry
 
     def _weight(self, tensordict: TensorDictBase, key: NestedKey, like: Tensor) -> Tensor:
         weight = tensordict.get(key, None)

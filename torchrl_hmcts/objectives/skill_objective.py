@@ -34,19 +34,18 @@ class SkillObjective(Loss):
 
     .. math:: L(\phi; s, z, s'), \qquad r_\phi(s, z, s')
 
-    An objective is everything in which one method of skill discovery differs from another. A
-    :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` trains it beside actor and critics, a
+    A :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` trains it beside actor and critics, a
     :class:`~torchrl_hmcts.transforms.SkillReward` writes its reward; both take any objective.
-
     Sub-classes define :meth:`losses`, :meth:`reward` and three attributes: ``root_features`` and
     ``next_features``, the entries they read of the state before and after a transition, and
-    ``out_keys``. Gradients of the losses stay within the objective's own parameters.
+    ``out_keys``. A terminal state may hold anything: where what is read of one is not finite, its
+    transition teaches nothing and is worth 0, as that of a skill that the prior switches off.
 
     Args:
         num_skills (int or TensorSpec, optional): number of skills ``Z``, or the spec of one skill
-            that is a vector ``[D]``. Default ``None``: what the network says.
+            that is a vector ``[D]``. Default: what the network says.
         prior (SkillPrior, sequence of float or Tensor, optional): p(z), ``[Z]``, normalised; 0
-            switches a skill off. Default ``None``: uniform; vectors have that of their spec. A
+            switches a skill off. Default: uniform, or that of the vectors' spec. A
             :class:`~torchrl_hmcts.modules.SkillPrior` is read at every use and stays its owner's.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
         **network (TensorDictModuleBase): what is trained, under the name of its attribute.
@@ -56,15 +55,10 @@ class SkillObjective(Loss):
         ``reduction="none"`` all are ``[*B]``.
 
     Raises:
-        ValueError: if the reduction is unknown, or the number of skills is unknown or contradicts
-            that of the network or prior.
+        ValueError: if the number of skills is unknown or contradicts that of the network or prior.
 
-    A terminal state may hold anything; where the entries that are read of one are not finite, its
-    transition teaches nothing and is worth 0. So does one of a skill that the prior switches off.
-
-    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, or float ``[*B, D]``, default ``"skill"``),
-    ``terminated`` (read under ``"next"`` if it is there, default ``"terminated"``),
-    ``priority_weight`` (default ``"priority_weight"``).
+    Keys (``set_keys``): ``skill`` (int64 ``[*B]``, or float ``[*B, D]``), ``terminated`` (read
+    under ``"next"`` if it is there) and ``priority_weight``, each by its own name by default.
 
     Reference:
         This project's: the common form of DIAYN, DADS, METRA and LSD.
@@ -80,13 +74,10 @@ class SkillObjective(Loss):
         ...     def reward(self, tensordict):
         ...         sign = 2 * tensordict["skill"].unsqueeze(-1) - 1
         ...         return sign * (tensordict["next", "x"] - tensordict["x"])
-        >>> objective = GoWhereTheSkillSays(2)
         >>> td = TensorDict(x=torch.zeros(2, 1), skill=torch.tensor([0, 1]),
         ...                 next=TensorDict(x=torch.ones(2, 1), batch_size=[2]), batch_size=[2])
-        >>> objective.reward(td).flatten().tolist()
+        >>> GoWhereTheSkillSays(2).reward(td).flatten().tolist()
         [-1.0, 1.0]
-        >>> objective.in_keys
-        ['skill', 'x', ('next', 'x')]
     """
 
     @dataclass

@@ -146,15 +146,6 @@ class _TrainsObjective(Reduction):
         key = getattr(self.tensor_keys, self._value_name)
         return self._vmap_qnetworkN0(inputs, params).get(key)
 
-    def _what_follows(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Returns the entries after transitions, in a copy, without those of terminal states."""
-        after = tensordict.get("next")
-        terminated = after.get(self.tensor_keys.terminated, None)
-        if terminated is None:
-            terminated = after.get(self.tensor_keys.done)
-        keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
-        return without_terminal_entries(after, terminated, keys)
-
     @property
     def alpha(self) -> Tensor:
         """The entropy coefficient, within its bounds, detached."""
@@ -169,7 +160,12 @@ class _TrainsObjective(Reduction):
     @torch.no_grad()
     def _compute_target(self, tensordict: TensorDictBase) -> Tensor:
         """Returns r + gamma (1 - d) V(s', z), ``[*B]``."""
-        after = self._what_follows(tensordict)
+        after = tensordict.get("next")
+        terminated = after.get(self.tensor_keys.terminated, None)
+        if terminated is None:
+            terminated = after.get(self.tensor_keys.done)
+        keys = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        after = without_terminal_entries(after, terminated, keys)
         after.set(self.value_estimator.tensor_keys.value, self._next_value(after))
         transitions = tensordict.copy().set("next", after)
         return self.value_estimator.value_estimate(transitions).squeeze(-1)
@@ -219,13 +215,11 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
 
     plus the losses of the objective. The reward :math:`r` is the entry ``("next", "reward")``: put
     a :class:`~torchrl_hmcts.transforms.SkillReward` with the same objective on the replay buffer.
-    Being a :class:`torchrl.objectives.DiscreteSACLoss`, it runs with ``SoftUpdate``, ``Trainer``
-    and ``SACTrainer`` unchanged. No loss sends gradients into the parameters of another. What
-    follows a transition is never read where it terminates, and always where it is truncated.
+    It is a :class:`torchrl.objectives.DiscreteSACLoss`. What follows a transition is never read
+    where it terminates, and always where it is truncated.
 
     With a ``policy_prior`` :math:`\pi_0`, :math:`\log \pi` gives way to :math:`\log \pi - \log
-    \pi_0`: the policy is kept near another one instead of near the uniform one, and the best it can
-    do is :math:`\pi \propto \pi_0 \exp(Q / \alpha)`.
+    \pi_0`: the best policy is :math:`\pi \propto \pi_0 \exp(Q / \alpha)`.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy pi(a | s, z), e.g. a
@@ -237,38 +231,33 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
         action_space (str or TensorSpec): ``"categorical"``, ``"one-hot"`` or the action spec.
         num_actions (int, optional): number of actions ``A``. Default: that of the actor; needed
             only for ``target_entropy="auto"``.
-        gamma (float): discount per base step. Default ``0.95``: a horizon of twenty steps, about
-            what it takes a body with momentum to turn round.
+        gamma (float): discount per base step. Default ``0.95``, a horizon of twenty steps.
         alpha_init (float): entropy coefficient at the start, in units of reward. Default ``0.3``:
-            with less, skills settle before they have spread out, and two of them stay together.
+            with less, skills settle before they have spread out.
         fixed_alpha (bool): keep alpha instead of tuning it to a target entropy. Default ``True``:
-            in a run of a few hundred updates a tuned alpha is still far from settling.
+            a run of a few hundred updates is too short to tune it.
         min_alpha, max_alpha (float, optional): bounds of a tuned alpha. Default ``None``.
         target_entropy (float or "auto"): target entropy in nats. Default ``"auto"``.
-        target_entropy_weight (float): target entropy as a fraction of ``log A``. Default ``0.5``.
+        target_entropy_weight (float): target entropy as a fraction of ``log A``.
         policy_prior (TensorDictModuleBase, optional): :math:`\pi_0`; writes ``logits`` ``[*B, A]``
-            from entries that actor or critics read too. It is read as it is, and neither trained
-            nor saved here. Use a fixed alpha with it. Default ``None``: the uniform policy.
+            from entries that actor or critics read too. It is its owner's. Use a fixed alpha with
+            it. Default: the uniform policy.
         num_qvalue_nets (int): number of critics. Default ``2``, the twins.
         loss_function (str): ``"l2"`` (default), ``"l1"`` or ``"smooth_l1"`` for the critics.
         delay_qvalue (bool): bootstrap from target critics, to be moved by ``SoftUpdate``. Default
             ``True``.
-        reduction (str, optional): ``"mean"``, ``"sum"`` or ``"none"``. Default: that of the
-            objective, which must be the same.
-        deactivate_vmap (bool): run critics that cannot be stacked one after the other. Default
-            ``False``.
+        reduction (str, optional): that of the objective, which is the default.
+        deactivate_vmap (bool): run critics that cannot be stacked one after the other.
 
     Returns:
         TensorDict with ``loss_actor``, ``loss_qvalue`` (summed over the critics), ``loss_alpha``,
-        the losses of the objective and the detached diagnostics ``qvalue_loss_0``,
-        ``qvalue_loss_1`` and so on (each critic's own), those of the objective, ``alpha``,
-        ``entropy`` (nats). With ``reduction="none"`` all entries are ``[*B]``; ``alpha`` and
-        ``entropy`` are left out.
+        the losses of the objective and detached diagnostics: ``qvalue_loss_0`` and so on, those of
+        the objective, ``alpha``, ``entropy`` (nats). With ``reduction="none"`` all are ``[*B]``,
+        without the last two.
 
     Raises:
         TypeError: if the objective is no :class:`SkillObjective`.
-        ValueError: if a number is out of its range, the reduction is not that of the objective, or
-            the prior writes no logits.
+        ValueError: if the reduction is not that of the objective, or the prior writes no logits.
 
     Keys (``set_keys``): those of ``DiscreteSACLoss``, and ``skill``, which is handed on to the
     objective. Other keys of the objective are set on ``loss.objective``.
@@ -285,9 +274,7 @@ class DiscreteSkillSACLoss(_TrainsObjective, DiscreteSACLoss):
         >>> loss = DiscreteSkillSACLoss(
         ...     SkillActor(2, Categorical(4), num_skills=3, in_keys=["velocity"]),
         ...     SkillCritic(2, 4, num_skills=3, in_keys=["velocity"]),
-        ...     METRAEncoderLoss(SkillEncoder(2, num_skills=3)),
-        ...     action_space="categorical",
-        ... )
+        ...     METRAEncoderLoss(SkillEncoder(2, num_skills=3)), action_space="categorical")
         >>> [key for key in loss.out_keys if key.startswith("loss")]
         ['loss_actor', 'loss_qvalue', 'loss_alpha', 'loss_encoder', 'loss_dual']
     """
@@ -409,11 +396,8 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
             ``state_action_value`` ``[*B, 1]``, e.g. a
             :class:`~torchrl_hmcts.modules.SkillActionCritic`; copied ``num_qvalue_nets`` times.
         objective (SkillObjective): what makes skills different.
-        action_spec (TensorSpec, optional): of the action ``[D]``. Default: that of the actor;
-            needed only for ``target_entropy="auto"``.
-        target_entropy (float or "auto"): target entropy in nats. Default ``"auto"``: ``-D``.
-        gamma, alpha_init, fixed_alpha, min_alpha, max_alpha: as in :class:`DiscreteSkillSACLoss`.
-        num_qvalue_nets, loss_function, delay_qvalue, reduction, deactivate_vmap: so are these.
+        action_spec (TensorSpec, optional): of the action ``[D]``. Default: that of the actor.
+        **sac: as in :class:`DiscreteSkillSACLoss`; the default ``target_entropy`` is ``-D``.
 
     Returns:
         TensorDict with the entries of :class:`DiscreteSkillSACLoss`; ``entropy`` is that of the
@@ -428,12 +412,10 @@ class SkillSACLoss(_TrainsObjective, SACLoss):
         >>> from torchrl.data import Bounded
         >>> from torchrl_hmcts.modules import SkillActionCritic, SkillActor, SkillDiscriminator
         >>> from torchrl_hmcts.objectives import SkillDiscriminatorLoss, SkillSACLoss
-        >>> spec = Bounded(-1.0, 1.0, shape=(2,))
         >>> loss = SkillSACLoss(
-        ...     SkillActor(2, spec, num_skills=3, in_keys=["velocity"]),
+        ...     SkillActor(2, Bounded(-1.0, 1.0, shape=(2,)), num_skills=3, in_keys=["velocity"]),
         ...     SkillActionCritic(2, 2, num_skills=3, in_keys=["velocity"]),
-        ...     SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=3)),
-        ... )
+        ...     SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=3)))
         >>> [key for key in loss.out_keys if key.startswith("loss")]
         ['loss_actor', 'loss_qvalue', 'loss_alpha', 'loss_discriminator']
     """

@@ -7,18 +7,22 @@ raises a :class:`ContractError` that says what is wrong, why it matters and what
 from torchrl_hmcts.testing.contract import ContractError
 from torchrl_hmcts.testing.env_checks import check_env, check_macro_env, check_parallel_env
 from torchrl_hmcts.testing.loss_checks import LOSS_CHECKS, check_loss
-from torchrl_hmcts.testing.novelty_checks import check_novelty
 from torchrl_hmcts.testing.search_checks import (
     check_evaluator,
+    check_novelty,
     check_option_prior,
     check_planner,
     check_tree_policy,
 )
 from torchrl_hmcts.testing.settable_checks import check_settable
-from torchrl_hmcts.testing.skill_checks import check_skill_objective, check_skill_prior
 from torchrl_hmcts.testing.solvable_envs import ChainEnv, PointMassEnv, TableEnv
 from torchrl_hmcts.testing.transform_checks import TRANSFORM_CHECKS, check_transform
-from torchrl_hmcts.testing.worker_checks import check_termination, check_worker
+from torchrl_hmcts.testing.worker_checks import (
+    check_skill_objective,
+    check_skill_prior,
+    check_termination,
+    check_worker,
+)
 
 __all__ = [
     "LOSS_CHECKS",

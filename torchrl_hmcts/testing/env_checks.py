@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
-from torch.nn.functional import one_hot
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -41,9 +40,8 @@ def check_env(
     """Check that an env keeps TorchRL's contract: specs, seeds, episodes, partial resets and steps.
 
     TorchRL's ``check_env_specs``, with episodes that continue after their end; the same seed gives
-    the same rollout; the next step begins where the last one ended, and after the end of an episode
-    in a new one; a reset of some elements leaves the others as they are; of elements of which some
-    are not to step the others step as they do alone, and the former stay where they are.
+    the same rollout; the next step begins where the last one ended, or in a new episode; elements
+    that are not to be reset or stepped stay as they are, and the others do not depend on them.
 
     Args:
         env (EnvBase): any env. Stateless ones (``batch_locked=False``) are tried in batches too.
@@ -68,7 +66,7 @@ def check_env(
         with seeded(seed):
             env.set_seed(seed)
             check_env_specs(env, break_when_any_done="both")
-    act = _Random(env, mask_key)
+    act = _random(env, mask_key)
     data = rollout(env, num_steps, seed, act)
     if seeds_repeat:
         require_same(
@@ -98,10 +96,9 @@ def check_macro_env(
 
     All of :func:`check_env`, and: the action is one discrete option; a step takes at least one base
     step; some option may be taken wherever an episode continues; set to the states of a rollout and
-    stepped with its options the env gives what the unbroken rollout gave, for all of them at once
-    if it is stateless; a step leaves its input as it was; transforms of your own keep no tensor to
-    themselves that changes from step to step. With ``step_async``, ``step_wait`` and
-    ``step_abandon``: steps that are under way at the same time do not touch each other.
+    stepped with its options the env gives what the unbroken rollout gave; a step leaves its input
+    as it was; transforms of your own keep no tensor that changes from step to step. With
+    ``step_async``, ``step_wait`` and ``step_abandon``: steps under way do not touch each other.
 
     Args:
         env (EnvBase): stateless, or with ``_supports_set_state = True``; e.g. any env under an
@@ -130,7 +127,7 @@ def check_macro_env(
         simulator = Simulator(env, duration_key=duration_key, mask_key=mask_key)
     foreign = ForeignStates(env)
     before = foreign.read()
-    rollout(env, num_steps, seed, _Random(env, mask_key))
+    rollout(env, num_steps, seed, _random(env, mask_key))
     changed = foreign.changed(before)
     require(
         changed is None,
@@ -145,7 +142,7 @@ def check_macro_env(
         mask_key=mask_key,
         redrawn_keys=redrawn_keys,
     )
-    data = rollout(env, num_steps, seed, _Random(env, mask_key))
+    data = rollout(env, num_steps, seed, _random(env, mask_key))
     after = data.get("next")
     if simulator.duration_key is not None:
         duration, shape = after.get(simulator.duration_key), (*data.batch_size, 1)
@@ -204,7 +201,7 @@ def check_parallel_env(
     name = _name(serial)
     try:
         with during(name, "in a SerialEnv"):
-            expected = rollout(serial, num_steps, seed, _Random(serial, "action_mask"))
+            expected = rollout(serial, num_steps, seed, _random(serial, "action_mask"))
     finally:
         serial.close(raise_if_closed=False)
     for method in start_methods:
@@ -238,28 +235,20 @@ def _name(env: EnvBase) -> str:
     return f"{name} under {', '.join(transforms)}" if transforms else name
 
 
-class _Random:
-    """A policy that draws actions from the spec, and options from the mask if the env has one."""
+def _random(env: EnvBase, mask_key: NestedKey) -> Policy:
+    """Return a policy that draws actions from the spec, options from the mask if there is one."""
+    action_key = env.action_keys[0]
 
-    def __init__(self, env: EnvBase, mask_key: NestedKey) -> None:
-        self.env = env
-        self.mask_key = unravel_key(mask_key)
-        spec = env.full_action_spec[env.action_keys[0]]
-        self.one_hot = isinstance(spec, OneHot)
-        self.masked = isinstance(spec, (OneHot, Categorical))
-
-    def __call__(self, td: TensorDictBase) -> TensorDictBase:
-        td = self.env.rand_action(td)
-        mask = td.get(self.mask_key, None)
-        if mask is None or not self.masked:
+    def act(td: TensorDictBase) -> TensorDictBase:
+        td, spec = env.rand_action(td), env.full_action_spec_unbatched[action_key]
+        mask = td.get(mask_key, None)
+        if mask is None or not isinstance(spec, (OneHot, Categorical)):
             return td
-        weights = (mask | ~mask.any(-1, keepdim=True)).to(torch.float32)
-        option = torch.multinomial(weights.flatten(0, -2) if mask.ndim > 1 else weights, 1)
-        option = option.reshape(mask.shape[:-1])
-        old = td.get(self.env.action_keys[0])
-        if self.one_hot:
-            return td.set(self.env.action_keys[0], one_hot(option, mask.shape[-1]).to(old.dtype))
-        return td.set(self.env.action_keys[0], option.reshape(old.shape).to(old.dtype))
+        spec = spec.expand(*td.batch_size, *spec.shape).clone()
+        spec.update_mask(mask | ~mask.any(-1, keepdim=True))
+        return td.set(action_key, spec.rand())
+
+    return act
 
 
 def rollout(

@@ -267,23 +267,16 @@ class _Loss:
         if not self.targets:
             return
         loss = self.make()
-        trainable = {id(p) for p in loss.parameters()}
+        trained = {p.data_ptr() for p in loss.parameters()}
         create = "Create them with convert_to_functional(..., create_target_params=True)."
         for network in self.targets:
-            held = getattr(loss, f"target_{network}_params", None)
+            held: Any = getattr(loss, f"target_{network}_params", None)
             require(held is not None, f"{self.name} has no target_{network}_params. {create}")
-            assert held is not None
-            own = getattr(loss, f"{network}_params").values(True, True)
-            for target, trained in zip(held.values(True, True), own, strict=True):
-                require(
-                    id(target) not in trainable and not target.requires_grad,
-                    f"{self.name}: target_{network}_params would be trained. {create}",
-                )
-                require(
-                    target.data_ptr() != trained.data_ptr(),
-                    f"{self.name}: target_{network}_params are the network's own. Pass the "
-                    "argument that delays them.",
-                )
+            apart = all(
+                target.data_ptr() not in trained and not target.requires_grad
+                for target in held.values(True, True)
+            )
+            require(apart, f"{self.name}: target_{network}_params would be trained. {create}")
 
         def data(prefix: str) -> dict[str, TensorDictBase]:
             return {n: getattr(loss, f"{prefix}{n}_params").data.clone() for n in self.targets}
@@ -293,14 +286,14 @@ class _Loss:
         with torch.no_grad():
             for parameter in loss.parameters():
                 parameter.add_(1.0)
-        before, trained = data("target_"), data("")
+        before, goal = data("target_"), data("")
         self.backward(self.run(loss))
         for network, now in data("target_").items():
             message = f"a call moved target_{network}_params (<key>). Only an updater may."
             require_same(before[network], now, f"{self.name}: {message}")
         updater.step()
         for network, now in data("target_").items():
-            half = before[network].lerp(trained[network], 0.5)
+            half = before[network].lerp(goal[network], 0.5)
             message = f"did not move target_{network}_params half of the way (<key>)."
             message = f"{self.name}: SoftUpdate(tau=0.5) {message}"
             require_same(half, now, message, tolerance=self.tolerance)

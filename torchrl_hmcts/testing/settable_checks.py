@@ -42,8 +42,7 @@ def check_settable(
         num_states (int): states to restore. Default 50.
         num_steps (int): steps from each, or as many as the episode has left. Default 200.
         seed (int): of the episodes and actions. Default 0.
-        other_process (bool): whether a second process is tried, which takes some seconds. Default
-            ``True``.
+        other_process (bool): whether a second process is tried, which takes some seconds.
         unread_keys (sequence of NestedKey): entries that no step reads as they are, e.g. the bytes
             of a snapshot, in which equal states may differ. Default ``("snapshot",)``.
 

@@ -34,17 +34,6 @@ class EnvTransform(Transform):
                 f"outside: TransformedEnv(ParallelEnv(n, make_env), {name}(...))."
             )
 
-    def _carried(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        """Return an entry of a tensordict to step, which the step before has written."""
-        entry: Tensor | None = tensordict.get(key, None)
-        if entry is None:
-            raise KeyError(
-                f"{type(self).__name__} reads {key!r}, which is missing from the tensordict to "
-                "step. Start from env.reset(), or env.reset(td, set_state=True) for a state of "
-                "your own."
-            )
-        return entry
-
     def _require(self, written: Iterable[NestedKey], *keys: NestedKey, advice: str = "") -> None:
         """Refuse an env whose specs, of the entries ``written``, lack one that is read."""
         written = list(map(unravel_key, written))

@@ -18,25 +18,18 @@ class SkillReward(Transform):
 
     .. math:: r = c_i\, r_\phi(s, z, s') + c_e\, r_{\text{env}}
 
-    Usually it belongs to a replay buffer. There it rewards sampled transitions by the present
-    objective, so old data never have stale rewards. On an env it rewards each step when it is
-    taken. Use it in one of the two places only: the second would take the first one's reward for
-    the env's (harmless while ``extrinsic_coeff`` is 0).
+    On a replay buffer, where it belongs, it rewards sampled transitions by the present objective;
+    on an env, each step when it is taken. Use it in one of the two places only.
 
     Args:
         objective (SkillObjective): gives the reward :math:`r_\phi`, e.g. ``loss.objective`` of a
-            :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`. Its parameters are not listed
-            among the transform's; its owner trains them.
-        intrinsic_coeff (float): :math:`c_i`. Default ``1.0``.
+            :class:`~torchrl_hmcts.objectives.DiscreteSkillSACLoss`. It stays its owner's.
+        intrinsic_coeff (float): :math:`c_i`.
         extrinsic_coeff (float): :math:`c_e`. Default ``0.0``: the env's reward is replaced.
-        reward_key (NestedKey): reward to write, ``[*B, 1]``, under ``"next"``. Default
-            ``"reward"``. An env gets a reward of another name beside its own.
-
-    Returns:
-        The transitions with ``("next", reward_key)`` set to ``r`` ``[*B, 1]``, detached.
+        reward_key (NestedKey): reward to write, ``[*B, 1]``, under ``"next"``. An env gets a reward
+            of another name beside its own.
 
     Raises:
-        TypeError: if the objective is no :class:`SkillObjective`.
         ValueError: on an env that draws other skills than the objective distinguishes, or has no
             reward of this name to mix in.
 
@@ -54,10 +47,8 @@ class SkillReward(Transform):
         >>> objective = SkillDiscriminatorLoss(SkillDiscriminator(2, num_skills=4))
         >>> buffer = ReplayBuffer(
         ...     storage=LazyTensorStorage(10), transform=SkillReward(objective), batch_size=5)
-        >>> data = TensorDict(skill=torch.zeros(10, dtype=torch.int64),
-        ...                   next=TensorDict(displacement=torch.randn(10, 2), batch_size=[10]),
-        ...                   batch_size=[10])
-        >>> _ = buffer.extend(data)
+        >>> after = TensorDict(displacement=torch.randn(10, 2), batch_size=[10])
+        >>> _ = buffer.extend(TensorDict(skill=torch.arange(10) % 4, next=after, batch_size=[10]))
         >>> buffer.sample()["next", "reward"].shape
         torch.Size([5, 1])
     """

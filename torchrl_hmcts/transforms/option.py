@@ -13,7 +13,7 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
 from torchrl_hmcts.checks import (
@@ -25,15 +25,15 @@ from torchrl_hmcts.checks import (
     whole_number,
 )
 from torchrl_hmcts.nesting import parts
-from torchrl_hmcts.transforms.env_transform import zero_count
-from torchrl_hmcts.transforms.option_checks import HasOptions, Termination, check_skill_table
+from torchrl_hmcts.transforms.env_transform import EnvTransform, zero_count
+from torchrl_hmcts.transforms.option_checks import Termination, check_skill_table
 from torchrl_hmcts.transforms.option_rollout import OptionRollout
 from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
 _ROOT = "_option_root_"
 
 
-class OptionTransform(HasOptions):
+class OptionTransform(EnvTransform):
     r"""Makes each rollout of a worker one macro-step, so that a planner or a loss works on an SMDP.
 
     The action of the transformed env is an **option**. One step runs the worker closed-loop in the
@@ -43,29 +43,20 @@ class OptionTransform(HasOptions):
     .. math:: \text{reward} = \sum_{i<k} \gamma^i\, r_{i+1}, \qquad \text{duration} = k,
 
     the done flags, and observation and state after the last base step. Every batch element has its
-    own option and its own end. An element whose option has ended waits for the others.
+    own option and its own end. If the env below counts base steps itself, as one with an
+    OptionTransform does, k is their sum: there can be any number of levels.
+    :func:`~torchrl_hmcts.objectives.use_durations` makes any TorchRL loss correct for the SMDP.
 
-    The base env's ``"action_mask"`` forbids base actions, not options. Worker and termination read
-    it by this name; above, it is ``"base_action_mask"``. A transform behind this one may write a
-    mask of the options as ``"action_mask"``, e.g. :class:`SkillMaskTransform`.
+    The base env's ``"action_mask"`` forbids base actions; above, it is ``"base_action_mask"``, and
+    a transform behind this one may write a mask of the options, e.g. :class:`SkillMaskTransform`.
 
-    TorchRL's estimators discount by ``gamma ** steps_to_next_obs``. With
-    ``loss.value_estimator.set_keys(steps_to_next_obs=("next", "duration"))``, after every
-    ``make_value_estimator``, any TorchRL loss is correct for the SMDP.
+    Append it after all transforms that must see base steps. The worker is no sub-module: its owner
+    moves, trains and saves it. The memory of a recurrent worker is what it writes under ``"next"``.
+    TorchRL's ``LowLevelController`` is such a worker: append its ``make_tensordict_primer()``
+    before this transform, and name its decision ``skill_key``.
 
-    If the env below counts base steps itself, as one with an OptionTransform does, k is their sum,
-    and the rewards are discounted by it. So options of options can have any number of levels.
-
-    Append it after all transforms that must see base steps; they see each once. Transforms appended
-    after it see macro-steps. The worker is not registered as a sub-module: its owner moves, trains
-    and saves it. The memory of a recurrent worker is what it writes under ``"next"``; it is passed
-    from base step to base step. TorchRL's ``LowLevelController`` is such a worker: append its
-    ``make_tensordict_primer()`` before this transform, and name its decision ``skill_key``.
-
-    With a group of agents and ``option_key=("agents", "option")`` each agent has an option. Their
-    options begin and end together: at the termination, after ``max_steps`` or as soon as any
-    ``done`` below is true, also that of one agent. The rewards of each agent are discounted and
-    summed separately.
+    With a group of agents and ``option_key=("agents", "option")`` each agent has an option and its
+    own reward; their options begin and end together, as soon as one of them ends.
 
     Args:
         worker (TensorDictModuleBase): reads observation or state entries and ``skill_key``, writes
@@ -77,35 +68,28 @@ class OptionTransform(HasOptions):
         termination (callable, optional): ``termination(td) -> bool`` tensor ``[*B]`` or
             ``[*B, 1]``, True where the option ends. ``td`` holds the entries after a base step,
             ``skill_key`` and the base steps taken so far under ``duration_key``. Default: none.
-        option_key (NestedKey): the macro action, int64 ``[*B]`` (one-hot bool ``[*B, num_options]``
-            with ``one_hot=True``); ``[*B, n]`` in a group of n agents. With ``"action"`` every
-            TorchRL actor, loss and trainer fits without ``set_keys``. Default ``"option"``.
+        option_key (NestedKey): the macro action, int64 ``[*B]``; ``[*B, n]`` in a group of agents.
+            With ``"action"`` every TorchRL actor, loss and trainer fits without ``set_keys``.
         skill_key (NestedKey): the entry from which the worker reads the option, int64 ``[*B]``, or
-            a vector of ``skills``, ``[*B, D]``. Default ``"skill"``.
-        duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``. Default ``"duration"``.
-        one_hot (bool): options are one-hot instead of categorical. Default ``False``.
+            a vector of ``skills``, ``[*B, D]``.
+        duration_key (NestedKey): base steps taken, int64 ``[*B, 1]``.
         trajectory_keys (sequence of NestedKey, optional): entries of base transitions to return,
-            e.g. to train the worker. Entries of the env or of the worker, as ``"position"``,
-            ``"skill"``, ``"action_log_prob"`` or ``("next", "reward")``, are returned as
-            ``("next", "trajectory", ...)`` of shape ``[*B, T]``, zero after the option's end, with
-            ``("next", "trajectory", "mask")``. Default: none.
-        base_duration_key (NestedKey, optional): the entry, int64 ``[*B, 1]``, in which the env
-            below counts the base steps of each of its steps. Default: that of its
-            ``OptionTransform``, else ``duration_key`` or ``"duration"``, if the env has it; without
-            one each step is a base step.
-        worker_memory (str): memory of a recurrent worker at the start of an option. ``"reset"``
-            (default): the values of its primer, or zeros, so that the state of the macro env is
-            that of the env alone. ``"keep"``: the memory at the end of the last option; the env
-            must then keep it, by a ``TensorDictPrimer`` before this transform.
+            of the env or of the worker, e.g. ``"position"``, ``"action_log_prob"`` or ``("next",
+            "reward")``: as ``("next", "trajectory", ...)`` ``[*B, T]``, zero after the option's
+            end, with ``("next", "trajectory", "mask")``. Default: none.
+        base_duration_key (NestedKey, optional): in which the env below counts the base steps of
+            each of its steps, int64 ``[*B, 1]``. Default: that of its ``OptionTransform``, else
+            ``duration_key`` or ``"duration"``, if it has one; without, each step is a base step.
+        worker_memory (str): memory of a recurrent worker at the start of an option: ``"reset"``
+            (default), that of its primer, or zeros; ``"keep"``, that at the end of the last option,
+            which a ``TensorDictPrimer`` before this transform must keep.
         skills (Tensor, optional): ``[num_options, D]``, the vector that the worker gets for each
-            option, e.g. of :func:`~torchrl_hmcts.modules.spread_skills`. Default: the option's
-            number.
+            option, e.g. of :func:`~torchrl_hmcts.modules.spread_skills`. Default: its number.
 
     Raises:
-        ValueError: if a number is out of range; when attached to an env: if the worker reads an
-            entry the env does not have or writes an action that does not fit the env's action spec,
-            or if the env steps or resets elements whose option has ended; when stepping: if an
-            option index is out of range, or the termination returns anything but one bool each.
+        ValueError: when attached, if worker and env do not fit, or the env cannot leave elements
+            alone whose option has ended; when stepping, if an option does not exist, or the
+            termination returns anything but one bool each.
 
     Reference:
         Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999; dissertation, sections 2.2
@@ -124,6 +108,10 @@ class OptionTransform(HasOptions):
         (4, 4)
     """
 
+    worker: TensorDictModuleBase
+    termination: Termination | None
+    skills: Tensor | None
+
     invertible = True
 
     def __init__(
@@ -137,7 +125,6 @@ class OptionTransform(HasOptions):
         *,
         skill_key: NestedKey = "skill",
         duration_key: NestedKey = "duration",
-        one_hot: bool = False,
         trajectory_keys: Sequence[NestedKey] | None = None,
         base_duration_key: NestedKey | None = None,
         worker_memory: Literal["reset", "keep"] = "reset",
@@ -165,7 +152,6 @@ class OptionTransform(HasOptions):
         self.num_options = whole_number("OptionTransform", "num_options", num_options, least=1)
         self.max_steps = whole_number("OptionTransform", "max_steps", max_steps, least=1)
         self.gamma = real_number("OptionTransform", "gamma", gamma, above=0.0, most=1.0)
-        self.one_hot = one_hot
         self.worker_memory = one_of(
             "OptionTransform", "worker_memory", worker_memory, ("reset", "keep")
         )
@@ -177,7 +163,9 @@ class OptionTransform(HasOptions):
             self.trajectory = OptionTrajectory(keys, self.max_steps)
         self._rollout: OptionRollout | None = None
 
-    # ---------------------------------------------------------------- stepping
+    def told(self, option: Tensor) -> Tensor:
+        """Return what the worker gets for options, int64 ``[*B]``: themselves or vectors."""
+        return option if self.skills is None else self.skills.to(option.device)[option]
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Choose the first base action; the env then takes that step as it always does."""
@@ -191,7 +179,7 @@ class OptionTransform(HasOptions):
         private = [key for key in tensordict.keys() if str(key).startswith(_ROOT)]
         inner = rollout.masks.show(tensordict).exclude("_step", "next", *private)
         inner = inner.copy()  # groups too: a transform below may rename what is in them
-        option = self._index(option, rollout.option_shape, tensordict.batch_size)
+        self._check_option(option, rollout.option_shape, tensordict.batch_size)
         inner.set(self.skill_key, self.told(option))
         if self.worker_memory == "reset":
             rollout.begin_memory(inner)
@@ -220,16 +208,10 @@ class OptionTransform(HasOptions):
         return rollout.run(root, next_tensordict, skipped)
 
     def run_from(self, state: TensorDictBase, option: Tensor) -> TensorDictBase | None:
-        """Run an option from a state of an env that holds one; what ``step`` writes as next.
+        """Run an option, int64 ``[]``, from a state; what ``step`` writes as next.
 
-        A planner's short way past the bookkeeping of ``reset(set_state=True)`` and ``step``.
-
-        Args:
-            state (TensorDictBase): the env's ``state_spec``, without a batch dimension.
-            option (Tensor): int64, without a dimension.
-
-        Returns:
-            The outcome, or None where ``reset`` and ``step`` are needed.
+        A planner's short way past ``reset(set_state=True)`` and ``step``, for an env of one state;
+        None where these are needed.
         """
         return self._attached().run_from(state, option)
 
@@ -247,25 +229,13 @@ class OptionTransform(HasOptions):
             tensordict_reset.set(OptionTrajectory.KEY, empty.data)
         return tensordict_reset
 
-    def _index(self, option: Tensor, shape: torch.Size, batch_size: torch.Size) -> Tensor:
-        """Return the number of an option, int64, if there is such an option."""
+    def _check_option(self, option: Tensor, shape: torch.Size, batch_size: torch.Size) -> None:
         shape = batch_size + shape[len(self.parent.batch_size) :]
-        if self.one_hot:
-            shape = torch.Size((*shape, self.num_options))
-        if option.shape != shape or not (self.one_hot or option.dtype == torch.int64):
+        if option.shape != shape or option.dtype != torch.int64:
             raise ValueError(
-                f"The option under {self.option_key!r} must be "
-                f"{'one-hot' if self.one_hot else 'int64'} {list(shape)}; got {option.dtype} "
-                f"{list(option.shape)}. env.rand_action(td) writes one of the right form."
+                f"The option under {self.option_key!r} must be int64 {list(shape)}; got "
+                f"{option.dtype} {list(option.shape)}. env.rand_action(td) writes one that fits."
             )
-        if self.one_hot:
-            wrong = option.sum(-1) != 1
-            if wrong.any():
-                raise ValueError(
-                    f"The option under {self.option_key!r} must be one-hot {list(shape)}; got "
-                    f"{option[wrong][0].tolist()}. Set exactly one entry."
-                )
-            return option.to(torch.int64).argmax(-1)
         if option.numel():
             low, high = torch.aminmax(option)
             if low < 0 or high >= self.num_options:
@@ -274,23 +244,18 @@ class OptionTransform(HasOptions):
                     f"Option {bad} does not exist: options are 0 to {self.num_options - 1}. Choose "
                     f"one of them, or make OptionTransform with a larger num_options."
                 )
-        return option
-
-    # ---------------------------------------------------------------- specs
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         rollout = self._attached()
         input_spec = input_spec.clone()
         old = input_spec["full_action_spec"]
         shape, device = rollout.option_shape, old.device
-        option: TensorSpec = Categorical(self.num_options, shape=shape, device=device)
-        if self.one_hot:
-            option = OneHot(self.num_options, shape=(*shape, self.num_options), device=device)
+
         spec = Composite(shape=old.shape, device=device)
         group = parts(self.option_key)[:-1]
         if group:  # of agents, which keeps its shape
             spec[unravel_key(group)] = Composite(shape=shape, device=device)
-        spec[self.option_key] = option
+        spec[self.option_key] = Categorical(self.num_options, shape=shape, device=device)
         input_spec["full_action_spec"] = spec
         state = input_spec.get("full_state_spec", None)
         if state is None:
@@ -324,8 +289,6 @@ class OptionTransform(HasOptions):
             spec[OptionTrajectory.KEY] = rollout.trajectory_spec
         return spec
 
-    # ---------------------------------------------------------------- its place in an env
-
     def set_container(self, container: Transform | EnvBase) -> None:
         """Takes its place in an env, and checks there that worker and env fit."""
         self._rollout = None
@@ -357,9 +320,3 @@ class OptionTransform(HasOptions):
                 )
             self._rollout = OptionRollout(self)
         return self._rollout
-
-    def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}(num_options={self.num_options}, max_steps={self.max_steps}, "
-            f"gamma={self.gamma})"
-        )

@@ -1,14 +1,13 @@
-"""Checks of the env below an OptionTransform and of its worker, when it is attached."""
+"""Checks of the env below an OptionTransform (Any: it imports this file) and of its worker."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
@@ -26,8 +25,6 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_hmcts.carried_state import CarriedFrames, apart
 from torchrl_hmcts.nesting import env_name, flat_transforms, innermost, parts
-from torchrl_hmcts.transforms.env_transform import EnvTransform
-from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 
 Termination = Callable[[TensorDictBase], Tensor]
 _SPECS = (
@@ -36,27 +33,6 @@ _SPECS = (
     *("observation_spec", "full_observation_spec", "state_spec", "full_state_spec"),
     *("done_spec", "full_done_spec", "done_keys", "batch_size", "device", "_is_batched"),
 )
-
-
-class HasOptions(EnvTransform):
-    """The attributes of an OptionTransform, for the files that it imports."""
-
-    worker: TensorDictModuleBase
-    termination: Termination | None
-    trajectory: OptionTrajectory | None
-    num_options: int
-    max_steps: int
-    gamma: float
-    worker_memory: str
-    option_key: NestedKey
-    skill_key: NestedKey
-    duration_key: NestedKey
-    base_duration_key: NestedKey | None
-    skills: Tensor | None
-
-    def told(self, option: Tensor) -> Tensor:
-        """Return what the worker gets for options, int64 ``[*B]``: themselves or vectors."""
-        return option if self.skills is None else self.skills.to(option.device)[option]
 
 
 def check_skill_table(skills: Tensor | None, num_options: int) -> Tensor | None:
@@ -109,7 +85,7 @@ def with_constant_specs(env: EnvBase) -> EnvBase:
     return view
 
 
-def check_env(transform: HasOptions, env: TransformedEnv) -> None:
+def check_env(transform: Any, env: TransformedEnv) -> None:
     """Refuse an env whose rewards or steps cannot be summed, or whose parts read missing
     entries."""
     base = env_name(env)
@@ -165,7 +141,7 @@ def _check_after(transform: Transform) -> None:
             )
 
 
-def duration_key(transform: HasOptions, env: EnvBase) -> NestedKey | None:
+def duration_key(transform: Any, env: EnvBase) -> NestedKey | None:
     """Return the entry in which the env below counts base steps, if it does."""
     spec = env.full_observation_spec
     available = set(map(unravel_key, spec.keys(True, True)))
@@ -210,7 +186,7 @@ class Trial(NamedTuple):
     """What of its memory the env does not announce."""
 
 
-def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
+def try_worker(transform: Any, env: TransformedEnv) -> Trial:
     """Run the worker once, and refuse one that does not fit the env."""
     worker, base = transform.worker, env_name(env)
     name = f"The worker {type(worker).__name__}"
@@ -265,7 +241,7 @@ def try_worker(transform: HasOptions, env: TransformedEnv) -> Trial:
     return Trial(td, writes, memory, lost)
 
 
-def _check_skills(name: str, transform: HasOptions) -> None:
+def _check_skills(name: str, transform: Any) -> None:
     """Refuse a worker that needs vectors and gets numbers, or needs numbers and gets vectors."""
     spec, table = getattr(transform.worker, "skill_spec", None), transform.skills
     decisions = getattr(transform.worker, "decision_spec", None)  # of TorchRL's LowLevelController

@@ -21,7 +21,6 @@ from torchrl_hmcts.direct_calls import has_hooks, is_plain, put
 from torchrl_hmcts.nesting import complete_done, flat_transforms, parts, set_states, step_states
 from torchrl_hmcts.transforms.base_masks import BaseMasks
 from torchrl_hmcts.transforms.option_checks import (
-    HasOptions,
     check_env,
     duration_key,
     env_below,
@@ -36,7 +35,7 @@ from torchrl_hmcts.transforms.trajectory import OptionTrajectory
 class OptionRollout:
     """Takes the base steps of options in the env below an OptionTransform, if both fit."""
 
-    def __init__(self, transform: HasOptions) -> None:
+    def __init__(self, transform: Any) -> None:
         self._options, self._parent = transform, env_below(transform)
         parent = self._parent
         self.batch_locked = parent.batch_locked

@@ -23,25 +23,22 @@ class OptionRecorder(EnvTransform):
 
     Append it after an :class:`OptionTransform` that returns its base transitions. It removes them
     from the tensordict and stores those that were taken, each with the option as its skill and the
-    displacement since the option began,
+    displacement since the option began, as :class:`DisplacementTransform` writes it,
 
     .. math:: \Delta_t = x_t - x_{t_0}, \qquad t_0 = \text{the option's first base step}
 
-    as :class:`DisplacementTransform` writes it when skills are trained. Transitions that a planner
-    simulates are recorded like those that are executed, so the search yields data to train its
-    worker. The transitions are kept until :meth:`take` is called. The env's output is the same as
-    without the recorder.
+    Transitions that a planner simulates are recorded like those that are executed, so the search
+    yields data to train its worker. They are kept until :meth:`take` is called.
 
     Args:
         keys (sequence of NestedKey): entries of a base transition to store, e.g. the ``in_keys`` of
             the loss: ``"velocity"``, ``"action"``, ``("next", "velocity")``. ``skill_key`` and
             ``displacement_key``, under ``"next"`` too, are written by the recorder.
-        position_key (NestedKey): entry ``[*B, D]`` whose displacement is measured. Default
-            ``"position"``; read only if ``displacement_key`` is among the ``keys``.
-        displacement_key (NestedKey): displacement to write, ``[n, D]`` in the units of the
-            position. Default ``"displacement"``.
+        position_key (NestedKey): entry ``[*B, D]`` whose displacement is measured; read only if
+            ``displacement_key`` is among the ``keys``.
+        displacement_key (NestedKey): displacement to write, ``[n, D]``.
         skill_key (NestedKey): entry under which the ``OptionTransform`` tells the worker its option
-            and under which it is stored, int64 ``[n]``. Default ``"skill"``.
+            and under which it is stored, int64 ``[n]``.
 
     Raises:
         ValueError: at construction if ``keys`` names nothing to record.
@@ -57,13 +54,13 @@ class OptionRecorder(EnvTransform):
         >>> from torchrl_hmcts.testing import ChainEnv
         >>> from torchrl_hmcts.transforms import OptionRecorder, OptionTransform
         >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> recorder = OptionRecorder(["state", "skill", ("next", "state")])
+        >>> recorder = OptionRecorder(["skill", ("next", "state")])
         >>> options = OptionTransform(worker, 2, 3, trajectory_keys=recorder.trajectory_keys)
         >>> env = TransformedEnv(ChainEnv(length=9), Compose(options, recorder))
         >>> td = env.step(env.reset().set("option", torch.tensor(1)))  # 1: three to the right
         >>> data = recorder.take()
-        >>> data["state"].tolist(), data["next", "state"].tolist(), data["skill"].tolist()
-        ([0, 1, 2], [1, 2, 3], [1, 1, 1])
+        >>> data["next", "state"].tolist(), data["skill"].tolist()
+        ([1, 2, 3], [1, 1, 1])
     """
 
     def __init__(
@@ -102,11 +99,10 @@ class OptionRecorder(EnvTransform):
         skill = tensordict.get(self.skill_key, None)
         if skill is None:
             raise KeyError(
-                f"OptionRecorder found no skill under {self.skill_key!r}, where the "
-                "OptionTransform before it tells the worker its option. Give both the same "
-                "skill_key, and put both on the same side of a SerialEnv or ParallelEnv."
+                f"OptionRecorder found no skill under {self.skill_key!r}. Give it the skill_key of "
+                "the OptionTransform, and put both on the same side of a SerialEnv or ParallelEnv."
             )
-        skill = skill.clone()  # its own: a planner may use the memory of its options again
+        skill = skill.clone()  # a planner may use the memory of its options again
         self._blocks.append((block.reshape(-1, block.shape[-1]), skill.reshape(-1)))
         self.num_base_steps += int(block.get(OptionTrajectory.MASK_KEY).sum())
         return next_tensordict
@@ -118,11 +114,10 @@ class OptionRecorder(EnvTransform):
         return tensordict_reset
 
     def take(self) -> TensorDictBase:
-        """Hands over the transitions recorded since the last call and forgets them.
+        """Hands over the transitions ``[n]`` recorded since the last call and forgets them.
 
-        Returns:
-            Transitions ``[n]`` with the ``keys``, those of an option one after the other. Without
-            any it has batch size ``[0]`` and no entries.
+        Their entries are ``keys``, those of an option one after the other; there are none without
+        any.
         """
         if not self._blocks:
             return TensorDict(batch_size=[0])

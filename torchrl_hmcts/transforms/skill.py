@@ -1,4 +1,4 @@
-"""Sampling of skills in mini-episodes."""
+"""Skills in an env: drawn in mini-episodes, and masked while they are switched off."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Composite
+from torchrl.data import Binary, Bounded, Composite
 
-from torchrl_hmcts.checks import nested_key, whole_number
+from torchrl_hmcts.checks import instance, nested_key, whole_number
 from torchrl_hmcts.modules.skill_prior import SkillPrior, as_skill_prior
 from torchrl_hmcts.modules.skill_spec import (
     Skills,
@@ -28,39 +28,31 @@ class SkillTransform(EnvTransform):
 
     .. math:: z \sim p(z) \quad \text{at reset and whenever } k \text{ steps were taken with it}
 
-    Writes two entries: the skill, int64 ``[*B]``, or a vector ``[*B, D]``, and ``skill_step``,
-    int64 ``[*B, 1]``, the base steps taken with it so far. Each batch element has its own
-    mini-episodes. On the last transition of one, ``("next", "skill")`` is still the old skill, so
-    that values are bootstrapped with the skill that acted; the next root holds the new one.
-    Episodes continue: nothing is done.
+    Writes the skill, int64 ``[*B]`` or a vector ``[*B, D]``, and ``skill_step``, int64 ``[*B, 1]``,
+    the base steps taken with it so far. On the last transition of a mini-episode ``("next",
+    "skill")`` is still the skill that acted, for bootstrapping; the next root holds the new one.
+    Episodes continue: nothing is done. A reset tensordict that holds a skill and no ``"_reset"``
+    mask keeps its skill.
 
-    A reset draws new skills where it resets. To choose the skill, reset with it: a reset
-    tensordict that holds a skill and no ``"_reset"`` mask keeps its skill (and ``skill_step``).
-
-    Since a new skill is drawn between two steps, stepping must go through
-    ``env.step_and_maybe_reset`` or ``env.rollout`` (collectors do); a bare ``env.step`` followed by
-    ``step_mdp`` always keeps the skill. For the same reason the transform goes outside of
-    ``SerialEnv`` and ``ParallelEnv``.
+    Step by ``env.step_and_maybe_reset`` or ``env.rollout``, between whose steps new skills are
+    drawn; for the same reason the transform goes outside of ``SerialEnv`` and ``ParallelEnv``.
 
     Args:
         num_skills (int or TensorSpec): number of skills ``Z``, or the spec of one skill that is a
             vector: a :class:`~torchrl_hmcts.modules.UnitSphere` (``D``), ``Bounded(low, high,
             shape=(D,))`` (even between the bounds) or ``Unbounded(shape=(D,))`` (normal).
-        max_skill_steps (int, optional): base steps per mini-episode. Default ``None``: one skill
-            per episode.
-        skill_key (NestedKey): entry of the skill. Default ``"skill"``.
-        skill_step_key (NestedKey): entry of the steps taken. Default ``"skill_step"``.
+        max_skill_steps (int, optional): base steps per mini-episode. Default: one skill per
+            episode.
+        skill_key, skill_step_key (NestedKey): entries of the skill and of the steps taken.
         prior (sequence of float, Tensor or SkillPrior, optional): probabilities ``[Z]`` of the
-            skills, normalised. Default ``None``: uniform, or as the spec of vectors says. Numbers
-            are kept as the buffer ``prior``. A :class:`~torchrl_hmcts.modules.SkillPrior` is read
-            at every draw, so that its present probabilities count. It is also read once a step: if
-            the skill in use was switched off, the mini-episode ends. It is not a sub-module of the
-            transform.
+            skills, normalised and kept as the buffer ``prior``. Default: uniform, or as the spec of
+            vectors says. A :class:`~torchrl_hmcts.modules.SkillPrior` stays its owner's and is read
+            at every step: where the skill in use was switched off, the mini-episode ends.
         seed (int, optional): seed of an own generator, whose state is saved in the state dict.
-            Default ``None``: torch's global generator.
+            Default: torch's global generator.
 
     Raises:
-        ValueError: if a number is not positive or the prior is no distribution over the skills.
+        ValueError: if the prior is no distribution over the skills.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4
@@ -146,8 +138,8 @@ class SkillTransform(EnvTransform):
         return tensordict_reset.set(self.skill_step_key, step)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict.set(self.skill_key, self._carried(tensordict, self.skill_key))
-        step = self._carried(tensordict, self.skill_step_key)
+        next_tensordict.set(self.skill_key, tensordict[self.skill_key])
+        step = tensordict[self.skill_step_key]
         return next_tensordict.set(self.skill_step_key, step + 1)
 
     def _post_step_mdp_hooks(
@@ -200,3 +192,80 @@ class SkillTransform(EnvTransform):
             if self.generator is None:
                 self.generator = torch.Generator()
             self.generator.set_state(state["generator"])
+
+
+class SkillMaskTransform(EnvTransform):
+    r"""Writes which options may be taken: those whose skill the prior has switched on.
+
+    .. math:: \text{mask}(z) = [\,p(z) > 0\,]
+
+    Append it after the :class:`OptionTransform` of an env whose options are skills.
+    :class:`~torchrl_hmcts.planners.MCTSPlanner` reads the entry; TorchRL's ``ActionMask`` behind it
+    restricts random actions, too. The prior is read at every step and stays its owner's.
+
+    Args:
+        prior (SkillPrior): over the skills, one per option, ``Z``.
+        mask_key (NestedKey): entry to write, bool ``[*B, Z]``.
+
+    Raises:
+        ValueError: when the specs are made, if the env has another number of options.
+
+    Reference:
+        This project's (section 6.2 of Bartley 2023 asks for skills that are added as needed).
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.envs import Compose, TransformedEnv
+        >>> from torchrl_hmcts.modules import GrowingSkillPrior
+        >>> from torchrl_hmcts.testing import ChainEnv
+        >>> from torchrl_hmcts.transforms import OptionTransform, SkillMaskTransform
+        >>> prior = GrowingSkillPrior(2, num_active=1)
+        >>> options = OptionTransform(TensorDictModule(lambda z: z, ["skill"], ["action"]), 2, 4)
+        >>> env = TransformedEnv(ChainEnv(), Compose(options, SkillMaskTransform(prior)))
+        >>> env.reset()["action_mask"].tolist()
+        [True, False]
+    """
+
+    def __init__(self, prior: SkillPrior, mask_key: NestedKey = "action_mask") -> None:
+        instance("SkillMaskTransform", "prior", prior, SkillPrior)
+        self.mask_key = nested_key("SkillMaskTransform", "mask_key", mask_key)
+        super().__init__(in_keys=[], out_keys=[self.mask_key])
+        # Past nn.Module.__setattr__: a sub-module would be saved and moved with the env.
+        self.__dict__["prior"] = prior
+
+    prior: SkillPrior
+
+    def mask(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the mask into a tensordict of states ``[*B]``, e.g. ones made without the env."""
+        active: Tensor = self.prior.active()
+        if tensordict.device is not None:
+            active = active.to(tensordict.device)
+        shape = (*tensordict.batch_size, self.prior.num_skills)
+        return tensordict.set(self.mask_key, active.expand(shape).clone())
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self.mask(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.mask(next_tensordict)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        number = self.prior.num_skills
+        for key in () if self.parent is None else self.parent.action_keys:
+            options = getattr(self.parent.full_action_spec[key].space, "n", number)
+            if int(options) != number:
+                raise ValueError(
+                    f"SkillMaskTransform has a mask of {number} skills, but the action {key!r} has "
+                    f"{int(options)} options. Build the OptionTransform with num_options={number}, "
+                    "and append the mask after it."
+                )
+        shape = torch.Size([*observation_spec.shape, number])
+        observation_spec[self.mask_key] = Binary(
+            number, shape=shape, dtype=torch.bool, device=observation_spec.device
+        )
+        return observation_spec
+
+    def _stays_outside(self) -> str | None:
+        return "reads a prior that changes here, and not in copies of it"

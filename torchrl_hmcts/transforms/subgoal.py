@@ -21,6 +21,9 @@ from torchrl_hmcts.direct_calls import put
 from torchrl_hmcts.nesting import parts
 from torchrl_hmcts.transforms.env_transform import EnvTransform, count_spec
 
+# Entries of one number per element: of the plan, and the counters of the episode.
+_NUMBERS = ("plan_length", "goal_index", "num_plans", "num_goals_met", "num_divergences")
+
 
 @runtime_checkable
 class PlansGoals(Protocol):
@@ -63,57 +66,42 @@ class SubgoalTransform(EnvTransform):
         r = r_\text{tick} + r_\text{met}\,[d < d_\text{met}] + r_\text{div}\,[d > d_\text{div}]
 
     A goal that is met makes way for the next one. Where :math:`d > d_\text{div}`, and where the
-    last goal is met though the episode continues, a new plan is made from :math:`x` before the next
-    action. All elements of a batch that need a plan at the same base step get it in one call.
+    last goal is met though the episode continues, a new plan is made from :math:`x`. All elements
+    of a batch that need a plan at the same base step get it in one call.
 
-    It writes these entries in the root and under ``"next"``. They are part of the state, so the env
-    stays stateless and continues from any tensordict: ``goals_key`` (float32 ``[*B, K D]``, the
-    next K goals, the last one repeated), ``"plan"`` (float32 ``[*B, G, D]``), ``"plan_length"``
-    and ``"goal_index"`` (int64 ``[*B, 1]``), and the counters of the episode ``"num_plans"``,
-    ``"num_goals_met"`` and ``"num_divergences"`` (int64 ``[*B, 1]``). Under ``"next"`` also the
-    worker's reward, in place of the env's own, which moves to ``task_reward_key``.
-
-    A reset plans where it resets. ``reset(td, set_state=True)`` to a state that holds a plan keeps
-    that plan, to one without a plan makes one.
+    It writes, in the root and under ``"next"``, ``goals_key`` (float32 ``[*B, K D]``, the next K
+    goals, the last one repeated), ``plan_key`` (float32 ``[*B, G, D]``), ``"plan_length"``,
+    ``"goal_index"`` and the counters of the episode ``"num_plans"``, ``"num_goals_met"`` and
+    ``"num_divergences"`` (int64 ``[*B, 1]``). They are part of the state: ``reset(td,
+    set_state=True)`` to a state that holds a plan keeps it. Under ``"next"`` the worker's reward
+    takes the place of the env's own, which moves to ``task_reward_key``.
 
     Args:
         planner (PlansGoals or callable): the manager. ``planner(td [m]) -> (goals [m, L, D],
             lengths [m])``, or an object with a method ``plan_goals`` of that form, e.g.
             :class:`~torchrl_hmcts.planners.GoalPlanner`.
-        position_key (NestedKey): entry ``[*B, D]`` that is compared with the goals. Default
-            ``"position"``.
+        position_key (NestedKey): entry ``[*B, D]`` that is compared with the goals.
         goal_met_threshold (float): :math:`d_\text{met}`, in the units of the position. Default 0.5:
             half a tile.
-        goal_divergence_threshold (float): :math:`d_\text{div}`; must be larger than the distance of
-            one goal to the next. ``math.inf`` never plans again. Default 2 tiles.
-        r_tick (float): reward of every base step. The dissertation gives no number. Default -0.025:
-            a worker that moves back and forth around a corner of Waterworld meets the same goals
-            again and earns 0.020 per base step, so with a smaller cost it would pay not to arrive.
-        r_goal_met (float): Default 1.
-        r_goal_divergence (float): Default -1.
+        goal_divergence_threshold (float): :math:`d_\text{div}`; larger than the distance of one
+            goal to the next. ``math.inf`` never plans again. Default 2 tiles.
+        r_tick (float): reward of every base step. Default -0.025: a worker that moves around a
+            corner of Waterworld and meets the same goals again earns 0.020 per base step, so with a
+            smaller cost it would pay not to arrive.
+        r_goal_met, r_goal_divergence (float): the other rewards. Default 1 and -1.
         num_goals (int): K. Default 3.
-        max_goals (int): G; a longer plan is cut, and a new plan follows when its last goal is
-            met. Default 64.
+        max_goals (int): G; a longer plan is cut, and a new plan follows when its last goal is met.
         relative (bool): show goals relative to the position (default), so that what the worker
             learns in one place holds in all, or as they are.
-        goals_key (NestedKey): the next K goals, ``[*B, K D]``. Default ``"goals"``.
-        plan_key (NestedKey): the whole plan, ``[*B, G, D]``. Default ``"plan"``.
-        plan_length_key (NestedKey): goals of the plan, int64 ``[*B, 1]``. Default
-            ``"plan_length"``.
-        goal_index_key (NestedKey): index of the current goal, int64 ``[*B, 1]``. Default
-            ``"goal_index"``.
-        num_plans_key, num_goals_met_key, num_divergences_key (NestedKey): counts of the episode,
-            int64 ``[*B, 1]``. Defaults ``"num_plans"``, ``"num_goals_met"`` and
-            ``"num_divergences"``.
-        reward_key (NestedKey): the env's reward, which becomes the worker's. Default ``"reward"``.
-        task_reward_key (NestedKey): where the env's reward goes. Default ``"task_reward"``.
+        goals_key, plan_key (NestedKey): what is shown, and the whole plan.
+        reward_key (NestedKey): the env's reward, which becomes the worker's.
+        task_reward_key (NestedKey): where the env's reward goes.
 
     Raises:
         TypeError: if ``planner`` is neither.
-        ValueError: if a threshold, reward or number is out of range; when planning, if a plan has
-            no goal, the wrong shape or a value that is not finite.
-        KeyError: when the specs are made, if the env lacks ``position_key`` or ``reward_key``; when
-            stepping, if the tensordict has no plan.
+        ValueError: when planning, if a plan has no goal, the wrong shape or a value that is not
+            finite.
+        KeyError: when the specs are made, if the env lacks ``position_key`` or ``reward_key``.
 
     Reference:
         Dissertation, section 3.2.1 and algorithm 1. That goals are popped when met, and r_tick,
@@ -128,14 +116,9 @@ class SubgoalTransform(EnvTransform):
         ...     away = torch.tensor([[1.0, 0.0], [2.0, 0.0]])
         ...     return td["position"].unsqueeze(1) + away, torch.full((len(td),), 2)
         >>> env = TransformedEnv(PointMassEnv(), SubgoalTransform(to_the_right, num_goals=2))
-        >>> td = env.reset()
-        >>> td["goals"].round(decimals=3).tolist()
-        [1.0, 0.0, 2.0, 0.0]
-        >>> td = env.step(td.set("action", torch.tensor(3)))  # push to the right
-        >>> td["next", "goals"]
-        tensor([0.9900, 0.0000, 1.9900, 0.0000])
-        >>> td["next", "reward"], td["next", "num_plans"]
-        (tensor([-0.0250]), tensor([1]))
+        >>> td = env.step(env.reset().set("action", torch.tensor(3)))  # push to the right
+        >>> td["next", "goals"], td["next", "reward"]
+        (tensor([0.9900, 0.0000, 1.9900, 0.0000]), tensor([-0.0250]))
     """
 
     def __init__(
@@ -153,11 +136,6 @@ class SubgoalTransform(EnvTransform):
         relative: bool = True,
         goals_key: NestedKey = "goals",
         plan_key: NestedKey = "plan",
-        plan_length_key: NestedKey = "plan_length",
-        goal_index_key: NestedKey = "goal_index",
-        num_plans_key: NestedKey = "num_plans",
-        num_goals_met_key: NestedKey = "num_goals_met",
-        num_divergences_key: NestedKey = "num_divergences",
         reward_key: NestedKey = "reward",
         task_reward_key: NestedKey = "task_reward",
     ) -> None:
@@ -176,20 +154,11 @@ class SubgoalTransform(EnvTransform):
         self.position_key = key("position_key", position_key)
         self.goals_key = key("goals_key", goals_key)
         self.plan_key = key("plan_key", plan_key)
-        self.plan_length_key = key("plan_length_key", plan_length_key)
-        self.goal_index_key = key("goal_index_key", goal_index_key)
-        self.counter_keys = [
-            key("num_plans_key", num_plans_key),
-            key("num_goals_met_key", num_goals_met_key),
-            key("num_divergences_key", num_divergences_key),
-        ]
-        # Entries of one number per element.
-        self._numbers = [self.plan_length_key, self.goal_index_key, *self.counter_keys]
         self.reward_key = key("reward_key", reward_key)
         self.task_reward_key = key("task_reward_key", task_reward_key)
         super().__init__(
             in_keys=[self.position_key, self.reward_key],
-            out_keys=[self.goals_key, self.plan_key, self.task_reward_key, *self._numbers],
+            out_keys=[self.goals_key, self.plan_key, self.task_reward_key, *_NUMBERS],
         )
         # Past nn.Module.__setattr__: a manager's modules are not to be saved with the env.
         self.__dict__["planner"] = planner
@@ -209,8 +178,6 @@ class SubgoalTransform(EnvTransform):
         self.max_goals = whole_number("SubgoalTransform", "max_goals", max_goals, least=1)
         self.relative = relative
         self._ahead = np.arange(self.num_goals)
-
-    # ------------------------------------------------------------------ planning
 
     def _plan(self, tensordict: TensorDictBase, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Ask the manager for plans from some elements, counted in row-major order.
@@ -266,13 +233,11 @@ class SubgoalTransform(EnvTransform):
         numbers: Iterable[np.ndarray],
     ) -> TensorDictBase:
         """Write arrays of ``[m, ...]`` and the numbers ``[m]``, in the shape of a tensordict."""
-        for key, array in (*entries.items(), *zip(self._numbers, numbers, strict=True)):
+        for key, array in (*entries.items(), *zip(_NUMBERS, numbers, strict=True)):
             array = array.reshape(*td.batch_size, *(array.shape[1:] or (1,)))
             tensor = torch.from_numpy(array)
             put(td, key, tensor if td.device is None else tensor.to(td.device))
         return td
-
-    # ------------------------------------------------------------------ in an env
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -287,7 +252,7 @@ class SubgoalTransform(EnvTransform):
             numbers[0] = 1
         else:
             path = old.numpy(force=True).reshape(m, self.max_goals, dims).copy()
-            numbers = np.stack([_numbers(tensordict, key, m) for key in self._numbers])
+            numbers = np.stack([_numbers(tensordict, key, m) for key in _NUMBERS])
         rows = np.flatnonzero(fresh)
         if len(rows):
             path[rows], numbers[0, rows] = self._plan(tensordict_reset, rows)
@@ -303,20 +268,20 @@ class SubgoalTransform(EnvTransform):
         masks = [before.get(key) for key in given if parts(key)[-1] == "_reset"]
         if masks:
             return np.logical_or.reduce([_any(mask, m) for mask in masks])
-        mine = {self.plan_key, self.goals_key, *self._numbers}
+        mine = {self.plan_key, self.goals_key, *_NUMBERS}
         state = set(map(unravel_key, self.parent.full_state_spec.keys(True, True))) - mine
-        if not state or not {self.plan_key, *self._numbers, *state} <= given:
+        if not state or not {self.plan_key, *_NUMBERS, *state} <= given:
             return np.ones(m, np.bool_)
         # The plan is for the state it was made in: one that the reset did not set needs another.
         return np.logical_or.reduce([_any(before.get(k) != after.get(k), m) for k in state])
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        plan = self._carried(tensordict, self.plan_key)
+        plan = tensordict[self.plan_key]
         position = _rows(next_tensordict.get(self.position_key))
         m, dims = position.shape
         # Small arrays: numpy does in one microsecond what torch does in three.
         path = plan.numpy(force=True).reshape(m, self.max_goals, dims)
-        length, index, *counters = (_numbers(tensordict, key, m) for key in self._numbers)
+        length, index, *counters = (_numbers(tensordict, key, m) for key in _NUMBERS)
         offset = position - path[np.arange(m), index]
         distance = np.sqrt(np.einsum("md,md->m", offset, offset))
         met = distance < self.goal_met_threshold
@@ -346,16 +311,14 @@ class SubgoalTransform(EnvTransform):
         entries = {self.reward_key: reward.astype(np.float32), self.goals_key: shown}
         return self._write(next_tensordict, entries, (length, index, *counted))
 
-    # ------------------------------------------------------------------ specs
-
     def _add_specs(self, spec: Composite, position: TensorSpec) -> Composite:
         shape, device, dims = spec.shape, spec.device, position.shape[-1]
         spec[self.plan_key] = Unbounded(
             (*shape, self.max_goals, dims), dtype=torch.float32, device=device
         )
-        for key in self._numbers:
+        for key in _NUMBERS:
             spec[key] = count_spec(spec)
-        for key, high in ((self.plan_length_key, 0), (self.goal_index_key, -1)):
+        for key, high in (("plan_length", 0), ("goal_index", -1)):
             high += self.max_goals
             spec[key] = Bounded(0, high, shape=(*shape, 1), dtype=torch.int64, device=device)
         return spec
@@ -386,12 +349,6 @@ class SubgoalTransform(EnvTransform):
     def _terminated_key(self) -> NestedKey:
         keys = list(map(unravel_key, self.parent.done_keys))
         return next((key for key in keys if parts(key)[-1] == "terminated"), keys[0])
-
-    def __repr__(self) -> str:
-        return (
-            f"SubgoalTransform(planner={type(self.planner).__name__}, num_goals={self.num_goals}, "
-            f"relative={self.relative})"
-        )
 
 
 def _rows(value: Tensor) -> np.ndarray:
