@@ -102,7 +102,8 @@ NOTHING_TO_CITE = set(
     "TreeView Evaluation SearchSettings extract_plans OptionWorker TorchRLGymnasiumEnv "
     "free_tiles maze_from_text maze_to_text replay_recording "
     "shortest_path shortest_path_lengths Snapshot AttributeSnapshot ReplaySnapshot "
-    "SnapshotError option_color".split()
+    "SnapshotError option_color "
+    "GrowingSkillPrior LandmarkEnv SkillPolicy StallTransform find_jumps".split()
 )
 # What works on tensors, so that its docstring has to give their shapes.
 TENSORS = re.compile(r"\b(Tensor|TensorDict|TensorDictBase|ndarray|Plan|Search)\b")
