@@ -18,8 +18,8 @@ from typing import Any
 from table import markdown, read_arguments, write
 
 from torchrl_hmcts.envs import maze_pool
-from torchrl_hmcts.trainers.experiments import find_experiment
 from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
+from torchrl_hmcts.trainers.experiments.registry import find_experiment
 from torchrl_hmcts.trainers.experiments.waterworld.episodes import play_mazes
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import make_goal_env
 from torchrl_hmcts.trainers.experiments.waterworld.scripted_expert import ScriptedExpert

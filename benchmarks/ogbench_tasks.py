@@ -22,8 +22,7 @@ from typing import Any
 from table import add_row, markdown, read_arguments
 
 from torchrl_hmcts.trainers.experiments.ogbench.agent import fit_model, learn, make_agent
-from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
-from torchrl_hmcts.trainers.experiments.ogbench.names import RECIPES
+from torchrl_hmcts.trainers.experiments.ogbench.config import RECIPES, OGBenchConfig
 from torchrl_hmcts.trainers.experiments.ogbench.run import play_tasks, recorded, summary
 
 ARMS: dict[str, dict[str, Any]] = {

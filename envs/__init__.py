@@ -13,9 +13,8 @@ from torchrl_hmcts.envs.gym.mujoco_batch import MujocoBatch
 from torchrl_hmcts.envs.gym.mujoco_tasks import MujocoTask
 from torchrl_hmcts.envs.gym.option_pool import OptionPool
 from torchrl_hmcts.envs.gym.option_run import OptionWorker
-from torchrl_hmcts.envs.gym.policy_worker import PolicyWorker
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv
-from torchrl_hmcts.envs.gym.skill_worker import SkillWorker
+from torchrl_hmcts.envs.gym.skill_worker import PolicyWorker, SkillWorker
 from torchrl_hmcts.envs.gym.snapshots import ReplaySnapshot, Snapshot, SnapshotError
 from torchrl_hmcts.envs.gym.workers import (
     FeatureGoal,
@@ -25,12 +24,11 @@ from torchrl_hmcts.envs.gym.workers import (
     RepeatActions,
 )
 from torchrl_hmcts.envs.gym_envs import TorchRLGymnasiumEnv, register_envs
-from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS
 from torchrl_hmcts.envs.lab.deepmind_lab import DeepMindLabEnv
 from torchrl_hmcts.envs.lab.first_person import draw_first_person
 from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
 from torchrl_hmcts.envs.lab.mazes import lab_maze
-from torchrl_hmcts.envs.lab.recordings import replay_recording
+from torchrl_hmcts.envs.lab.states import LAB_ACTIONS
 from torchrl_hmcts.envs.mazes.gridworld import GridworldMazeEnv
 from torchrl_hmcts.envs.mazes.items import MazeItems
 from torchrl_hmcts.envs.mazes.layouts import (
@@ -39,7 +37,6 @@ from torchrl_hmcts.envs.mazes.layouts import (
     maze_from_text,
     maze_pool,
     maze_to_text,
-    shortest_path,
     shortest_path_lengths,
 )
 from torchrl_hmcts.envs.mazes.rendering import draw_maze
@@ -86,8 +83,6 @@ __all__ = [
     "maze_from_text",
     "maze_pool",
     "maze_to_text",
-    "replay_recording",
-    "shortest_path",
     "shortest_path_lengths",
 ]
 

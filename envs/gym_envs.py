@@ -27,12 +27,12 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
     Args:
         env (EnvBase): unbatched, with a ``Categorical`` action, ``render(td)`` and an entry
             ``"observation"``.
-        render_mode (str, optional): ``"rgb_array"``, ``"human"`` for a window that shows every step
-            (needs pygame, which the extra ``gym`` brings), or None for no pictures. Default None.
+        render_mode (str, optional): ``"rgb_array"``, or None for no pictures, the default. A window
+            is Gymnasium's: ``gymnasium.make(..., render_mode="human")``, or its wrapper
+            ``HumanRendering``; it needs pygame, which the extra ``gym`` brings.
 
     Raises:
         ValueError: if the render mode is another, or the env's action is not one categorical.
-        ImportError: if a window is asked for and pygame is missing.
 
     Example:
         >>> from torchrl_hmcts.envs import GridworldMazeEnv, TorchRLGymnasiumEnv
@@ -45,13 +45,11 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
         (304, 304, 3)
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
 
     def __init__(self, env: EnvBase, render_mode: str | None = None) -> None:
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
-                f'render_mode must be None, "rgb_array" or "human", got {render_mode!r}.'
-            )
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f'render_mode must be None or "rgb_array", got {render_mode!r}.')
         action_spec = env.action_spec
         if not isinstance(action_spec, Categorical) or action_spec.shape or env.batch_size:
             raise ValueError(
@@ -60,8 +58,7 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
             )
         self.env = env
         self.render_mode = render_mode
-        self.metadata = {**getattr(env, "metadata", self.metadata), **_MODES}
-        self._window = _Window(self.metadata["render_fps"]) if render_mode == "human" else None
+        self.metadata = getattr(env, "metadata", self.metadata)
         self._num_actions = int(action_spec.space.n)
         self.action_space = gymnasium.spaces.Discrete(self._num_actions)
         self.observation_space = _box(env.observation_spec["observation"])
@@ -100,14 +97,12 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
         )
 
     def render(self) -> np.ndarray | None:
-        """Draw the current state, uint8 ``[h, w, 3]``; None in a window or without a mode."""
+        """Draw the current state, uint8 ``[h, w, 3]``; None without a mode."""
         td = self._current("render")
         return self.env.render(td) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Close the TorchRL env, and the window."""
-        if self._window is not None:
-            self._window.close()
+        """Close the TorchRL env."""
         if not self.env.is_closed:
             self.env.close()
 
@@ -119,45 +114,9 @@ class TorchRLGymnasiumEnv(gymnasium.Env):
         return self._tensordict
 
     def _shown(self, td: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
-        if self._window is not None:
-            self._window.show(self.env.render(td))
         # Copies: the env may hand on the same tensor step after step.
         entries = {key: td[key].cpu().numpy().copy() for key in self.env.observation_spec.keys()}
         return entries.pop("observation"), entries
-
-
-_MODES = {"render_modes": TorchRLGymnasiumEnv.metadata["render_modes"]}
-
-
-class _Window:
-    """A window of pygame, opened by the first picture."""
-
-    def __init__(self, fps: int) -> None:
-        try:
-            import pygame
-        except ImportError as error:
-            raise ImportError(
-                'render_mode="human" opens a window of pygame, which is not installed; it comes '
-                "with pip install 'torchrl_hmcts[gym]'. \"rgb_array\" needs no window."
-            ) from error
-        self._pygame, self._fps, self._clock = pygame, fps, pygame.time.Clock()
-        self._screen: Any = None
-
-    def show(self, picture: np.ndarray) -> None:
-        """Show a picture, uint8 ``[h, w, 3]``, for as long as a step takes."""
-        display = self._pygame.display
-        if self._screen is None:
-            display.init()
-            self._screen = display.set_mode(picture.shape[1::-1])
-        self._pygame.event.pump()
-        self._pygame.surfarray.blit_array(self._screen, picture.swapaxes(0, 1))
-        display.flip()
-        self._clock.tick(self._fps)
-
-    def close(self) -> None:
-        if self._screen is not None:
-            self._pygame.display.quit()
-            self._screen = None
 
 
 def _box(spec: Any) -> gymnasium.spaces.Box:
@@ -180,6 +139,8 @@ def make_maze(name: str, render_mode: str | None = None, **kwargs: Any) -> Torch
     return TorchRLGymnasiumEnv(_MAZES[name](**kwargs), render_mode)
 
 
+make_maze.metadata = TorchRLGymnasiumEnv.metadata  # type: ignore[attr-defined]  # for windows
+
 _MAZES: dict[str, Callable[..., EnvBase]] = {
     "WaterworldMaze": WaterworldMazeEnv,
     "GridworldMaze": GridworldMazeEnv,
@@ -192,14 +153,6 @@ def register_envs() -> None:
 
     ``import torchrl_hmcts.envs`` does it already. Keywords of ``gymnasium.make`` go to the TorchRL
     env.
-
-    Example:
-        >>> import gymnasium
-        >>> from torchrl_hmcts.envs.gym_envs import register_envs
-        >>> register_envs()
-        >>> env = gymnasium.make("torchrl_hmcts/GridworldMaze-v0", max_steps=50)
-        >>> env.reset(seed=1)[0].shape
-        (66,)
     """
     for name in _MAZES:
         env_id = f"torchrl_hmcts/{name}-v0"

@@ -1,11 +1,10 @@
-"""What every test gets: one thread, fixed seeds, a maze cache of its own."""
+"""What every test gets: one thread, fixed seeds."""
 
 from __future__ import annotations
 
 import os
 import random
 import signal
-from collections.abc import Iterator
 
 os.environ.setdefault("MPLBACKEND", "Agg")  # before anything imports matplotlib
 
@@ -32,11 +31,3 @@ def fixed_seeds() -> None:
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002  third-party code draws from the global generator
     torch.manual_seed(0)
-
-
-@pytest.fixture(autouse=True, scope="session")
-def maze_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keeps the tests off the user's cache folder, in sub-processes too."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHRL_HMCTS_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield

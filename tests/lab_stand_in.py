@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from torchrl_hmcts.envs import LabMazeEnv
-from torchrl_hmcts.envs.lab.actions import NATIVE_ACTIONS
-from torchrl_hmcts.envs.lab.view import heading_degrees
+from torchrl_hmcts.envs.lab.states import NATIVE_ACTIONS, heading_degrees
 
 SIZES = {"demos/random_maze": 15, "nine": 9}
 
@@ -22,7 +21,6 @@ SIZES = {"demos/random_maze": 15, "nine": 9}
 class Lab:
     """One level of the engine, one episode at a time."""
 
-    ACTION_NAMES = list(NATIVE_ACTIONS)
     opened: list[Lab] = []
 
     def __init__(
@@ -59,7 +57,7 @@ class Lab:
     def action_spec(self) -> list[dict[str, Any]]:
         return [
             {"name": name, "min": NATIVE_ACTIONS[name][0], "max": NATIVE_ACTIONS[name][1]}
-            for name in self.ACTION_NAMES
+            for name in NATIVE_ACTIONS
         ]
 
     def fps(self) -> int:

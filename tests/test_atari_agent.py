@@ -155,7 +155,7 @@ def test_trials_and_training_begin_in_one_split_and_scored_episodes_in_the_other
         game="Pong", frames=1_000, episodes=1, max_episode_frames=400, source="diayn_retrained",
         tune_trials=1, trial_steps=6, trial_ratio=1.0, rounds=1, skill_base_steps=64, ratio=1.0,
         num_processes=0, out=str(tmp_path), seed=4, protocol=protocol, curve_every=64,
-        curve_steps=10, curve_episodes=2,
+        curve_steps=10, curve_episodes=2, guide="none",
     )  # fmt: skip
     splits: list[tuple[str, int]] = []
     real = AtariOptionPool._reset
@@ -255,7 +255,7 @@ def test_the_gif_is_the_episode_that_scored(tmp_path, protocol) -> None:
     assert f"which scored {score:g}" in pictures.captions["episode.gif"]
 
 
-@pytest.mark.parametrize("guide", ["none", "prior_value"])
+@pytest.mark.parametrize("guide", ["none", "prior_value", "reactive"])
 def test_a_run_in_pieces_is_the_run_in_one(tmp_path, guide) -> None:
     config = AtariConfig(
         **SHORT, max_episode_frames=1_200, ratio=3.0, out=str(tmp_path), guide=guide

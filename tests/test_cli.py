@@ -10,7 +10,7 @@ import pytest
 
 import torchrl_hmcts
 from torchrl_hmcts.trainers.cli import main
-from torchrl_hmcts.trainers.experiments import EXPERIMENTS, Experiment
+from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS, Experiment
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.config import config_keys

@@ -28,10 +28,9 @@ from torchrl_hmcts.planners import PUCT, Gumbel, RadiusNovelty, WidthNovelty
 from torchrl_hmcts.testing import ChainEnv
 from torchrl_hmcts.trainers.command_line.words import expand, parse_config
 from torchrl_hmcts.trainers.configs import COMPONENTS, config_of
-from torchrl_hmcts.trainers.experiments import EXPERIMENTS, find_experiment
 from torchrl_hmcts.trainers.experiments.kits import make_kit
 from torchrl_hmcts.trainers.experiments.kits.waterworld import WaterworldKit
-from torchrl_hmcts.trainers.experiments.registry import DEMO
+from torchrl_hmcts.trainers.experiments.registry import DEMO, EXPERIMENTS, find_experiment
 from torchrl_hmcts.trainers.experiments.settings import DemoConfig
 from torchrl_hmcts.trainers.experiments.skills import learn, make_loss
 from torchrl_hmcts.trainers.parts import build, differences, merged, named

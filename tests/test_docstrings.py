@@ -100,9 +100,10 @@ LITERATURE = {
 NOTHING_TO_CITE = set(
     "NodeStatistics NoveltyTest Plan PlansGoals Root Search SearchProgress SearchTree Transition "
     "TreeView Evaluation SearchSettings extract_plans OptionWorker TorchRLGymnasiumEnv "
-    "free_tiles maze_from_text maze_to_text replay_recording "
-    "shortest_path shortest_path_lengths Snapshot AttributeSnapshot ReplaySnapshot "
-    "SnapshotError option_color "
+    "free_tiles maze_from_text maze_to_text "
+    "shortest_path_lengths Snapshot AttributeSnapshot ReplaySnapshot "
+    "SnapshotError option_color GridMoves GridView MujocoTask SkillWorker PolicyWorker FeatureGoal "
+    "FollowGoals OccasionalAction JoinedWorkers MazeItems "
     "GrowingSkillPrior LandmarkEnv SkillPolicy StallTransform find_jumps".split()
 )
 # What works on tensors, so that its docstring has to give their shapes.

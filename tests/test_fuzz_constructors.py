@@ -242,6 +242,7 @@ GOOD: dict[str, Good] = {
     **everything(
         trainers,
         SearchGuide={"num_options": 3, "hidden": (4,), "buffer_size": 8},
+        ReactiveManager={"num_options": 3, "hidden": (4,), "buffer_size": 8},
         OptionGoals={"goals": [0, 2]},
         AtariSearch={},
         RuleSource={},
@@ -290,7 +291,7 @@ COSTLY = {  # milliseconds each; the others take microseconds
 }
 EXCLUDED = {  # why public names are not fuzzed here
     "a record that is filled": "NodeStatistics Plan TreeView Root SearchProgress Transition "
-    "Evaluation GoalEpisodes GoalTrack Options Controllability Solution MujocoTask",
+    "Evaluation GoalTrack Options Controllability Solution MujocoTask",
     "a protocol": "NoveltyTest PlansGoals OptionWorker",
     "a base class": "Kit SkillObjective SkillPrior ResumableTrainer",
     "starts processes": "AtariOptionPool AtariRAMEnv DeepMindLabEnv OptionPool",

@@ -18,7 +18,7 @@ from search_parts import least_visited
 from torchrl_hmcts import planners
 from torchrl_hmcts.envs import LabMazeEnv, SharedMLP
 from torchrl_hmcts.envs.lab.first_person import draw_first_person
-from torchrl_hmcts.envs.mazes.wall_growing import _compiled_grow_walls, _grow_walls
+from torchrl_hmcts.envs.mazes.layouts import _compiled_grow_walls, _grow_walls
 from torchrl_hmcts.planners import (
     PUCT,
     UCT,

@@ -5,16 +5,49 @@ from __future__ import annotations
 import gzip
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from torchrl_hmcts.envs import lab_maze, replay_recording, shortest_path_lengths
-from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
+from torchrl_hmcts.envs import LabMazeEnv, lab_maze, shortest_path_lengths
+from torchrl_hmcts.envs.lab.mazes import MersenneTwister64
+from torchrl_hmcts.envs.lab.states import heading_degrees
 
 DATA = Path(__file__).parent / "data" / "lab_recordings.json.gz"
 RECORDINGS = {s["name"]: s for s in json.loads(gzip.decompress(DATA.read_bytes()))["sequences"]}
+
+
+def replay(recording: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Plays a recording's actions; after the goal the player appears elsewhere than there."""
+    rows = recording["rows"]
+    if not any("P" in row for row in rows):  # the start is given
+        rows = "\n".join(rows).replace(" ", "P", 1).split("\n")
+    env = LabMazeEnv(
+        [rows],
+        actions=None,
+        terminate_on_goal=False,
+        max_frames=10**12,
+        fps=recording["fps"],
+        clock="exact",
+        clock_phase=recording["clock_phase"],
+        read_outs=(),
+    )
+    pos, rot, velocity = (np.array(recording[key][0]) for key in ("pos", "rot", "vel_world"))
+    td = env.make_state(0, pos[:2].tolist(), float(rot[1]), velocity=velocity[:2].tolist())
+    td["turned"][1] = rot[0]
+    found: dict[str, list[Any]] = {"pos": [], "rot": [], "vel_world": [], "reward": []}
+    for action in [*recording["actions"], None]:
+        found["pos"].append([*td["position"].tolist(), 25.125])
+        found["vel_world"].append([*td["velocity"].tolist(), 0.0])
+        yaw = heading_degrees(td["turned"][:1].numpy(), td["level"][:1].numpy())
+        pitch = heading_degrees(td["turned"][1:].numpy(), np.zeros(1, np.int64))
+        found["rot"].append([float(pitch[0]), float(yaw[0]), 0.0])
+        if action is not None:
+            td = env._step(td.set("action", torch.tensor(action)))
+            found["reward"].append(float(td["reward"]))
+    return {key: np.array(values) for key, values in found.items()}
 
 
 def test_the_recordings_cover_every_kind_of_movement() -> None:
@@ -26,7 +59,7 @@ def test_the_recordings_cover_every_kind_of_movement() -> None:
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_the_environment_moves_as_the_engine_did(name: str) -> None:
     recording = RECORDINGS[name]
-    ours = replay_recording(recording)
+    ours = replay(recording)
     for key in ("pos", "rot", "vel_world", "reward"):
         assert ours[key].shape == np.shape(recording[key])
     assert np.abs(ours["pos"] - recording["pos"])[:, :2].max() < 0.01  # a cell is 100
@@ -39,12 +72,12 @@ def test_the_environment_moves_as_the_engine_did(name: str) -> None:
 def test_other_actions_do_not_give_the_recorded_movement() -> None:
     recording = dict(RECORDINGS["solver_9x9_seed1"])
     recording["actions"] = [[-a for a in action] for action in recording["actions"]]
-    assert np.abs(replay_recording(recording)["pos"] - recording["pos"]).max() > 50.0
+    assert np.abs(replay(recording)["pos"] - recording["pos"]).max() > 50.0
 
 
 def test_two_phases_of_the_clock_drift_a_few_units_apart() -> None:
     recording = RECORDINGS["open_random_0"]
-    other = replay_recording({**recording, "clock_phase": [46, -3]})
+    other = replay({**recording, "clock_phase": [46, -3]})
     assert 0.1 < np.abs(other["pos"] - recording["pos"])[:, :2].max() < 30.0
 
 
@@ -52,16 +85,6 @@ def test_two_phases_of_the_clock_drift_a_few_units_apart() -> None:
 def test_the_maze_of_a_seed_is_the_engines(name: str) -> None:
     recording = RECORDINGS[name]
     assert list(lab_maze(recording["seed"])) == recording["rows"]
-    by_seed = {key: value for key, value in recording.items() if key != "rows"}
-    by_seed["actions"] = by_seed["actions"][:3]
-    assert (replay_recording(by_seed)["pos"][:4] == replay_recording(recording)["pos"][:4]).all()
-
-
-def test_a_recording_that_lacks_an_entry_is_refused() -> None:
-    recording = {k: v for k, v in RECORDINGS["goal_plus_x"].items() if k not in ("rows", "seed")}
-    del recording["fps"]
-    with pytest.raises(ValueError, match=r"needs the entries \['fps', 'rows'\]"):
-        replay_recording(recording)
 
 
 # ---------------------------------------------------------------------- random numbers
@@ -101,13 +124,6 @@ def test_integers_reject_the_numbers_that_would_make_one_more_likely() -> None:
 def test_reals_are_64_bits_below_one() -> None:
     assert Fixed(1 << 62).uniform_real() == 0.25
     assert Fixed(2**64 - 1).uniform_real() == 1.0 - 2.0**-53
-
-
-def test_bad_ranges_and_seeds_are_refused() -> None:
-    with pytest.raises(ValueError, match="low <= high; got 2 and 1"):
-        MersenneTwister64(0).uniform_int(2, 1)
-    with pytest.raises(ValueError, match="64 bits.*got -1"):
-        MersenneTwister64(-1)
 
 
 # ---------------------------------------------------------------------- mazes

@@ -67,15 +67,6 @@ def test_each_start_is_played_until_its_own_end(env) -> None:
     assert test.last["step_count"].flatten().tolist() == test.base_steps.tolist()
 
 
-def test_a_watcher_sees_every_transition(env) -> None:
-    seen: list[int] = []
-    starts = env.make_state(0, [[6.5, 1.5]], (8.5, 1.5))
-    test = play_mazes(
-        to_the_right, env, starts, watch=lambda td: seen.append(int(td["step_count"]))
-    )
-    assert seen == list(range(int(test.base_steps)))
-
-
 def test_sampled_tests_repeat_by_their_seed(env) -> None:
     actor, _ = make_maze_networks(env, in_keys=["observation", "velocity"])
     starts = env.make_state(0, [[6.5, 1.5]] * 4, (7.5, 1.5))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_hmcts.envs import GridworldMazeEnv, draw_maze, maze_from_text
+from torchrl_hmcts.envs import draw_maze, maze_from_text
 from torchrl_hmcts.envs.mazes.rendering import (
     DOT_COLOR,
     FREE_COLOR,
@@ -68,11 +68,6 @@ def test_a_path_without_extent_is_no_error(points):
     draw_maze(WALLS, paths=[(points, (1, 2, 3))])
 
 
-def test_what_lies_outside_the_picture_is_left_out():
-    inside = draw_maze(WALLS)
-    assert (draw_maze(WALLS, player=(-5.0, 9.0), dots=[(50, 50)]) == inside).all()
-
-
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
@@ -87,11 +82,3 @@ def test_what_lies_outside_the_picture_is_left_out():
 def test_bad_arguments_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         draw_maze(**kwargs)
-
-
-def test_env_draws_its_state():
-    maze, player, target = maze_from_text("P.#\n..T")
-    env = GridworldMazeEnv(maze[None])
-    image = env.render(env.make_state(0, player, target), tile_pixels=TILE)
-    expected = draw_maze(maze, player=(0.5, 0.5), target=(2.5, 1.5), tile_pixels=TILE)
-    assert (image == expected).all()

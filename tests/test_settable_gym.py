@@ -17,7 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_hmcts.envs import AttributeSnapshot, ReplaySnapshot, SettableGymEnv, SnapshotError
 from torchrl_hmcts.envs.gym.families import snapshot_of
-from torchrl_hmcts.envs.gym.generators import (
+from torchrl_hmcts.envs.gym.marks import (
     generator_memory,
     generator_state,
     set_generator_state,

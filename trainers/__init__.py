@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
     from torchrl_hmcts.trainers.experiments.atari.kit import AtariKit
     from torchrl_hmcts.trainers.experiments.atari.options import Options
+    from torchrl_hmcts.trainers.experiments.atari.reactive import ReactiveManager
     from torchrl_hmcts.trainers.experiments.atari.rules import RuleSource
     from torchrl_hmcts.trainers.experiments.atari.sources import TrainedSource
     from torchrl_hmcts.trainers.experiments.goals import make_maze_networks
@@ -34,9 +35,8 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.experiments.settings import DemoConfig, SkillsConfig
     from torchrl_hmcts.trainers.experiments.skills import learn, solve
     from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
-        GoalEpisodes,
         GoalTrack,
-        run_goal_episodes,
+        play_mazes,
     )
     from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
         TilePlanner,

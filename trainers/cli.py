@@ -67,6 +67,7 @@ Show an agent acting: one episode, planned and executed in an env of its own.
 
     hmcts play run=runs/gym            in a window; without a display on a page in runs/gym/play
     hmcts play run=runs/gym seed=3 out=episode.mp4
+    hmcts play run=runs/atari ratio=0 out=episode.gif   an Atari agent, here without search
 
 needs   a folder that `hmcts train kit=...`, `hmcts demo` or HMCTS.save() wrote
 writes  nothing, or play/ in that folder, or the film (FILE.mp4 and FILE.gif)

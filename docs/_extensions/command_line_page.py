@@ -30,7 +30,7 @@ def spoken(words: list[str]) -> str:
 
 def page() -> str:
     """Return the page, in Markdown."""
-    from torchrl_hmcts.trainers.experiments import EXPERIMENTS
+    from torchrl_hmcts.trainers.experiments.registry import EXPERIMENTS
 
     def block(text: str) -> str:
         return f"```text\n{text}\n```\n"

@@ -107,6 +107,48 @@ def atari(runs: Sequence[dict[str, Any]]) -> str:
     return text
 
 
+def sticky(data: dict[str, Any]) -> str:
+    """Return the sticky protocol's tables: scores at numbers of frames, and who plays alone."""
+    checkpoints = [str(frames) for frames in data["dopamine"]["frames"]]
+    rows = [
+        [
+            row["game"],
+            row["seed"],
+            *(f"{row['score_at'][at]:.1f}" if at in row["score_at"] else "-" for at in checkpoints),
+            *(_mean(row.get(f"reactive_{name}")) for name in ("sticky", "deterministic")),
+            f"{row['frames_before_first_episode'] / row['frames']:.1%}",
+            f"{row['frames'] / 1e6:.1f} million",
+        ]
+        for row in data["rows"]
+    ]
+    named = [f"{int(at) // 1_000_000}M frames" for at in checkpoints]
+    head = ["game", "seed", *named, "without search", "the same, deterministic",
+            "frames before the first episode", "frames, all kinds"]  # fmt: skip
+    means = [[name, *values] for name, values in data["dopamine"]["interquartile_mean"].items()]
+    ours: dict[str, str] = {}
+    for line in data["summary"]:
+        if len(line["games"]) == len(TABLE_5_1):
+            seeds, low_high = min(line["seeds"]), line["interval_95"]
+            interval = f" ({low_high[0]:.2f} to {low_high[1]:.2f})" if low_high else ""
+            ours[str(line["frames"])] = (
+                f"{line['interquartile_mean']:.2f}{interval}, {seeds} seed(s)"
+            )
+    means.append(["ours, seven games", *(ours.get(at, "-") for at in checkpoints)])
+    return (
+        "Actions stick with probability 0.25; episodes are played to their end or 108,000 frames; "
+        "every emulated frame counts. A score is the mean of the last ten planned episodes that "
+        "were over by then, or of all, where there are fewer. **The simulator is set** to plan; "
+        "Dopamine's agents never set theirs.\n\n"
+        + table(head, rows)
+        + "\nInterquartile means of human-normalised scores, beside Dopamine's published training "
+        "curves of five runs:\n\n" + table(["agent", *named], means)
+    )
+
+
+def _mean(scores: Sequence[float] | None) -> str:
+    return "-" if not scores else f"{sum(scores) / len(scores):.1f}"
+
+
 def best(runs: Sequence[dict[str, Any]], game: str) -> str:
     """Return the best deterministic score in a game, or that there is none."""
     scores = [

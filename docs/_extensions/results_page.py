@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from results_atari import ATARI, atari, best, learned
+from results_atari import ATARI, atari, best, learned, sticky
 from results_reliability import RELIABILITY
 from results_tables import SECTIONS, Section, table
 
@@ -67,6 +67,7 @@ _ATARI = {
     "Atari": (
         Section("Seven games", "atari/runs.json", atari),
         Section("Learned workers", "atari/learned.json", learned),
+        Section("Sticky actions, whole episodes", "atari/sticky.json", sticky),
     )
 }
 

@@ -60,11 +60,11 @@ plt.show()
 # ``ScriptedExpert`` steers towards the next goal and slows down where the path turns. It shows
 # what is possible, and whether the env is right, before anything is trained.
 
-from torchrl_hmcts.trainers import ScriptedExpert, draw_goals, run_goal_episodes
+from torchrl_hmcts.trainers import ScriptedExpert, draw_goals, play_mazes
 
-episodes = run_goal_episodes(tests, ScriptedExpert(), starts, record=True)
+episodes = play_mazes(ScriptedExpert(), tests, starts, record=True)
 summary = episodes.summary()
-print(f"solved: {summary['solved']:.0%}; base steps, mean: {summary['base_steps']['mean']:.0f}")
+print(f"solved: {summary['solved_share']:.0%}; base steps, mean: {summary['base_steps_mean']:.0f}")
 
 track = episodes.tracks[far]
 last = len(track.positions) - 1
@@ -93,12 +93,13 @@ actor, critic = make_maze_networks(
 )
 loss = A3CLoss(actor, critic, entropy_coeff=0.01, critic_coeff=0.5, gamma=0.95)
 short = make_goal_env(maze_pool("test"), observation=False, max_steps=300)
+planned = short.reset(starts[:20].clone(), set_state=True)["plan_length"].sum()
 
 
 def evaluate(policy):
-    played = run_goal_episodes(short, policy, starts[:20], deterministic=False)
-    goals_met = played.num_goals_met.sum() / played.shortest.sum()
-    return {"solved": float(played.solved.mean()), "goals": float(goals_met)}
+    played = play_mazes(policy, short, starts[:20])
+    goals_met = played.last["num_goals_met"].sum() / planned
+    return {"solved": float(played.solved.double().mean()), "goals": float(goals_met)}
 
 
 trainer = A3CTrainer(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium import spaces
 
 from torchrl_hmcts.envs.gym.mujoco import find_physics
@@ -33,12 +34,7 @@ _ACTUATORS = [6, 7, 0, 1, 2, 3, 4, 5]  # are those of legs 4, 1, 2 and 3
 
 
 def seen_from(frame: Sequence[Any], x: Any, y: Any) -> tuple[Any, Any]:
-    """Return a vector in a frame.
-
-    Args:
-        frame: cosine and sine of its first axis, each a number or ``[*B]``.
-        x, y: of the vector in the world.
-    """
+    """Return (x, y) as seen in a frame: cosine and sine of its first axis, each ``[*B]``."""
     c, s = frame
     return c * x + s * y, c * y - s * x
 
@@ -51,14 +47,11 @@ def _scaled(*x: Any) -> list[Any]:
 
 
 def body_of(physics: np.ndarray, frame: Any = None) -> tuple[np.ndarray, Any]:
-    """Return what the worker sees of positions and velocities, ``[*B, 32]``, and the frame.
+    """Return what the worker sees of ``qpos`` and ``qvel``, ``[*B, 29]``, and the frame.
 
-    Height, rotation matrix, joints, and all velocities, scaled.
-
-    Args:
-        physics: ``qpos`` and ``qvel``, float64 ``[*B, 29]``.
-        frame: cosine and sine, each a number or ``[*B]``. Default: those of the body's own heading,
-            which turns by a quarter where the body does.
+    It is height, rotation matrix, joints and all velocities, scaled, ``[*B, 32]``. The frame, its
+    cosine and sine, is by default that of the body's own heading, which turns by a quarter where
+    the body does.
     """
     single = physics.ndim == 1  # numbers of Python are faster than arrays of one
     numbers = physics.tolist() if single else list(np.moveaxis(physics, -1, 0))
@@ -81,11 +74,7 @@ def body_of(physics: np.ndarray, frame: Any = None) -> tuple[np.ndarray, Any]:
 
 
 def up_of(qpos: np.ndarray) -> np.ndarray:
-    """Return how far the ant's back is up, 1 to -1.
-
-    Args:
-        qpos: ``[*B, 15]`` and more.
-    """
+    """Return how far the ant's back is up, 1 to -1, of ``qpos``, ``[*B, 15]`` and more."""
     up: np.ndarray = 1 - 2 * (qpos[..., 4] ** 2 + qpos[..., 5] ** 2)
     return up
 
@@ -95,10 +84,6 @@ def goal_rings(env: gymnasium.Env, observation: Any) -> np.ndarray:
 
     So that a search tells places apart that are metres from each other, and near the goal those
     that are a goal's width nearer.
-
-    Args:
-        env: is not looked at.
-        observation: of :class:`AntView`.
     """
     x, y = observation["achieved_goal"]
     u, v = observation["desired_goal"]
@@ -127,21 +112,16 @@ class Turn(NamedTuple):
         return turned * self.sign[quarters].astype(x.dtype)
 
 
-def _joined(*blocks: np.ndarray) -> np.ndarray:
-    size = sum(map(len, blocks))
-    whole, at = np.zeros((size, size)), 0
-    for block in blocks:
-        whole[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return whole
+def _block_diag(*blocks: np.ndarray) -> np.ndarray:
+    return torch.block_diag(*map(torch.from_numpy, blocks)).numpy()
 
 
 def turns() -> tuple[Turn, Turn, Turn]:
     """Return the turns of what :func:`body_of` returns, of an action and of a vector in a plane."""
     one, plane = np.ones((1, 1)), np.array([[0.0, 1.0], [-1.0, 0.0]])
-    space = _joined(plane, one)
+    space = _block_diag(plane, one)
     legs = np.eye(8)[_LEGS] * np.array(_BENDS)[:, None]
-    body = _joined(one, np.kron(space, space), legs, space, space, legs)
+    body = _block_diag(one, np.kron(space, space), legs, space, space, legs)
     order = np.eye(8)[_ACTUATORS]
     return Turn.of(body), Turn.of(order @ legs @ order.T), Turn.of(plane)
 
@@ -149,17 +129,9 @@ def turns() -> tuple[Turn, Turn, Turn]:
 class AntView(gymnasium.Wrapper):
     """Shows an ant maze as positions, velocities, place and goal, and slows its ant down.
 
-    With ``directions`` there is an ``"action_mask"`` too: an ant that walks does not turn back.
-
-    Args:
-        env (gymnasium.Env): an ant maze of OGBench or gymnasium-robotics.
-        repeat (int): steps of the env that an action lasts.
-        strength (float): share of the torques that an action may use.
-        directions (ndarray, optional): of the options, as seen from the heading, ``[A, 2]``; of
-            those that are unknown (0, 0). Default: no mask.
-
-    Raises:
-        SnapshotError: if it is none.
+    An action lasts ``repeat`` steps of the env, with the share ``strength`` of the torques. With
+    ``directions`` of the options as seen from the heading, ``[A, 2]``, (0, 0) of those that are
+    unknown, there is an ``"action_mask"`` too: an ant that walks does not turn back.
     """
 
     is_stateless = True
@@ -225,9 +197,6 @@ class AntWorker:
 
     Option ``2 z + h`` is skill z after h half turns, so that three skills are six directions. It
     ends where the ant lies on its back.
-
-    Args:
-        actor (SkillActor): sees what :func:`body_of` returns.
     """
 
     def __init__(self, actor: SkillActor) -> None:

@@ -11,8 +11,13 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from torchrl_hmcts.envs.gym.generators import generator_state, set_generator_state
-from torchrl_hmcts.envs.gym.marks import ATOMS, Seen, look_through
+from torchrl_hmcts.envs.gym.marks import (
+    ATOMS,
+    Seen,
+    generator_state,
+    look_through,
+    set_generator_state,
+)
 from torchrl_hmcts.envs.gym.snapshots import (
     DEFAULT_CAP,
     KNOWN_WRAPPERS,
@@ -72,10 +77,6 @@ class AttributeSnapshot(Snapshot):
     head: ClassVar[int] = 1  # numbers before the clocks
     drawing_modules: ClassVar[tuple[str, ...]] = ("pygame", "matplotlib", "PIL", "cv2", "moviepy")
 
-    @classmethod
-    def fits(cls, env: gymnasium.Env) -> bool:
-        return True
-
     def __init__(self, env: gymnasium.Env, *, cap: int = DEFAULT_CAP) -> None:
         self.env = env
         env.reset(seed=0)
@@ -106,11 +107,7 @@ class AttributeSnapshot(Snapshot):
         self._load(row)
 
     def is_fixed(self, value: Any) -> bool:
-        """Return whether an object is not state: it never changes in an instance.
-
-        Args:
-            value: any object that an env refers to.
-        """
+        """Return whether an object is not state: it never changes in an instance."""
         if isinstance(value, _FIXED_TYPES):
             return True
         module = type(value).__module__
@@ -263,12 +260,7 @@ class AttributeSnapshot(Snapshot):
         return None if self._seen is None else self._seen.contents()
 
     def is_read(self, layer: Any, name: str) -> bool:
-        """Return whether an attribute may be state.
-
-        Args:
-            layer: whose it is.
-            name: of the attribute.
-        """
+        """Return whether an attribute of a layer may be state."""
         return name not in self.skipped_attributes
 
     def _refusal(self, values: list[dict[str, Any]], error: Exception) -> str:
@@ -293,11 +285,7 @@ _NUMPY = frozenset(
 )
 
 
-class _Kept:
-    """Marks an attribute that was no state when the row was read: it stays as it is."""
-
-
-_KEPT = _Kept()
+_KEPT = object()  # an attribute that was no state when the row was read: it stays as it is
 
 
 class _Pickler(pickle.Pickler):

@@ -46,9 +46,6 @@ def features_of(env: gymnasium.Env) -> Features:
 
     They are the achieved goal of an env with goals; :class:`GridFeatures` in MiniGrid; the place of
     the robot in MuJoCo; and else the observation.
-
-    Args:
-        env: with its wrappers.
     """
     space = env.observation_space
     if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
@@ -65,12 +62,7 @@ def features_of(env: gymnasium.Env) -> Features:
 
 
 class WithFeatures(gymnasium.ObservationWrapper):
-    """Shows the features beside the observation, e.g. to a vector env of Gymnasium.
-
-    Args:
-        env (gymnasium.Env): any env.
-        features (callable): as of :class:`OptionPool`.
-    """
+    """Shows the features beside the observation, e.g. to a vector env of Gymnasium."""
 
     is_stateless = True
 

@@ -146,15 +146,7 @@ class GridFeatures:
 
 
 def check_minigrid(env: gymnasium.Env, owner: str) -> None:
-    """Refuse an env that is none of MiniGrid's.
-
-    Args:
-        env: with its wrappers.
-        owner: who asks.
-
-    Raises:
-        SnapshotError: if it is another env.
-    """
+    """Refuse an env that is none of MiniGrid's."""
     if not MiniGridSnapshot.fits(env):
         raise SnapshotError(
             f"{owner} is for MiniGrid and BabyAI envs, e.g. 'MiniGrid-FourRooms-v0'; got {env}."
@@ -162,11 +154,7 @@ def check_minigrid(env: gymnasium.Env, owner: str) -> None:
 
 
 def is_thing(item: Any) -> bool:
-    """Return whether a cell holds a door or an object, rather than nothing, wall, goal or lava.
-
-    Args:
-        item: what a grid has in the cell.
-    """
+    """Return whether a cell holds a door or an object, rather than nothing, wall, goal or lava."""
     return item is not None and item.type not in _UNMOVED
 
 

@@ -45,13 +45,6 @@ class MiniGridSnapshot(AttributeSnapshot):
     A copy of the whole grid takes milliseconds. Between two states of an episode only the agent, a
     few cells and objects differ, and restoring changes only these. The reference is part of the
     row, so that a row fits other instances too.
-
-    Args:
-        env (gymnasium.Env): a MiniGrid or BabyAI env with its wrappers.
-        cap (int): bytes of the reference at most. Default 65,536.
-
-    Raises:
-        SnapshotError: if an attribute cannot be stored.
     """
 
     skipped_attributes = AttributeSnapshot.skipped_attributes | {*_AGENT}
@@ -156,7 +149,9 @@ class MiniGridSnapshot(AttributeSnapshot):
             for i, (now, before) in enumerate(zip(grid, self._cells, strict=True))
             if now is not before
         ]
-        objects = [_object_state(item, self._number) for item in self._movable]
+        objects = [  # what one contains as a number
+            {**item.__dict__, "contains": self._number(item.contains)} for item in self._movable
+        ]
         content = pickle.dumps((changed, objects), protocol=5)
         self._changes = _Changes(list(grid), own, content)
         return content
@@ -221,8 +216,3 @@ def _quick(item: Any) -> Any:
     for name, value in vars(item).items():
         setattr(copied, name, value)
     return copied
-
-
-def _object_state(item: Any, number: Any) -> dict[str, Any]:
-    """The attributes of an object that moves; what it contains as a number."""
-    return {**item.__dict__, "contains": number(item.contains)}

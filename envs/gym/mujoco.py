@@ -29,20 +29,10 @@ class MujocoSnapshot(AttributeSnapshot):
     """Stores MuJoCo's integration state, and the attributes of the env.
 
     Positions and velocities alone are not the state: the solver's warm start, controls and applied
-    forces belong to it (``mjSTATE_INTEGRATION``). Some models also need a forward pass before the
-    state is set, and some rewards read derived quantities of the step before. A short probe finds
-    out what of both this env needs, and fields of the model that a reset changes (goal sites).
-
-    Args:
-        env (gymnasium.Env): an env with a MuJoCo ``model`` and ``data``.
-        cap (int): bytes of a row at most. Default 65,536.
-
-    Attributes:
-        forward (bool): whether restoring takes a forward pass.
-        derived (tuple of str): fields of ``MjData`` stored beside the state.
-
-    Raises:
-        SnapshotError: if the env is not deterministic, or an attribute cannot be stored.
+    forces belong to it (``mjSTATE_INTEGRATION``). Some models also need a ``forward`` pass before
+    the state is set, and some rewards read ``derived`` fields of the step before. A short probe
+    finds out what of both this env needs, and fields of the model that a reset changes (goal
+    sites).
 
     Reference:
         MuJoCo documentation, "Simulation: state and control".
@@ -163,14 +153,7 @@ class MujocoSnapshot(AttributeSnapshot):
 
 
 def find_physics(env: gymnasium.Env) -> tuple[Any, Any]:
-    """Return MuJoCo's model and data of an env.
-
-    Args:
-        env (gymnasium.Env): with its wrappers.
-
-    Raises:
-        SnapshotError: if there is none.
-    """
+    """Return MuJoCo's model and data of an env."""
     for layer in env_layers(env):
         physics = _physics_of(layer)
         if physics is not None:
@@ -187,11 +170,7 @@ def _physics_of(layer: gymnasium.Env) -> tuple[Any, Any] | None:
 
 
 def repr_of(outcome: tuple[Any, ...]) -> bytes:
-    """Return a step's observation, reward and ends as bytes, to be compared to the bit.
-
-    Args:
-        outcome: of ``env.step``; the info is left out.
-    """
+    """Return a step's observation, reward and ends as bytes, to be compared to the bit."""
     observation, reward, terminated, truncated = outcome[:4]
     parts = [np.asarray(x) for x in _leaves(observation)]
     parts += [np.asarray(float(reward)), np.asarray([terminated, truncated])]

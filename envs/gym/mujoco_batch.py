@@ -111,11 +111,7 @@ class MujocoBatch(EnvBase):
     # ---------------------------------------------------------------- states
 
     def read(self, env: gymnasium.Env) -> TensorDict:
-        """Return the state of a Gymnasium env of the same kind, and what the env shows there.
-
-        Args:
-            env (gymnasium.Env): made as this one's; e.g. one that is acted in.
-        """
+        """Return the state of a Gymnasium env of the same kind, and what this env shows there."""
         model, data = find_physics(env)
         if (model.nq, model.nv, model.ngeom) != (self.model.nq, self.model.nv, self.model.ngeom):
             raise SnapshotError(f"{env} has another MuJoCo model than {self}.")

@@ -29,9 +29,6 @@ class MujocoTask:
         derived (tuple of str): fields of ``MjData`` that an observation holds beside positions and
             velocities.
 
-    Reference:
-        This project's.
-
     Example:
         >>> from torchrl_hmcts.envs import MujocoBatch, MujocoTask
         >>> class Forward(MujocoTask):  # no maze: the speed of a cheetah
@@ -182,14 +179,7 @@ class OGBenchPointMaze(OGBenchMaze):
 
 
 def task_of(env: gymnasium.Env) -> MujocoTask:
-    """Return the task of an env that is known.
-
-    Args:
-        env (gymnasium.Env): with its wrappers.
-
-    Raises:
-        SnapshotError: if it is none of the mazes, with what to pass.
-    """
+    """Return the task of an env that is known."""
     bases = {f"{c.__module__.split('.')[0]}.{c.__name__}" for c in type(env.unwrapped).__mro__}
     kinds: dict[type[MujocoTask], set[str]] = {
         RoboticsPointMaze: {"gymnasium_robotics.PointMazeEnv"},

@@ -25,14 +25,13 @@ class OptionPool(ProcessPool):
 
     It is stateless: the tensordict holds the state as ``"snapshot"``, as :class:`SettableGymEnv`
     writes it, and any batch can be stepped. A planner can search in it, and an agent can act in it.
-    Each option is one message to a process, which costs little beside the env's own steps. Choose
-    ``leaves_per_wave`` a few times as large as ``num_processes``.
+    Each option is one message to a process. Choose ``leaves_per_wave`` a few times as large as
+    ``num_processes``.
 
-    An outcome is a function of the state, the option, the worker's weights and the pool's seed; the
-    process does not matter. So a search is the same with any number of processes, and a plan
-    happens as predicted. The state holds the generators of the env and of the worker, so a planner
-    knows their draws in advance. With ``determinised=False`` every call draws other numbers, for a
-    planner that samples options more than once (``chance=ProgressiveWidening()``).
+    An outcome is a function of the state, the option, the worker's weights and the pool's seed; so
+    a search is the same with any number of processes, and a plan happens as predicted: a planner
+    knows the draws of env and worker in advance. With ``determinised=False`` every call draws other
+    numbers, for a planner that samples options more than once (``chance=ProgressiveWidening()``).
 
     If a process dies, is stopped, or hangs for ``step_seconds``, the pool starts it and its options
     again. ``num_restarts`` counts restarts; ``num_steps`` counts all base steps, lost ones
@@ -45,9 +44,9 @@ class OptionPool(ProcessPool):
 
     Args:
         env (str or callable): an id, or a function that makes the env, called in each process.
-        worker (OptionWorker): ``worker.act(observation, option, generator)`` gives the next action;
-            e.g. :class:`RepeatActions` or :class:`SkillWorker`. It is sent to each process once;
-            weights in shared memory stay shared, so that updates are seen at once.
+        worker (OptionWorker): e.g. :class:`RepeatActions` or :class:`SkillWorker`. It is sent to
+            each process once; weights in shared memory stay shared, so that updates are seen at
+            once.
         max_steps (int): base steps after which an option ends.
         num_processes (int, optional): 0 runs the options in the calling process. Default: one for
             each core.
@@ -59,8 +58,8 @@ class OptionPool(ProcessPool):
         still (float): an option ends early when it moves the features less than this within a fifth
             of ``max_steps``, e.g. at a wall. Default 0: never.
         start_method ("forkserver" or "spawn"): how processes are started. Default forkserver, or
-            spawn where the path of the temporary folder (``TMPDIR``) is too long for it. As
-            always with :mod:`multiprocessing`, a script needs ``if __name__ == "__main__":``.
+            spawn where the path of the temporary folder (``TMPDIR``) is too long for it. As always
+            with :mod:`multiprocessing`, a script needs ``if __name__ == "__main__":``.
         step_seconds (float): longest time for one step of the worker and the env, seconds. A
             process that neither steps nor uses the processor for so long is replaced; one that
             computes without a step, after ten times as long, at least two minutes. Default 60.
@@ -71,12 +70,10 @@ class OptionPool(ProcessPool):
     Raises:
         TypeError: if ``env`` is an env, which cannot be sent to processes.
         ImportError: if a package is missing; the extra that has it is named.
-        ValueError: if an argument is out of range, or the state cannot be stored; when stepping, if
-            an option is out of range.
+        ValueError: if an argument or an option is out of range, or the state cannot be stored.
         RuntimeError: when stepping, if the worker or the env raises an error, or processes die or
             hang again and again.
-        OSError: if there is too little shared memory or too few file descriptors, or when stepping,
-            if processes cannot be started.
+        OSError: if there is too little shared memory, too few descriptors, or no process can start.
 
     Reference:
         Sutton, Precup and Singh, "Between MDPs and semi-MDPs", 1999.
@@ -86,10 +83,8 @@ class OptionPool(ProcessPool):
         >>> from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
         >>> pool = OptionPool("CartPole-v1", RepeatActions(2), max_steps=3, num_processes=0, seed=0)
         >>> planner = MCTSPlanner(pool, budget=SearchBudget(base_steps=200, until_plan=False))
-        >>> td = pool.rollout(4, policy=planner)
-        >>> td["next", "duration"].flatten().tolist()
+        >>> pool.rollout(4, policy=planner)["next", "duration"].flatten().tolist()
         [3, 3, 3, 3]
-        >>> pool.close()
     """
 
     def __init__(

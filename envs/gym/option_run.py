@@ -20,7 +20,7 @@ from torchrl.data.utils import CloudpickleWrapper
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
 from torchrl_hmcts.envs.gym.families import snapshot_of
 from torchrl_hmcts.envs.gym.features import FEATURES_KEY, Features
-from torchrl_hmcts.envs.gym.generators import generator_memory, set_generator_state
+from torchrl_hmcts.envs.gym.marks import generator_memory, set_generator_state
 from torchrl_hmcts.envs.gym.quick import quick_step
 from torchrl_hmcts.envs.gym.settable import PrivateRandom, make_gym
 from torchrl_hmcts.envs.gym.snapshots import (
@@ -119,12 +119,7 @@ class OptionRun(ABC):
         return np.dtype(fields, align=True)
 
     def run(self, slots: dict[str, np.ndarray], index: int) -> None:
-        """Run the option in one slot to its end and write the outcome.
-
-        Args:
-            slots: the fields of the slots, each ``[S, ...]``.
-            index: which slot.
-        """
+        """Run the option in one slot, of fields ``[S, ...]``, to its end and write the outcome."""
         option = int(slots["option"][index])
         observation, generator = self.begin(slots, index)
         if self._begun is not None:
@@ -216,15 +211,9 @@ class OptionRun(ABC):
 
 
 class GymRun(OptionRun):
-    """Runs options in a Gymnasium env, whose state a snapshot stores.
+    """Runs options in a Gymnasium env, whose state a snapshot stores; arguments as of OptionPool.
 
-    Args:
-        env: an id, or a function that makes the env.
-        keywords: of ``gymnasium.make``, or the function.
-        snapshot, cap: as in :func:`snapshot_of`.
-        worker, max_steps, gamma: as in :class:`OptionPool`.
-        redrawing: whether the env's own generators begin every option with new draws.
-        features: as in :class:`OptionPool`.
+    With ``redrawing`` the env's own generators begin every option with new draws.
     """
 
     def __init__(

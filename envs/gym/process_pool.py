@@ -40,13 +40,7 @@ class PendingStep:
 
 
 class ProcessPool(EnvBase):
-    """What all pools share: slots, tickets, processes, threads, copies and specs.
-
-    Args:
-        run: runs options in the calling process, and tells the processes how.
-        num_processes, determinised, start_method, step_seconds, batch_size, seed: as in
-            :class:`OptionPool`.
-    """
+    """What all pools share: slots, tickets, processes, threads, copies and specs."""
 
     batch_locked = False
     _supports_set_state = True
@@ -239,40 +233,37 @@ class ProcessPool(EnvBase):
             ValueError: if an option does not exist.
         """
         with self._turn():
-            return self._begin_step(tensordict)
-
-    def _begin_step(self, tensordict: TensorDictBase) -> PendingStep:
-        rows = self._rows(tensordict)
-        options = _array(tensordict.get("option")).reshape(-1)
-        count = len(options)
-        if count and not (0 <= options.min() and options.max() < self.num_options):
-            bad = int(options.min()) if options.min() < 0 else int(options.max())
-            raise ValueError(
-                f"Option {bad} does not exist: the worker's are 0 to {self.num_options - 1}."
-            )
-        seeds = np.full(count, self._key)
-        if not self.determinised:
-            seeds = (self._key + self._num_calls + np.arange(count)) & np.iinfo(np.int64).max
-            self._num_calls += count
-        inputs = {f"before {key}": value for key, value in rows.items()}
-        inputs.update(option=options, seed=seeds)
-        ticket, begin = PendingStep(self, tensordict), 0
-        self._under_way.append(ticket)
-        try:
-            while begin < count:
-                self._make_room(min(count - begin, NUM_SLOTS))
-                slots = self._free[: count - begin]
-                part = slice(begin, begin + len(slots))
-                for name, values in inputs.items():
-                    self._fields[name][slots] = values[part]
-                del self._free[: len(slots)]
-                ticket.slots = slots
-                self._submit(slots)
-                begin = part.stop
-        except BaseException:
-            self.step_abandon(ticket)
-            raise
-        return ticket
+            rows = self._rows(tensordict)
+            options = _array(tensordict.get("option")).reshape(-1)
+            count = len(options)
+            if count and not (0 <= options.min() and options.max() < self.num_options):
+                bad = int(options.min()) if options.min() < 0 else int(options.max())
+                raise ValueError(
+                    f"Option {bad} does not exist: the worker's are 0 to {self.num_options - 1}."
+                )
+            seeds = np.full(count, self._key)
+            if not self.determinised:
+                seeds = (self._key + self._num_calls + np.arange(count)) & np.iinfo(np.int64).max
+                self._num_calls += count
+            inputs = {f"before {key}": value for key, value in rows.items()}
+            inputs.update(option=options, seed=seeds)
+            ticket, begin = PendingStep(self, tensordict), 0
+            self._under_way.append(ticket)
+            try:
+                while begin < count:
+                    self._make_room(min(count - begin, NUM_SLOTS))
+                    slots = self._free[: count - begin]
+                    part = slice(begin, begin + len(slots))
+                    for name, values in inputs.items():
+                        self._fields[name][slots] = values[part]
+                    del self._free[: len(slots)]
+                    ticket.slots = slots
+                    self._submit(slots)
+                    begin = part.stop
+            except BaseException:
+                self.step_abandon(ticket)
+                raise
+            return ticket
 
     def step_wait(self, ticket: PendingStep) -> TensorDictBase:
         """Wait for a step that was begun and return what it writes as next.
@@ -290,29 +281,26 @@ class ProcessPool(EnvBase):
                 "This step was begun by another pool; wait for it there, in ticket.pool."
             )
         with self._turn():
-            return self._end_step(ticket)
-
-    def _end_step(self, ticket: PendingStep) -> TensorDictBase:
-        if ticket.used or ticket not in self._under_way:
-            raise RuntimeError(
-                "The outcome of this step was returned or dropped before. Call step_async to take "
-                "another step."
-            )
-        try:
-            self._settle(ticket)
-        finally:
-            self._forget(ticket)
-        fields, *further = ticket.done
-        if further:
-            fields = {name: np.concatenate([p[name] for p in ticket.done]) for name in fields}
-        out = self._entries_in(fields)
-        for key in ("reward", "terminated", "truncated"):
-            out[key] = fields[key]
-        out["done"] = out["terminated"] | out["truncated"]
-        result = self._observed(out, ticket.tensordict.batch_size)
-        if self.on_step is not None:
-            self.on_step(ticket.tensordict, result)
-        return result
+            if ticket.used or ticket not in self._under_way:
+                raise RuntimeError(
+                    "The outcome of this step was returned or dropped before. Call step_async to "
+                    "take another step."
+                )
+            try:
+                self._settle(ticket)
+            finally:
+                self._forget(ticket)
+            fields, *further = ticket.done
+            if further:
+                fields = {name: np.concatenate([p[name] for p in ticket.done]) for name in fields}
+            out = self._entries_in(fields)
+            for key in ("reward", "terminated", "truncated"):
+                out[key] = fields[key]
+            out["done"] = out["terminated"] | out["truncated"]
+            result = self._observed(out, ticket.tensordict.batch_size)
+            if self.on_step is not None:
+                self.on_step(ticket.tensordict, result)
+            return result
 
     def step_abandon(self, ticket: PendingStep) -> None:
         """Give up a step that was begun: its outcome, or error, is dropped.

@@ -101,21 +101,9 @@ class OptionProcesses:
 
     A process that dies, by a signal or a crash of the env, costs what was under way: all processes
     are started again, and the options without an outcome run again. So does a process that is
-    stopped or hangs. An error that is raised in a process, e.g. by the worker, is raised here.
-
-    Args:
-        owner: name of the pool, for messages.
-        num_processes: P.
-        run: built in each process from its arguments; what these share (tensors in shared memory)
-            stays shared.
-        start_method: ``"forkserver"`` or ``"spawn"``.
-        step_seconds: longest time in which no process takes a step of its env, or uses any
-            processor time, while options are waited for. Processes that compute without a step may
-            do so ten times as long, and two minutes at least.
-
-    Raises:
-        OSError: if there is too little shared memory, or a process cannot be started.
-        RuntimeError: in :meth:`wait`, if the worker fails or processes die again and again.
+    stopped or hangs: that takes no step and uses no processor time for ``step_seconds``, or
+    computes without a step for ten times as long, and two minutes at least. An error that is raised
+    in a process, e.g. by the worker, is raised here.
     """
 
     def __init__(

@@ -26,9 +26,6 @@ def quick_step(env: gymnasium.Env) -> Step | None:
     """Return what steps a point maze as its env does, to the bit; None for other envs.
 
     Time limits are not kept, and the info tells of a success and nothing else.
-
-    Args:
-        env: with its wrappers. Tasks of a look are kept; others than Gymnasium's are not known.
     """
     task: TaskEnv | None = None
     layer: Any = env

@@ -35,16 +35,11 @@ _PACKAGES = ("gymnasium_robotics", "minigrid", "ogbench", "ale_py")
 
 
 class PrivateRandom(gymnasium.Wrapper):
-    """Gives an env that draws from the global generators of NumPy and Python its own states of
-    them.
+    """Gives an env that draws from NumPy's and Python's global generators its own states of them.
 
     ``reset(seed=...)`` does not fix such an env, and other draws change it. This wrapper restores
     the global generators after every reset and step, and after a ``with`` block of it. Many steps
     in one block save the time of exchanging states, 0.2 ms each.
-
-    Args:
-        env (gymnasium.Env): e.g. a maze of OGBench, which draws starts, goals and teleports from
-        them.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:

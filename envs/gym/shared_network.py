@@ -17,17 +17,7 @@ from torchrl_hmcts.processes import share
 
 
 class SharedNetwork:
-    """The weights of a ``SkillMLP`` in shared memory, in the order in which they are used.
-
-    Args:
-        num_inputs: features.
-        num_outputs: O.
-        num_heads: Z.
-        hidden: widths of the shared layers.
-
-    Raises:
-        OSError: if there is too little shared memory.
-    """
+    """The weights of a ``SkillMLP`` with Z heads in shared memory, in the order of their use."""
 
     def __init__(
         self,
@@ -61,27 +51,16 @@ class SharedNetwork:
         self._prepare()
 
     def load(self, parameters: Iterable[Tensor]) -> None:
-        """Take over the weights of a network, in the processes too.
+        """Take over the parameters of a ``SkillMLP`` of the same sizes, in the processes too.
 
-        Args:
-            parameters: weight ``[out, in]`` and bias ``[out]`` of each shared layer, then of the
-                heads, ``[Z * O, H]`` and ``[Z * O]``: the parameters of a ``SkillMLP``.
-
-        Raises:
-            ValueError: if their shapes are others.
+        They are weight ``[out, in]`` and bias ``[out]`` of each shared layer, then of the heads,
+        ``[Z * O, H]`` and ``[Z * O]``.
         """
         for view, parameter in self._pairs(parameters):
             view.copy_(parameter.detach().view_as(view))
 
     def store(self, parameters: Iterable[Tensor]) -> None:
-        """Write the weights into a network, the inverse of :meth:`load`.
-
-        Args:
-            parameters: of a ``SkillMLP`` of the same sizes, overwritten.
-
-        Raises:
-            ValueError: if their shapes are others.
-        """
+        """Overwrite the parameters of a ``SkillMLP``, the inverse of :meth:`load`."""
         for view, parameter in self._pairs(parameters):
             parameter.detach().view_as(view).copy_(view)
 

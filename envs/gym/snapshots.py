@@ -64,9 +64,6 @@ class Snapshot(ABC):
         ...     width = 4 * 8
         ...     def __init__(self, env):
         ...         self.inner = env.unwrapped
-        ...     @classmethod
-        ...     def fits(cls, env):
-        ...         return type(env.unwrapped).__name__ == "AcrobotEnv"
         ...     def read(self):
         ...         return np.array(self.inner.state, np.float64).view(np.uint8)
         ...     def restore(self, row):
@@ -78,9 +75,9 @@ class Snapshot(ABC):
     width: int
 
     @classmethod
-    @abstractmethod
     def fits(cls, env: gymnasium.Env) -> bool:
         """Return whether this kind of snapshot stores such an env."""
+        return True
 
     @abstractmethod
     def read(self) -> np.ndarray:
@@ -88,46 +85,22 @@ class Snapshot(ABC):
 
     @abstractmethod
     def restore(self, row: np.ndarray) -> None:
-        """Put the env into a state.
-
-        Args:
-            row (ndarray): uint8 ``[width]``, as :meth:`read` returned it.
-        """
+        """Put the env into a state, uint8 ``[width]``, as :meth:`read` returned it."""
 
     def note_reset(self, seed: int | None) -> None:  # noqa: B027  most kinds need no note
-        """Take note that the env is about to be reset; whoever resets it calls this first.
-
-        Args:
-            seed (int, optional): of the reset.
-        """
+        """Take note that the env is about to be reset; whoever resets it calls this first."""
 
     def note_step(self, action: Any) -> None:  # noqa: B027
-        """Take note that the env is about to take a step; whoever steps it calls this first.
-
-        Args:
-            action: of the step.
-        """
+        """Take note that the env is about to take a step; whoever steps it calls this first."""
 
     def note_redraw(self, seed: int) -> None:  # noqa: B027
-        """Take note that the generators were given other numbers; whoever redraws calls this.
-
-        Args:
-            seed: as of :func:`redraw`.
-        """
+        """Take note that :func:`redraw` gave the generators other numbers, of this seed."""
 
 
 def env_layers(env: gymnasium.Env) -> list[gymnasium.Env]:
     """Return the wrappers from the outside, the env itself, and envs that it holds as attributes.
 
     Wrappers with a class attribute ``is_stateless = True`` are left out: they hold no state.
-
-    Args:
-        env (gymnasium.Env): any env.
-
-    Example:
-        >>> import gymnasium
-        >>> [type(layer).__name__ for layer in env_layers(gymnasium.make("CartPole-v1"))]
-        ['TimeLimit', 'OrderEnforcing', 'PassiveEnvChecker', 'CartPoleEnv']
     """
     layers: list[gymnasium.Env] = []
     waiting = [env]
@@ -157,21 +130,12 @@ def _held_by(layer: Any) -> list[gymnasium.Env]:
 
 
 def time_limits(env: gymnasium.Env) -> list[Any]:
-    """Return the wrappers of an env that count its steps, from the outside.
-
-    Args:
-        env (gymnasium.Env): any env.
-    """
+    """Return the wrappers of an env that count its steps, from the outside."""
     return [layer for layer in env_layers(env) if type(layer) is TimeLimit]
 
 
 def redraw(layers: Sequence[gymnasium.Env], seed: int) -> None:
-    """Give all generators of an env other numbers.
-
-    Args:
-        layers: of :func:`env_layers`.
-        seed: of the numbers.
-    """
+    """Give all generators of the :func:`env_layers` other numbers."""
     for number, layer in enumerate(layers):
         generator = getattr(layer, "_np_random", None)
         if generator is not None and type(generator.bit_generator) is np.random.PCG64:
@@ -207,10 +171,6 @@ class ReplaySnapshot(Snapshot):
         SnapshotError: if an action has another size than the action space, or an episode is
             longer.
     """
-
-    @classmethod
-    def fits(cls, env: gymnasium.Env) -> bool:
-        return True
 
     def __init__(self, env: gymnasium.Env, *, max_steps: int | None = None) -> None:
         self.env = env
@@ -263,7 +223,9 @@ class ReplaySnapshot(Snapshot):
         redraws = np.frombuffer(taken[: 8 * steps], np.uint64).tolist()
         actions = list(np.frombuffer(taken[8 * steps :], self._dtype).reshape(steps, *self._shape))
         known = len(self._actions)
-        on_the_way = self._redraws == redraws[:known] and _same(self._actions, actions)
+        on_the_way = self._redraws == redraws[:known] and all(
+            map(np.array_equal, self._actions, actions)
+        )
         if seed != self._seed or self._redraw or not on_the_way:
             self.note_reset(seed)
             self.env.reset(seed=seed)
@@ -272,28 +234,15 @@ class ReplaySnapshot(Snapshot):
         for again, action in zip(redraws[known:], actions[known:], strict=True):
             if again:
                 redraw(self._layers, again)
-            self.env.step(self._plain(action))
-
-    def _plain(self, action: np.ndarray) -> Any:
-        return action if self._shape else action[()]
-
-
-def _same(taken: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(taken, other, strict=False))
+            self.env.step(action if self._shape else action[()])
 
 
 class FunctionSnapshot(Snapshot):
     """Stores what two functions of yours read and restore.
 
-    Args:
-        env (gymnasium.Env): the env with its wrappers.
-        read (callable): ``read(env) -> bytes`` or an array, the same size every time.
-        restore (callable): ``restore(env, row)`` with uint8 ``[width]``.
+    ``read(env)`` gives bytes or an array, of one size every time; ``restore(env, row)`` takes uint8
+    ``[width]``.
     """
-
-    @classmethod
-    def fits(cls, env: gymnasium.Env) -> bool:
-        return False
 
     def __init__(
         self,

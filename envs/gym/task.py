@@ -30,14 +30,8 @@ class TaskEnv(gymnasium.Wrapper):
 
     A task of kind ``"goal"`` pays 1 for a success and nothing else, and a success ends the episode.
     A success is ``info["success"]`` or ``info["is_success"]`` where the env has one of them, else
-    an end that pays more than 0, or, where every step costs, no more than a step. A task of kind
-    ``"return"`` pays :math:`(r + \text{shift}) \cdot \text{scale}`.
-
-    Args:
-        env (gymnasium.Env): any env.
-        kind ("goal" or "return"): of the task.
-        step_reward (float): least reward of a step that does not end the episode.
-        shift, scale (float): see above.
+    an end that pays more than 0, or, where every step costs, no more than ``step_reward``, the
+    least of a step. A task of kind ``"return"`` pays :math:`(r + \text{shift}) \cdot \text{scale}`.
     """
 
     is_stateless = True
@@ -68,11 +62,7 @@ class TaskEnv(gymnasium.Wrapper):
         return observation, float(solved), terminated or solved, truncated, info
 
     def is_success(self, reward: Any, terminated: bool, info: dict[str, Any]) -> bool:
-        """Return whether a step solved a task of kind ``"goal"``.
-
-        Args:
-            reward, terminated, info: of the step.
-        """
+        """Return whether a step solved a task of kind ``"goal"``."""
         for name in _SUCCESS:
             if name in info:
                 return bool(info[name])
@@ -84,17 +74,7 @@ def fixed_actions(space: gymnasium.Space) -> list[Any]:
     """Return actions that options may repeat: all of them, or directions within bounds.
 
     Of a box of one dimension its ends and its middle, of two dimensions eight directions, of more
-    both ends of each axis.
-
-    Args:
-        space: of the actions.
-
-    Raises:
-        ValueError: if there are too many to plan over.
-
-    Example:
-        >>> fixed_actions(spaces.Box(-1, 1, (1,)))
-        [array([-1.], dtype=float32), array([0.], dtype=float32), array([1.], dtype=float32)]
+    both ends of each axis. A ValueError where there are too many to plan over.
     """
     found: list[Any] = []
     if isinstance(space, spaces.Discrete):
@@ -154,11 +134,7 @@ class Look:
     steps: int
 
     def task(self, env: gymnasium.Env) -> TaskEnv:
-        """Return the env as the task that was found.
-
-        Args:
-            env: made in the same way as that which was looked at.
-        """
+        """Return the env as the task that was found."""
         return TaskEnv(
             env, self.kind, step_reward=self.step_reward, shift=self.shift, scale=self.scale
         )
@@ -180,19 +156,10 @@ def look_at(
     seed: int = 0,
     **keywords: Any,
 ) -> Look:
-    """Play an env for about two thousand steps and return what suits it.
+    """Play an env, an id or what makes it, for about two thousand steps; return what suits it.
 
-    Args:
-        env: an id, or a function that makes the env.
-        features: what says where the env is. Default: :func:`features_of` it; an observation's
-            numbers are brought to equal spans.
-        gamma: discount per base step.
-        seed: of the look.
-        **keywords: of ``gymnasium.make``.
-
-    Example:
-        >>> look_at("MountainCar-v0").kind
-        'goal'
+    The ``features`` say where the env is; by default those of :func:`features_of`. An observation's
+    numbers are brought to equal spans.
     """
     made = make_gym(env, **keywords)
     chosen = features_of(made) if features is None else features

@@ -77,9 +77,6 @@ class FeatureGoal:
         raising, lowering: actions that raise the feature and lower it.
         dead_zone: the goal is reached where :math:`|x_c - v|` is at most this.
 
-    Reference:
-        This project's; goals of a worker as in chapter 3 of the dissertation.
-
     Example:
         >>> import numpy as np
         >>> from torchrl_hmcts.envs import FeatureGoal
@@ -115,9 +112,6 @@ class FollowGoals:
     Raises:
         ValueError: if there is no goal.
 
-    Reference:
-        This project's; goals of a worker as in chapter 3 of the dissertation.
-
     Example:
         >>> from torchrl_hmcts.envs import ByteGoal, FollowGoals
         >>> FollowGoals([ByteGoal(72, 99, o, 2, 3) for o in (-12, 0, 12)]).num_options
@@ -140,6 +134,15 @@ class FollowGoals:
         return False if reached is None else bool(reached(observation))
 
 
+def _begin(worker: Any, observation: Any, option: int) -> None:
+    if hasattr(worker, "begin"):
+        worker.begin(observation, option)
+
+
+def _ends(worker: Any, observation: Any, option: int, steps: int) -> bool:
+    return hasattr(worker, "ends") and bool(worker.ends(observation, option, steps))
+
+
 class OccasionalAction:
     """Another worker's options, sometimes interrupted by one action.
 
@@ -152,9 +155,6 @@ class OccasionalAction:
 
     Raises:
         ValueError: if the probability is not from 0 to 1.
-
-    Reference:
-        This project's.
 
     Example:
         >>> import numpy as np
@@ -181,14 +181,11 @@ class OccasionalAction:
 
     def begin(self, observation: Any, option: int) -> None:
         """Tell the worker that an option begins."""
-        begin: Any = getattr(self.worker, "begin", None)
-        if begin is not None:
-            begin(observation, option)
+        _begin(self.worker, observation, option)
 
     def ends(self, observation: Any, option: int, steps: int) -> bool:
         """Return whether the worker ends the option; never, if it cannot."""
-        ends: Any = getattr(self.worker, "ends", None)
-        return False if ends is None else bool(ends(observation, option, steps))
+        return _ends(self.worker, observation, option, steps)
 
 
 class JoinedWorkers:
@@ -199,9 +196,6 @@ class JoinedWorkers:
 
     Raises:
         ValueError: if there is no worker.
-
-    Reference:
-        This project's.
 
     Example:
         >>> from torchrl_hmcts.envs import JoinedWorkers, RepeatActions
@@ -225,12 +219,9 @@ class JoinedWorkers:
     def begin(self, observation: Any, option: int) -> None:
         """Tell the worker whose option it is that it begins."""
         worker, own = self._whose[option]
-        begin: Any = getattr(worker, "begin", None)
-        if begin is not None:
-            begin(observation, own)
+        _begin(worker, observation, own)
 
     def ends(self, observation: Any, option: int, steps: int) -> bool:
         """Return whether the worker whose option it is ends it; never, if it cannot."""
         worker, own = self._whose[option]
-        ends: Any = getattr(worker, "ends", None)
-        return False if ends is None else bool(ends(observation, own, steps))
+        return _ends(worker, observation, own, steps)

@@ -17,10 +17,10 @@ from torch import Tensor
 from torchrl.data import Unbounded, UnboundedDiscrete
 from torchrl.envs import EnvBase
 
-from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 from torchrl_hmcts.envs.lab.kernels import APPLES, FRAME, GOAL_MET, SPAWN_HEADING
 from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
 from torchrl_hmcts.envs.lab.read_outs import READ_OUTS
+from torchrl_hmcts.envs.lab.states import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 
 _MODULE = "deepmind_lab"
 _NUMBERS = ("uint8", "int32", "int64", "float32", "float64")
@@ -97,7 +97,16 @@ class DeepMindLabEnv(EnvBase):
             raise ValueError(
                 f"DeepMindLabEnv needs maze_seeds, each 0 to 2**31 - 1; got {list(maze_seeds)}."
             )
-        module = _import_engine()
+        try:
+            module: Any = importlib.import_module(_MODULE)
+        except ImportError as error:
+            raise ImportError(
+                f"DeepMindLabEnv needs the module {_MODULE!r}, which is not installed ({error}). "
+                "No package index has it with the engine inside: build it with Bazel from "
+                "https://github.com/google-deepmind/lab (docs/users/build.md there), or with the "
+                "tool of the package dmlab-gym (`dmlab-gym build`, needs Docker or Podman). "
+                "LabMazeEnv simulates the same level without it."
+            ) from error
         super().__init__(batch_size=torch.Size(()))
         self.maze_seeds = tuple(int(s) for s in maze_seeds)
         self.model = LabMazeEnv(
@@ -136,27 +145,16 @@ class DeepMindLabEnv(EnvBase):
                 f"The engine has no observations {missing}; it has {sorted(offered)}. Check the "
                 f"names in `observations`, or that the level includes the debug observations."
             )
-        action_names = [str(entry["name"]) for entry in self._lab.action_spec()]
-        if action_names != list(NATIVE_ACTIONS):
-            raise ValueError(
-                f"DeepMindLabEnv knows the actions {list(NATIVE_ACTIONS)}; this engine has "
-                f"{action_names}."
-            )
         model = self.model
         observation = model.observation_spec.clone()
-        taken = set(observation.keys())
         for name, key in self._extra.items():
-            if key in taken:
-                raise ValueError(
-                    f"The observation {name} cannot be written under {key!r}, which is taken. "
-                    f"Choose another key."
-                )
             dtype = _TYPES.get(np.dtype(offered[name]["dtype"]))
             shape = tuple(int(n) for n in offered[name]["shape"])
-            if dtype is None or 0 in shape:
+            if key in model.observation_spec.keys() or dtype is None or 0 in shape:
                 raise ValueError(
-                    f"The observation {name} has the type {offered[name]['dtype']} and the shape "
-                    f"{shape}; numbers of a fixed shape are needed."
+                    f"The observation {name}, of type {offered[name]['dtype']} and shape {shape}, "
+                    f"cannot be written under {key!r}: the key must be free, and numbers of a "
+                    "fixed shape are needed."
                 )
             spec = Unbounded if dtype.is_floating_point else UnboundedDiscrete
             observation[key] = spec(shape, dtype=dtype)
@@ -291,16 +289,3 @@ class DeepMindLabEnv(EnvBase):
 
 def _floats(values: Any) -> Tensor:
     return torch.tensor(np.asarray(values), dtype=torch.float32)
-
-
-def _import_engine() -> Any:
-    try:
-        return importlib.import_module(_MODULE)
-    except ImportError as error:
-        raise ImportError(
-            f"DeepMindLabEnv needs the module {_MODULE!r}, which is not installed ({error}). No "
-            f"package index has it with the engine inside: build it with Bazel from "
-            f"https://github.com/google-deepmind/lab (docs/users/build.md there), or with the tool "
-            f"of the package dmlab-gym (`dmlab-gym build`, needs Docker or Podman). LabMazeEnv "
-            f"simulates the same level without it."
-        ) from error

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torchrl_hmcts.compiling import njit
 from torchrl_hmcts.envs.lab.kernels import APPLES, SPAWN_HEADING
 from torchrl_hmcts.envs.lab.maze_env import LabMazeEnv
-from torchrl_hmcts.envs.lab.view import heading_degrees
+from torchrl_hmcts.envs.lab.states import heading_degrees
 
 _EYE = 0.51  # height of the eye in cells; the ceiling is at 1
 _APPLE, _GOAL = (120, 0, 40), (90, 230, 40)

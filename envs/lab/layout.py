@@ -19,12 +19,8 @@ _NOWHERE = -1.0e6
 class LabLayout:
     """Mazes of one size as arrays.
 
-    Args:
-        mazes: text maps, each a sequence of R rows of C letters, the north first: ``*`` wall, ``P``
-            spawn, ``G`` goal, ``A`` apple, anything else from ``" "`` is refused.
-
-    Raises:
-        ValueError: if maps differ in size, hold other letters, more than one goal, or no spawn.
+    Text maps are sequences of R rows of C letters, the north first: ``*`` wall, ``P`` spawn, ``G``
+    goal, ``A`` apple, space.
 
     Attributes:
         walls: bool ``[M, R, C]``, the north first, as in the text.
@@ -33,11 +29,6 @@ class LabLayout:
         goal: float32 ``[M, 2]``; far outside where there is none.
         faces: uint8 ``[M, R, C]``, sides of open cells with a wall, as bits, the south first.
         tables: the arguments of the compiled movement.
-
-    Example:
-        >>> layout = LabLayout([["*****", "*P G*", "*****"]])
-        >>> layout.goal.tolist(), layout.spawn.tolist()
-        ([[350.0, 150.0]], [[[150.0, 150.0]]])
     """
 
     def __init__(self, mazes: Sequence[Sequence[str]]) -> None:

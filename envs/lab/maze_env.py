@@ -17,7 +17,6 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical
 
 from torchrl_hmcts.checks import instance, real_number, whole_number
-from torchrl_hmcts.envs.lab.actions import LAB_ACTIONS, NATIVE_ACTIONS, action_table
 from torchrl_hmcts.envs.lab.kernels import (
     APPLES,
     CLOCK,
@@ -32,8 +31,16 @@ from torchrl_hmcts.envs.lab.kernels import (
 from torchrl_hmcts.envs.lab.layout import LabLayout
 from torchrl_hmcts.envs.lab.mazes import lab_maze
 from torchrl_hmcts.envs.lab.read_outs import PAIRS, READ_OUTS, LabReadOuts
-from torchrl_hmcts.envs.lab.states import STATE, TRAILING, check_place, state_specs
-from torchrl_hmcts.envs.lab.view import heading_degrees
+from torchrl_hmcts.envs.lab.states import (
+    LAB_ACTIONS,
+    NATIVE_ACTIONS,
+    STATE,
+    TRAILING,
+    action_table,
+    check_place,
+    heading_degrees,
+    state_specs,
+)
 from torchrl_hmcts.envs.mazes.maze_env import MazeEnv
 from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, draw_goal, draw_maze, draw_walls
 

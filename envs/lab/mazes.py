@@ -8,14 +8,67 @@ from __future__ import annotations
 import torch
 
 from torchrl_hmcts.checks import whole_number
-from torchrl_hmcts.envs.lab.random_numbers import MersenneTwister64
 from torchrl_hmcts.envs.mazes.layouts import shortest_path_lengths
+
+_MASK = (1 << 64) - 1
+_N, _M = 312, 156
+_MATRIX = 0xB5026F5AA96619E9
+_UPPER, _LOWER = 0xFFFFFFFF80000000, 0x7FFFFFFF
 
 WALL, OPEN, APPLE, SPAWN, GOAL = "*", " ", "A", "P", "G"
 OPENING_PROBABILITY = 0.15
 """Chance of each cell inside the border to be opened after the maze is carved."""
 SPAWN_DISTANCE = 5
 """Cells: the player appears farther from the goal than this, apples lie nearer."""
+
+
+class MersenneTwister64:
+    """The 64-bit Mersenne Twister, with uniform integers and reals as libstdc++ draws them.
+
+    Reference:
+        Nishimura, "Tables of 64-bit Mersenne Twisters", 2000; Lemire, "Fast random integer
+        generation in an interval", 2019 (the integers of libstdc++ since gcc 11).
+    """
+
+    def __init__(self, seed: int) -> None:
+        state = [seed]
+        for i in range(1, _N):
+            last = state[-1]
+            state.append((6364136223846793005 * (last ^ (last >> 62)) + i) & _MASK)
+        self._state = state
+        self._index = _N
+
+    def next(self) -> int:
+        """Return the next 64 random bits."""
+        if self._index == _N:
+            self._twist()
+        x = self._state[self._index]
+        self._index += 1
+        x ^= (x >> 29) & 0x5555555555555555
+        x ^= (x << 17) & 0x71D67FFFEDA60000
+        x ^= (x << 37) & 0xFFF7EEE000000000
+        return x ^ (x >> 43)
+
+    def uniform_int(self, low: int, high: int) -> int:
+        """Return a uniform integer from ``low`` to ``high``, both included."""
+        count = high - low + 1
+        product = self.next() * count
+        if product & _MASK < count:
+            threshold = (1 << 64) % count
+            while product & _MASK < threshold:
+                product = self.next() * count
+        return low + (product >> 64)
+
+    def uniform_real(self) -> float:
+        """Return a uniform float in [0, 1)."""
+        return min(self.next() / 18446744073709551616.0, 1.0 - 2.0**-53)
+
+    def _twist(self) -> None:
+        state = self._state
+        for i in range(_N):
+            x = (state[i] & _UPPER) | (state[(i + 1) % _N] & _LOWER)
+            state[i] = state[(i + _M) % _N] ^ (x >> 1) ^ (_MATRIX if x & 1 else 0)
+        self._index = 0
 
 
 def lab_maze(seed: int, rows: int = 9, columns: int = 9, *, mixer_seed: int = 0) -> tuple[str, ...]:

@@ -35,20 +35,7 @@ _REACH = 2  # cells in each direction of "walls_nearby"
 
 
 class LabReadOuts:
-    """Functions of the state, computed for a batch at once.
-
-    Args:
-        layout: the mazes.
-        names: those to write, any of :data:`READ_OUTS`.
-
-    Raises:
-        ValueError: if there is no such read-out, or one is named twice.
-
-    Example:
-        >>> layout = LabLayout([["*****", "*P G*", "*****"]])
-        >>> LabReadOuts(layout, ["goal", "observation"]).sizes
-        {'goal': 2, 'observation': 38}
-    """
+    """Those of the :data:`READ_OUTS` that are named, as functions of a batch of states."""
 
     def __init__(self, layout: LabLayout, names: Sequence[str]) -> None:
         self.names = tuple(names)

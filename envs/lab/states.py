@@ -1,15 +1,18 @@
-"""The state of :class:`LabMazeEnv`: its entries, its bounds, and the check of a state from outside.
+"""States and actions of :class:`LabMazeEnv`: entries, bounds, and checks of what is given.
 
 Letters: *B batch of the tensordict.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, TensorSpec
 
+from torchrl_hmcts.checks import instance
 from torchrl_hmcts.envs.lab.kernels import (
     APPLES,
     CELL,
@@ -24,6 +27,29 @@ from torchrl_hmcts.envs.lab.kernels import (
 )
 from torchrl_hmcts.envs.lab.layout import LabLayout
 
+LAB_ACTIONS: Mapping[str, tuple[int, int, int, int]] = {
+    "forward": (0, 0, 0, 1),
+    "back": (0, 0, 0, -1),
+    "strafe left": (0, 0, -1, 0),
+    "strafe right": (0, 0, 1, 0),
+    "look left": (-20, 0, 0, 0),
+    "look right": (20, 0, 0, 0),
+    "forward and look left": (-20, 0, 0, 1),
+    "forward and look right": (20, 0, 0, 1),
+    "nothing": (0, 0, 0, 0),
+}
+"""The usual discrete actions: look right, look down (pixels per frame), strafe right, forward."""
+
+NATIVE_ACTIONS: Mapping[str, tuple[int, int]] = {
+    "LOOK_LEFT_RIGHT_PIXELS_PER_FRAME": (-512, 512),
+    "LOOK_DOWN_UP_PIXELS_PER_FRAME": (-512, 512),
+    "STRAFE_LEFT_RIGHT": (-1, 1),
+    "MOVE_BACK_FORWARD": (-1, 1),
+    "FIRE": (0, 1),
+    "JUMP": (0, 1),
+    "CROUCH": (0, 1),
+}
+"""The engine's action: lowest and highest value of each of its seven entries, in its order."""
 STATE = ("maze_index", "position", "velocity", "turned", "level")
 TRAILING = {"maze_index": (), "position": (2,), "velocity": (2,), "turned": (2,), "level": (7,)}
 MAX_SPEED = 640.0
@@ -74,3 +100,33 @@ def check_place(layout: LabLayout, position: Tensor, maze: Tensor) -> None:
                 f"the player's centre keeps more than 16 units from walls. Choose e.g. one of "
                 f"env.layout.spawn[maze]."
             )
+
+
+def action_table(actions: Mapping[str, Sequence[int]]) -> np.ndarray:
+    """Return discrete actions as int64 ``[A, 4]``: look right, look down, strafe right, forward."""
+    if not actions:
+        raise ValueError("At least one action is needed; got none. Leave the default LAB_ACTIONS.")
+    bounds = list(NATIVE_ACTIONS.values())[:4]
+    for name, action in actions.items():
+        instance("LabMazeEnv", f"the action {name!r} of actions", action, Sequence)
+        if len(action) != 4 or any(int(x) != x for x in action):
+            raise ValueError(
+                f"The action {name!r} must be four integers (look right, look down, strafe right, "
+                f"move forward); got {tuple(action)}."
+            )
+        if not all(low <= x <= high for x, (low, high) in zip(action, bounds, strict=True)):
+            raise ValueError(
+                f"The action {name!r} = {tuple(action)} is out of range: looks are up to 512 "
+                f"pixels per frame, strafe and move -1, 0 or 1."
+            )
+    return np.array(list(actions.values()), np.int64)
+
+
+def heading_degrees(turned: np.ndarray, spawn_heading: np.ndarray) -> np.ndarray:
+    """Return the heading as the engine reports it, from -180 to 180 in 65,536 steps.
+
+    ``turned`` has the degrees of yaw since the spawn, ``spawn_heading`` has 65,536 to a turn.
+    """
+    units = np.floor(turned * np.float32(65536.0 / 360.0) + np.float32(0.5)).astype(np.int64)
+    units = (units + spawn_heading + 32768) % 65536 - 32768
+    return units * (360.0 / 65536.0)

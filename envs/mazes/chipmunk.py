@@ -45,20 +45,10 @@ class WallSegment(NamedTuple):
 
 
 def wall_segments(maze: npt.NDArray[np.bool_]) -> list[WallSegment]:
-    """Return the faces between free and solid tiles of a maze, merged into maximal segments.
+    """Return the faces between free and solid tiles of ``[H, W]``, merged into maximal segments.
 
     Merged faces have no seams, so a disc that slides along a wall of several tiles meets no corner.
-
-    Args:
-        maze: bool array ``[H, W]``, True where a tile is solid. The outside counts as solid.
-
-    Returns:
-        One :class:`WallSegment` per stretch.
-
-    Example:
-        >>> import numpy as np
-        >>> len(wall_segments(np.zeros((3, 3), dtype=bool)))  # an empty room has four walls
-        4
+    The outside counts as solid.
     """
     solid = np.pad(np.asarray(maze, dtype=bool), 1, constant_values=True)
     segments: list[WallSegment] = []
@@ -93,23 +83,18 @@ def wall_segments(maze: npt.NDArray[np.bool_]) -> list[WallSegment]:
 
 
 class ChipmunkMazes:
-    """Discs under thrust in mazes, as a pure function of position and velocity.
+    r"""Discs under thrust in mazes ``[M, H, W]``, as a pure function of position and velocity.
 
     A call of :meth:`step` sets every disc to the state it is given, advances time by ``time_step``
-    and returns the new states: semi-implicit Euler with the drag of Chipmunk,
+    and returns the new states: semi-implicit Euler with Chipmunk's ``damping`` d, the share of its
+    velocity that a disc keeps after one second without thrust,
 
-    .. math:: x' = x + v\\,dt, \\qquad v' = v\\,d^{dt} + a\\,dt,
+    .. math:: x' = x + v\,dt, \qquad v' = v\,d^{dt} + a\,dt,
 
     followed by Chipmunk's contact impulses with friction and elasticity 0. The depth a disc has
     sunk into a wall is taken back within the same call (a second C step at rest), so that nothing
     Chipmunk keeps between calls changes the next result. Threads take turns, since Chipmunk
     does not hold Python's lock, and a forked process builds a space of its own.
-
-    Args:
-        mazes: bool array ``[M, H, W]``, True where a tile is solid.
-        radius: radius of a disc, tiles.
-        damping: share of its velocity that a disc keeps after one second without thrust.
-        time_step: seconds per call.
 
     Reference:
         Pymunk (Chipmunk2D), ``pymunk.batch``.
@@ -220,30 +205,20 @@ class ChipmunkMazes:
     ) -> tuple[Float32Array, Float32Array]:
         """Advance ``n`` independent discs by one time step.
 
-        Args:
-            maze_index: int64 array ``[n]``.
-            position: float32 array ``[n, 2]``, tiles within the disc's maze.
-            velocity: float32 array ``[n, 2]``, tiles per second.
-            acceleration: float32 array ``[n, 2]``, tiles per second squared.
-
-        Returns:
-            The new ``(position, velocity)``, float32 arrays ``[n, 2]``.
+        Mazes are int64 ``[n]``; positions (tiles within the maze), velocities and accelerations
+        float32 ``[n, 2]``, as are the new positions and velocities that are returned.
         """
         if self._process != os.getpid():  # the space may have been in the middle of a step
             self.__setstate__(self.__getstate__())
+        if not len(maze_index):
+            return position.copy(), velocity.copy()
         with self._lock:
             return self._step(maze_index, position, velocity, acceleration)
 
     def _step(
-        self,
-        maze_index: npt.NDArray[np.int64],
-        position: Float32Array,
-        velocity: Float32Array,
-        acceleration: Float32Array,
+        self, maze_index: Any, position: Any, velocity: Any, acceleration: Any
     ) -> tuple[Float32Array, Float32Array]:
         n = len(maze_index)
-        if n == 0:
-            return position.copy(), velocity.copy()
         if n > self._capacity or n * 4 < self._capacity:
             self._resize(n)
         if not self._built[maze_index].all():

@@ -32,9 +32,6 @@ class MazeItems:
     Raises:
         ValueError: if a number is out of range, or there is neither an apple nor a key.
 
-    Reference:
-        This project's; the dissertation's mazes have no reward but the target's.
-
     Example:
         >>> MazeItems(apples=3, key=True).count
         4
@@ -65,19 +62,10 @@ class MazeItems:
 
 
 class PlacedItems:
-    """The items of many mazes, and how they are taken.
+    """The items of many mazes, and how they are taken within a distance ``touch``.
 
-    Args:
-        items: how many, and their worth.
-        mazes: bool ``[M, H, W]``, equal numbers of walls.
-        touch: distance within which an item is taken, tiles.
-
-    Raises:
-        ValueError: if a maze has too few free tiles.
-
-    Attributes:
-        places: float32 ``[M, K, 2]``, (x, y) in tiles.
-        worth: float32 ``[M, K]``; a key earns nothing.
+    ``places`` are float32 ``[M, K, 2]``, (x, y) in tiles; ``worth`` is float32 ``[M, K]``, 0 for a
+    key.
     """
 
     def __init__(self, items: MazeItems, mazes: Tensor, touch: float) -> None:
@@ -109,16 +97,10 @@ class PlacedItems:
     def take(
         self, maze: np.ndarray, position: np.ndarray, left: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Take what players touch.
+        """Take what players touch: mazes ``[n]``, positions ``[n, 2]``, items left ``[n, K]``.
 
-        Args:
-            maze: int64 ``[n]``.
-            position: float32 ``[n, 2]``.
-            left: bool ``[n, K]``, True where an item still lies.
-
-        Returns:
-            What is left, bool ``[n, K]``; the worth of what was taken, float32 ``[n]``; whether the
-            target is open, bool ``[n]``.
+        Returns what is left, bool ``[n, K]``, the worth of what was taken, float32 ``[n]``, and
+        whether the target is open, bool ``[n]``.
         """
         offset = self.places[maze] - position[:, None]
         offset *= offset

@@ -9,28 +9,103 @@ right, y downwards, both in tiles), so its centre is ``(col + 0.5, row + 0.5)``.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from operator import index
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
-
-from torchrl_hmcts.envs.mazes.pool_cache import pool_cache_path, read_pool, write_pool
-from torchrl_hmcts.envs.mazes.wall_growing import draw_mazes
 
 POOL_SIZE = 2342
 POOL_TRAIN_SIZE = 2000
 LARGE_WALLS = {15: 96, 31: 440}
 """Walls of the larger mazes by their side: the most frequent numbers that the algorithm grows."""
 _LARGE_TRAIN, _LARGE_TEST = 256, 342
-# Changing any of these changes the pool: every published figure rests on it.
-_POOL_SEED = 0
-_POOL_SHA256 = "cba98569ef76344ee619bbfc73b69ce3f545cf2dfba06fde46cb7d988c19d63c"
 
 _DRAWS_PER_CALL = 4096
+
+
+def _grow_walls(
+    num_draws: int, rows: int, cols: int, num_starts: int, walk_steps: int, rng_state: Any
+) -> Any:
+    """Draw mazes with the border included, uint8 [num_draws, rows, cols]; compiled by numba.
+
+    ``rng_state`` (uint64 [1]) is a SplitMix64 state, updated in place. The generator is spelled out
+    so that a seed gives the same mazes with every version of numpy and numba.
+    """
+    grids = np.zeros((num_draws, rows, cols), dtype=np.uint8)
+    neighbours = np.zeros((4, 2), dtype=np.int64)
+    state = rng_state[0]
+    for draw in range(num_draws):
+        grid = grids[draw]
+        grid[0, :] = 1
+        grid[rows - 1, :] = 1
+        grid[:, 0] = 1
+        grid[:, cols - 1] = 1
+        for _ in range(num_starts):
+            # A random even point of the lattice, border included.
+            state = state + np.uint64(0x9E3779B97F4A7C15)
+            bits = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            bits = bits ^ (bits >> np.uint64(31))
+            row = 2 * np.int64((bits >> np.uint64(32)) % np.uint64(rows // 2 + 1))
+            col = 2 * np.int64((bits & np.uint64(0xFFFFFFFF)) % np.uint64(cols // 2 + 1))
+            grid[row, col] = 1
+            for _ in range(walk_steps):
+                count = 0
+                empty = 0
+                for direction in range(4):
+                    next_row = row + (-2 if direction == 0 else 2 if direction == 1 else 0)
+                    next_col = col + (-2 if direction == 2 else 2 if direction == 3 else 0)
+                    if 0 <= next_row < rows and 0 <= next_col < cols:
+                        neighbours[count, 0] = next_row
+                        neighbours[count, 1] = next_col
+                        count += 1
+                        empty += 1 - grid[next_row, next_col]
+                if empty == 0:
+                    break  # walls never vanish: the walk cannot leave this point any more
+                state = state + np.uint64(0x9E3779B97F4A7C15)
+                bits = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+                bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+                bits = bits ^ (bits >> np.uint64(31))
+                choice = np.int64(bits % np.uint64(count))
+                next_row = neighbours[choice, 0]
+                next_col = neighbours[choice, 1]
+                if grid[next_row, next_col] == 0:
+                    grid[next_row, next_col] = 1
+                    grid[(row + next_row) // 2, (col + next_col) // 2] = 1
+                    row = next_row
+                    col = next_col
+    rng_state[0] = state
+    return grids
+
+
+@lru_cache(maxsize=1)
+def _compiled_grow_walls() -> Callable[..., Any]:
+    # numba takes a second to import; only generation needs it, not a pool read from the cache.
+    from torchrl_hmcts.compiling import njit
+
+    return njit()(_grow_walls)
+
+
+def draw_mazes(
+    num_draws: int,
+    height: int,
+    width: int,
+    complexity: float,
+    density: float,
+    rng_state: np.ndarray,
+) -> Tensor:
+    """Draw mazes without any filter, bool [num_draws, H, W]."""
+    # Walls live on the even points of an odd lattice; an even size is cut out of the next odd one.
+    rows, cols = height + 2 + (height + 1) % 2, width + 2 + (width + 1) % 2
+    num_starts = int(density * ((rows // 2) * (cols // 2)))
+    walk_steps = int(complexity * (5 * (rows + cols)))
+    grids = _compiled_grow_walls()(num_draws, rows, cols, num_starts, walk_steps, rng_state)
+    return torch.from_numpy(grids[:, 1 : height + 1, 1 : width + 1].astype(np.bool_))
 
 
 def _free_area_is_connected(mazes: Tensor) -> Tensor:
@@ -146,10 +221,8 @@ def generate_mazes(
 def maze_pool(split: Literal["train", "test", "all"] = "all", size: int = 9) -> Tensor:
     """Return the fixed pool of 2,342 distinct connected 9x9 mazes with 31 walls, or a split of it.
 
-    With ``size`` larger mazes by the same algorithm, 598 of a side. The pool of 9x9 is generated
-    once, in a few seconds, and kept in a user cache folder: ``TORCHRL_HMCTS_CACHE`` if set, else
-    ``torchrl_hmcts`` in ``XDG_CACHE_HOME`` or ``~/.cache``. A missing or damaged file is made
-    again; a folder that cannot be written costs only the repeated generation.
+    With ``size`` larger mazes by the same algorithm, 598 of a side. All are those of
+    :func:`generate_mazes` with seed 0; the pool of 9x9 comes with the package.
 
     Args:
         split (str): ``"train"`` (the first 2,000), ``"test"`` (the other 342) or ``"all"``. Default
@@ -186,34 +259,18 @@ def maze_pool(split: Literal["train", "test", "all"] = "all", size: int = 9) -> 
 @lru_cache(maxsize=len(LARGE_WALLS))
 def _large(size: int) -> Tensor:
     count, walls = _LARGE_TRAIN + _LARGE_TEST, LARGE_WALLS[size]
-    return generate_mazes(count, height=size, width=size, num_walls=walls, seed=_POOL_SEED)
+    return generate_mazes(count, height=size, width=size, num_walls=walls)
 
 
 @lru_cache(maxsize=1)
 def _pool() -> Tensor:
-    path = pool_cache_path(_POOL_SHA256)
-    cached = None if path is None else read_pool(path, (POOL_SIZE, 9, 9), _POOL_SHA256)
-    if cached is not None:
-        return torch.from_numpy(cached)
-    pool = generate_mazes(POOL_SIZE, seed=_POOL_SEED)
-    if path is not None:
-        write_pool(path, pool.numpy())
-    return pool
+    bits = np.fromfile(Path(__file__).with_name("pool.bin"), np.uint8)
+    walls = np.unpackbits(bits, count=POOL_SIZE * 81).astype(np.bool_)
+    return torch.from_numpy(walls.reshape(POOL_SIZE, 9, 9))
 
 
 def check_mazes(mazes: Tensor) -> None:
-    """Raise unless ``mazes`` can serve an environment: equal wall counts, connected free tiles.
-
-    Args:
-        mazes (Tensor): candidate, should be bool ``[M, H, W]`` with M >= 1.
-
-    Raises:
-        ValueError: if it is not a bool tensor of three dimensions, or a maze has another number of
-            walls than the first, fewer than two free tiles, or free tiles that are not connected.
-
-    Example:
-        >>> check_mazes(maze_pool("test"))
-    """
+    """Refuse mazes unless bool ``[M, H, W]``, equal in their wall counts, connected."""
     is_tensor = isinstance(mazes, Tensor)
     if not is_tensor or mazes.dtype != torch.bool or mazes.ndim != 3 or not mazes.numel():
         got = f"{mazes.dtype} {list(mazes.shape)}" if is_tensor else f"a {type(mazes).__name__}"
@@ -311,18 +368,7 @@ def maze_to_text(
 
 
 def wall_centers(mazes: Tensor) -> Tensor:
-    """Return the centres of the wall tiles, (x, y) in tiles, in row-major order.
-
-    Args:
-        mazes (Tensor): bool ``[*B, H, W]`` with the same number K of walls in each.
-
-    Returns:
-        float32 Tensor ``[*B, K, 2]``.
-
-    Example:
-        >>> wall_centers(torch.tensor([[False, True], [True, False]])).tolist()
-        [[1.5, 0.5], [0.5, 1.5]]
-    """
+    """Return the centres (x, y) of the K walls of ``[*B, H, W]``, float32 ``[*B, K, 2]``."""
     rows_cols = mazes.nonzero()[:, -2:].reshape(*mazes.shape[:-2], -1, 2)
     return rows_cols.flip(-1).to(torch.float32) + 0.5
 
@@ -360,12 +406,17 @@ def shortest_path_lengths(maze: Tensor, target: Sequence[int]) -> Tensor:
         >>> shortest_path_lengths(torch.tensor([[False, True], [False, False]]), (0, 0)).tolist()
         [[0, -1], [1, 2]]
     """
-    _check_free_tile(maze, target, "target")
     height, width = maze.shape
+    row, col = int(target[0]), int(target[1])
+    if not (0 <= row < height and 0 <= col < width) or maze[row, col]:
+        raise ValueError(
+            f"The target tile (row, col) = ({row}, {col}) is a wall or outside the "
+            f"{height}x{width} maze. Choose a free tile, e.g. from free_tiles(maze)."
+        )
     free = (~maze).tolist()
     lengths = [[-1] * width for _ in range(height)]
-    queue = deque([(int(target[0]), int(target[1]))])
-    lengths[queue[0][0]][queue[0][1]] = 0
+    queue = deque([(row, col)])
+    lengths[row][col] = 0
     while queue:
         row, col = queue.popleft()
         for r, c in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)):
@@ -373,52 +424,3 @@ def shortest_path_lengths(maze: Tensor, target: Sequence[int]) -> Tensor:
                 lengths[r][c] = lengths[row][col] + 1
                 queue.append((r, c))
     return torch.tensor(lengths)
-
-
-def shortest_path(maze: Tensor, start: Sequence[int], target: Sequence[int]) -> Tensor:
-    """Return the tiles of a shortest path, both ends included; ties go up, down, left, right.
-
-    Args:
-        maze (Tensor): bool ``[H, W]``.
-        start (sequence of int): (row, col) of a free tile.
-        target (sequence of int): (row, col) of a free tile.
-
-    Returns:
-        int64 Tensor ``[L, 2]`` of (row, col); L - 1 moves.
-
-    Raises:
-        ValueError: if an end is a wall or outside the maze, or no path joins them.
-
-    Example:
-        >>> maze, player, target = maze_from_text("P#T\\n...")
-        >>> shortest_path(maze, player, target).tolist()
-        [[0, 0], [1, 0], [1, 1], [1, 2], [0, 2]]
-    """
-    _check_free_tile(maze, start, "start")
-    lengths = shortest_path_lengths(maze, target).tolist()
-    row, col = int(start[0]), int(start[1])
-    if lengths[row][col] < 0:
-        raise ValueError(
-            f"No path joins start {tuple(start)} and target {tuple(target)} in the maze\n"
-            f"{maze_to_text(maze, start, target)}\nOpen a wall, or choose ends in one free area."
-        )
-    path = [(row, col)]
-    while lengths[row][col]:
-        row, col = next(
-            (r, c)
-            for r, c in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1))
-            if 0 <= r < len(lengths)
-            and 0 <= c < len(lengths[0])
-            and lengths[r][c] == lengths[row][col] - 1
-        )
-        path.append((row, col))
-    return torch.tensor(path)
-
-
-def _check_free_tile(maze: Tensor, tile: Sequence[int], name: str) -> None:
-    row, col = int(tile[0]), int(tile[1])
-    if not (0 <= row < maze.shape[0] and 0 <= col < maze.shape[1]) or maze[row, col]:
-        raise ValueError(
-            f"The {name} tile (row, col) = ({row}, {col}) is a wall or outside the "
-            f"{maze.shape[0]}x{maze.shape[1]} maze. Choose a free tile, e.g. from free_tiles(maze)."
-        )

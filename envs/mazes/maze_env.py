@@ -156,13 +156,7 @@ class MazeEnv(EnvBase):
 
     @abstractmethod
     def draw_map(self, axes: Any, tensordict: TensorDictBase) -> None:
-        """Draw walls and target of a state in axes of matplotlib, in the units of ``"position"``.
-
-        Args:
-            axes: to draw in.
-            tensordict (TensorDictBase): state without batch dimensions; of its entries
-                ``"maze_index"`` is needed.
-        """
+        """Draw walls and target of a state in matplotlib axes, in the units of ``"position"``."""
 
     def _repr_html_(self) -> str:
         first = TensorDict({"maze_index": torch.tensor(0)})
@@ -185,14 +179,7 @@ def _limits(spec: TensorSpec) -> tuple[torch.dtype, list[int], Tensor, Tensor]:
 
 
 class TileMazeEnv(MazeEnv):
-    """A maze of tiles with a player and a target, one of many in a tensor.
-
-    Args:
-        mazes: bool ``[M, H, W]``; None: the training split of the pool.
-        max_steps: of an episode.
-        observation: whether ``"observation"`` is written.
-        batch_size, device: of the env.
-    """
+    """A maze of tiles with a player and a target, one of many in a tensor."""
 
     tables: tuple[str, ...] = ("mazes", "_wall_centers", "_free_tiles")
     """Tensors that move with the env."""

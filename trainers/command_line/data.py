@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, Failure, printing, told
 from torchrl_hmcts.trainers.command_line.words import only_words
-from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
+from torchrl_hmcts.trainers.experiments.ogbench.config import split_name
 from torchrl_hmcts.trainers.runs.config import home, need_package, read_value
 
 _KEYS = ("id", "out", "seed", "episodes", "walker")

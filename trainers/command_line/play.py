@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torchrl_hmcts.trainers.command_line.running import WRONG_WORDS, printing, told
 from torchrl_hmcts.trainers.command_line.words import only_words
@@ -15,7 +16,8 @@ from torchrl_hmcts.trainers.runs.config import home, read_value
 if TYPE_CHECKING:
     from torchrl_hmcts.trainers.agent import HMCTS, Solution
 
-_KEYS = ("run", "seed", "out")
+_CHANGES = (("seed", "int"), ("ratio", "float"))  # of an Atari run
+_KEYS = ("run", "seed", "out", "ratio")
 
 
 def play(words: Sequence[str]) -> int:
@@ -34,6 +36,17 @@ def play(words: Sequence[str]) -> int:
         from torchrl_hmcts.trainers.runs.console import alive, say
 
         with alive():
+            if (atari := _atari_config(own)) is not None:
+                from torchrl_hmcts.trainers.experiments.atari.run import show_atari
+
+                if out.endswith(".mp4"):
+                    raise ValueError(f"out of an Atari run is a film FILE.gif; got {out!r}.")
+                film = Path(out or Path(home(own["run"])) / "play.gif")
+                print(show_atari(atari, film))
+                print(f"Film: {film}")
+                return 0
+            if "ratio" in own:
+                raise ValueError("ratio is a key of Atari runs: simulated base steps per real one.")
             agent = HMCTS.load(home(own["run"]))
             print(agent)
             say("Planning and acting ...")
@@ -49,6 +62,18 @@ def play(words: Sequence[str]) -> int:
                 print(solution)
                 print(f"Page: {_write_page(agent, solution, folder, seed)}")
     return 0
+
+
+def _atari_config(own: dict[str, str]) -> Any:
+    """Return the configuration of an Atari run with the changes of the command, else None."""
+    from torchrl_hmcts.trainers.experiments.registry import load_config
+    from torchrl_hmcts.trainers.saving.run_folder import read_run
+
+    experiment, config = load_config(read_run(home(own["run"])))
+    if experiment.name != "atari":
+        return None
+    changes = {key: read_value(key, own[key], kind) for key, kind in _CHANGES if key in own}
+    return replace(config, resume=False, **changes)
 
 
 def _has_display() -> bool:

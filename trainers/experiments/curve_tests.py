@@ -27,14 +27,10 @@ def curve_budget(config: SkillsConfig) -> dict[str, int]:
 class CurveTests:
     """Tries the worker in held-out mazes while a trainer trains it, for Figure 4.10.
 
-    Random numbers of the training are not touched. The networks that solved the most mazes are
-    kept, of several the latest: skills keep changing, and the last ones need not be the best. Those
-    of the test before the training are never kept: they are no learned skills.
-
-    Args:
-        trainer: whose loss has the actor.
-        kit: of the experiment.
-        interval: base steps between two tests; there is one before and one after the training.
+    There is a test before and after the training, and every ``interval`` base steps. Random numbers
+    of the training are not touched. The networks that solved the most mazes are kept, of several
+    the latest: skills keep changing, and the last ones need not be the best. Those of the test
+    before the training are never kept: they are no learned skills.
     """
 
     def __init__(self, trainer: OffPolicyTrainer, kit: Kit, interval: int) -> None:

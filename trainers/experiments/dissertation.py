@@ -40,10 +40,6 @@ class DissertationFigure:
 
     ``draws`` names a function ``draw(figure, sources, path) -> caption`` of the module
     ``dissertation_figures``; it raises :class:`MissingData` if it lacks something.
-
-    Example:
-        >>> find_figure("3.6").data
-        'docs/results/goals/goal_agent.json, or runs of waterworld_goals and waterworld_a3c'
     """
 
     name: str  # its number, or "table5.1"

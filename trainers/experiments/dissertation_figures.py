@@ -26,7 +26,7 @@ from torchrl_hmcts.trainers.experiments.kits.waterworld import make_starts
 from torchrl_hmcts.trainers.experiments.registry import load_config, recognise
 from torchrl_hmcts.trainers.experiments.settings import LabMazeConfig
 from torchrl_hmcts.trainers.experiments.skills import make_loss
-from torchrl_hmcts.trainers.experiments.waterworld.episodes import run_goal_episodes
+from torchrl_hmcts.trainers.experiments.waterworld.episodes import play_mazes
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
     make_goal_env,
     make_tile_planner,
@@ -127,8 +127,8 @@ def draw_goals(figure: DissertationFigure, sources: Sources, path: Path) -> str:
     else:
         env = make_goal_env(maze_pool("test"), observation=False)
     starts = make_starts(env.base_env, _MAZES, seed=0)
-    episodes = run_goal_episodes(env, worker, starts, record=True)
-    order = episodes.base_steps.argsort()
+    episodes = play_mazes(worker, env, starts, deterministic=True, record=True)
+    order = episodes.base_steps.numpy().argsort()
     shown = int(order[int(0.85 * (len(order) - 1))])
     plot_goals(env.base_env, starts[shown], episodes.tracks[shown], path)
     return f"An episode of {whose} in a test maze: the goals (red) that are still to be met."

@@ -25,7 +25,6 @@ from torchrl_hmcts.trainers.experiments.settings import WaterworldA3CConfig, Wat
 from torchrl_hmcts.trainers.experiments.waterworld.episodes import (
     MazeTest,
     play_mazes,
-    run_goal_episodes,
 )
 from torchrl_hmcts.trainers.experiments.waterworld.goal_planning import (
     make_goal_env,
@@ -47,11 +46,7 @@ _MAX_SPEED, _MAX_DISTANCE = 2.0, 2.0  # tiles a second; tiles from a goal that c
 def run_goals(config: WaterworldA3CConfig) -> dict[str, Any]:
     """Run ``hmcts train experiment=waterworld_goals`` or ``waterworld_a3c``; return its figures.
 
-    Args:
-        config: says which by its class.
-
-    Returns:
-        The figures, as written to ``metrics.json``. Times are in seconds, steps in base steps.
+    Times are in seconds, steps in base steps.
 
     Reference:
         Dissertation, chapter 3.
@@ -141,14 +136,10 @@ def _run(config: WaterworldA3CConfig, run: Run) -> dict[str, Any]:
 
 
 def evaluate_goals(config: WaterworldA3CConfig) -> dict[str, Any]:
-    """Test the agent of a run of chapter 3 in test mazes, with the starts of ``config.seed``.
+    """Test the agent of a run, whose folder is ``out``, with the starts of ``config.seed``.
 
-    Args:
-        config: of the run, whose folder is ``out``; changed keys change the test.
-
-    Returns:
-        Figures with sampled actions (``"test"``) and with the most probable ones
-        (``"test_greedy"``).
+    Returns figures with sampled actions (``"test"``) and with the most probable
+    (``"test_greedy"``).
 
     Reference:
         Dissertation, figure 3.6.
@@ -180,16 +171,7 @@ def _tests(config: WaterworldA3CConfig) -> tuple[EnvBase, TensorDictBase]:
 def make_agent_env(
     config: WaterworldA3CConfig, mazes: Tensor | None = None, batch_size: tuple[int, ...] = ()
 ) -> EnvBase:
-    """Build Waterworld as the agent of an experiment meets it.
-
-    Args:
-        config: of the agent with goals or of the one without.
-        mazes: bool ``[M, H, W]``. Default: the training split.
-        batch_size: of the env.
-
-    Returns:
-        The env; with goals, that of :func:`make_goal_env`.
-    """
+    """Build Waterworld as the agent of an experiment meets it, with its goals if it has any."""
     arguments: dict[str, Any] = {"max_steps": config.max_episode_steps, "batch_size": batch_size}
     if _with_goals(config):
         arguments.update({name: getattr(config, name) for name in _GOAL_KEYS})
@@ -198,11 +180,7 @@ def make_agent_env(
 
 
 def make_agent_loss(config: WaterworldA3CConfig) -> A3CLoss:
-    """Build actor, critic and loss; the agents with and without goals differ in one input.
-
-    Args:
-        config: of the experiment.
-    """
+    """Build actor, critic and loss; the agents with and without goals differ in one input."""
     in_keys = ["observation", "velocity", *["goals"] * _with_goals(config)]
     actor, critic = make_maze_networks(
         make_agent_env(config), in_keys=in_keys, hidden=config.hidden, seed=config.seed
@@ -290,7 +268,8 @@ def _draw_episode(
     by_length = among[test.base_steps[among].argsort(stable=True)]
     shown = int(by_length[int(0.85 * (len(by_length) - 1))])
     start = starts[shown]
-    track = run_goal_episodes(env, policy, starts[shown : shown + 1], record=True).tracks[0]
+    one = starts[shown : shown + 1]
+    track = play_mazes(policy, env, one, deterministic=True, record=True).tracks[0]
     words = "A test maze: the player (blue) follows the goals (magenta) to the target (green)."
     if not track.solved:
         steps = len(track.positions) - 1

@@ -11,12 +11,7 @@ from torchrl_hmcts.trainers.runs.config import ExperimentError
 
 @dataclass
 class GymConfig(SkillsConfig):
-    """Keys of ``hmcts train kit=gym env.id=NAME``: the agent over the kit ``gym``.
-
-    Example:
-        >>> GymConfig(id="PointMaze_Large-v3").num_skills
-        8
-    """
+    """Keys of ``hmcts train kit=gym env.id=NAME``: the agent over the kit ``gym``."""
 
     out: str = "runs/gym"
     """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
@@ -75,12 +70,7 @@ class GymConfig(SkillsConfig):
         return max(BATCH_STEPS, self.train_base_steps // BATCH_STEPS * BATCH_STEPS)
 
     def check_inputs(self) -> None:
-        """Check that there is such an env.
-
-        Raises:
-            ExperimentError: if there is no id, or none like it.
-            ImportError: if the env needs a package that is not installed.
-        """
+        """Check that there is such an env."""
         super().check_inputs()
         if not self.id:
             raise ExperimentError("say which env: env.id=NAME, e.g. env.id=PointMaze_Large-v3.")
@@ -98,10 +88,6 @@ class AntConfig(GymConfig):
 
     Its defaults are what was chosen by hand for the ant mazes. Skills are learned by LSD on the
     displacement that a skill brings, without a reward of the env.
-
-    Example:
-        >>> AntConfig(id="antmaze-large-v0").option_steps
-        25
     """
 
     out: str = "runs/ant"
@@ -140,11 +126,7 @@ class AntConfig(GymConfig):
     LEAST = {**GymConfig.LEAST, "repeat": 0, "strength": 0, "imagined": 0}
 
     def check_inputs(self) -> None:
-        """Check that there is such an env, and that keys are left alone that have no effect.
-
-        Raises:
-            ExperimentError: as of :class:`GymConfig`, or for another objective or algorithm.
-        """
+        """Check that there is such an env, and that keys are left alone that have no effect."""
         super().check_inputs()
         if self.objective or self.algorithm != "diayn":
             raise ExperimentError(

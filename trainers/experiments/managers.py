@@ -33,21 +33,8 @@ def learn_manager(
 ) -> TensorDictModuleBase:
     """Train the network that guides a kit's planner, on searches that it comes to guide.
 
-    Args:
-        kit: of the experiment.
-        simulator: the macro env of the training split.
-        searches: of each iteration, from fresh starts.
-        iterations: the first searches without the network.
-        updates: of the network, in each iteration.
-        save_dir: folder of the checkpoints. Default: none are written.
-        resume: continue from the newest of them.
-        progress: makes a progress bar.
-
-    Returns:
-        The network.
-
-    Raises:
-        ExperimentError: if the kit has no network for its states.
+    Each iteration makes ``searches`` from fresh starts, the first without the network, and updates
+    it ``updates`` times.
 
     Reference:
         Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search", 2017,
@@ -90,13 +77,7 @@ def save_manager(folder: Path, network: TensorDictModuleBase) -> None:
 def load_manager(
     kit: Kit, folder: str | Path, make_simulator: Callable[[], EnvBase]
 ) -> TensorDictModuleBase | None:
-    """Read the network of a run or an agent; None if it has none.
-
-    Args:
-        kit: with a network like that in the folder.
-        folder: of the run or the agent.
-        make_simulator: returns the macro env to plan in; called if there is a network.
-    """
+    """Read the network of a run or an agent; None if it has none."""
     path = Path(folder) / _FILE
     if not path.is_file():
         return None

@@ -16,25 +16,13 @@ from torchrl_hmcts.trainers.saving.run_folder import RunFolder
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment: what it shows, how it is set up, and what runs it.
+    """One experiment: its name and summary, its configuration, and what runs it.
 
-    Args:
-        name: as in ``hmcts train experiment=NAME``.
-        summary: one line for the list.
-        config: dataclass of its keys, as ``".module:Class"``, relative to this package.
-        run: function of that configuration which returns the figures, as ``".module:function"``.
-        evaluate: function of a configuration, whose ``out`` is the folder of a run, that tests the
-            newest checkpoint there and returns the figures; for ``hmcts evaluate``. Default: none.
-        objective: figure that a sweep improves, e.g. ``"test.solved"``, larger is better; with a
-            minus before it, smaller is better. Default: none, the user has to name one.
-        progress: logged value by which a sweep gives up trials early. Default: none.
-        kit: its name in ``hmcts train kit=NAME``. Default: none.
-        figures: names of the figures that a run gives, nested ones joined by dots. Default:
-            unknown.
-
-    Example:
-        >>> find_experiment("waterworld_goals").config_class(seed=3).seed
-        3
+    ``config``, ``run`` and ``evaluate``, which tests the newest checkpoint of the run in ``out``,
+    are paths ``".module:name"`` in this package. ``objective`` is the figure that a sweep improves,
+    larger is better unless a minus precedes it; ``progress`` the logged value by which it gives up
+    trials; ``kit`` the name in ``hmcts train kit=NAME``; ``figures`` the names of a run's figures,
+    nested ones joined by dots, if they are known.
     """
 
     name: str
@@ -69,11 +57,7 @@ class Experiment:
 
     @property
     def evaluation(self) -> Callable[[Any], dict[str, Any]]:
-        """The function that evaluates a run again.
-
-        Raises:
-            ValueError: if the experiment has nothing of the kind.
-        """
+        """The function that evaluates a run again."""
         self.check_evaluation()
         evaluate: Callable[[Any], dict[str, Any]] = _load(self.evaluate)
         return evaluate
@@ -218,36 +202,16 @@ KITS = {e.kit: e for e in ALL_EXPERIMENTS.values() if e.kit}
 
 
 def find_experiment(name: str, among: Mapping[str, Experiment] = EXPERIMENTS) -> Experiment:
-    """Return an experiment by name.
-
-    Args:
-        name: one of ``EXPERIMENTS``.
-        among: experiments by name, or by kit.
-
-    Returns:
-        Where its configuration, its run and its evaluation are.
-
-    Raises:
-        ValueError: if there is none of that name; the nearest are named.
-
-    Example:
-        >>> find_experiment("labmaz")
-        Traceback (most recent call last):
-        ...
-        ValueError: Unknown experiment 'labmaz'. Did you mean: labmaze...
-    """
+    """Return an experiment by name; the nearest are named where there is none."""
     if name not in among:
         raise ValueError(unknown_key(name, among, "kit" if among is KITS else "experiment"))
     return among[name]
 
 
 def recognise(run: RunFolder) -> RunFolder:
-    """Return a run with what its experiment says of its keys, for its page.
+    """Return a run with what its experiment says of its keys, for its page; changed in place.
 
     The experiment of a run without ``run.json`` is the one that has the keys of its config.
-
-    Args:
-        run: of :func:`~torchrl_hmcts.trainers.saving.run_folder.read_run`; changed in place.
     """
     if not run.experiment and run.config:
         known = (
@@ -264,12 +228,7 @@ def recognise(run: RunFolder) -> RunFolder:
 def load_config(run: RunFolder) -> tuple[Experiment, Any]:
     """Return the experiment of a run and its configuration, with ``out`` at the folder.
 
-    Args:
-        run: of :func:`read_run`.
-
-    Raises:
-        ValueError: if ``run.json`` is damaged, or the experiment is unknown or no longer has one of
-            the keys.
+    A ValueError if ``run.json`` is damaged, or the experiment is unknown or lacks one of the keys.
     """
     for sentence in run.damage:
         if "run.json" in sentence:

@@ -242,10 +242,6 @@ class LabMazeConfig(SkillsConfig):
 
     A frame is a 60th of a second of the game. A base step of the worker is ``frames_per_step``
     frames with one action.
-
-    Example:
-        >>> LabMazeConfig(seed=3).option_steps
-        25
     """
 
     out: str = "runs/labmaze"
@@ -366,12 +362,7 @@ class LabMazeConfig(SkillsConfig):
 
 @dataclass
 class WaterworldA3CConfig(RunConfig):
-    """Keys of ``hmcts train experiment=waterworld_a3c``.
-
-    Example:
-        >>> WaterworldA3CConfig(seed=1).total_frames
-        2000000
-    """
+    """Keys of ``hmcts train experiment=waterworld_a3c``."""
 
     out: str = "runs/waterworld_a3c"
     """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
@@ -435,12 +426,7 @@ class WaterworldA3CConfig(RunConfig):
 
 @dataclass
 class WaterworldGoalsConfig(WaterworldA3CConfig):
-    """Keys of ``hmcts train experiment=waterworld_goals``.
-
-    Example:
-        >>> WaterworldGoalsConfig().goal_divergence_threshold
-        2.0
-    """
+    """Keys of ``hmcts train experiment=waterworld_goals``."""
 
     out: str = "runs/waterworld_goals"
     """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""

@@ -60,13 +60,9 @@ _REWARD_SCALES = {"METRAEncoderLoss": 3.0, "LSDEncoderLoss": 10.0, "SkillDynamic
 
 
 def run_skills(config: SkillsConfig) -> dict[str, Any]:
-    """Run the agent over a kit and return its figures, as they are written to ``metrics.json``.
+    """Run the agent over the kit of a configuration; return its figures, as in ``metrics.json``.
 
-    Args:
-        config: keys of the experiment; ``KIT`` of its class names the kit.
-
-    Returns:
-        The figures. Times are in seconds, steps in base steps.
+    Times are in seconds, steps in base steps.
 
     Reference:
         Dissertation, chapter 4 (tree search over skills), on the mazes of chapters 3 and 4.
@@ -128,14 +124,10 @@ def _run(config: SkillsConfig, run: Run) -> dict[str, Any]:
 
 
 def evaluate_skills(config: SkillsConfig) -> dict[str, Any]:
-    """Solve test starts with the worker of a run.
+    """Solve test starts with the worker of a run, whose folder is ``out``; changed keys change it.
 
-    Args:
-        config: of the run, whose folder is ``out``; changed keys change the test.
-
-    Returns:
-        Figures of plans that are executed open-loop, one trial per start (``"test"``), and those of
-        the kit's further tests.
+    Returns figures of plans that are executed open-loop, one trial per start (``"test"``), and
+    those of the kit's further tests.
 
     Reference:
         Dissertation, figure 4.10.
@@ -225,16 +217,7 @@ def learn(
 
 
 def load_skills(kit: Kit, folder: str | Path) -> LearnedSkills:
-    """Read the skills of a run or an agent.
-
-    Args:
-        kit: of networks like those in the folder.
-        folder: of the run or the agent.
-
-    Raises:
-        FileNotFoundError: if it has no networks yet.
-        ExperimentError: if they are other ones, or of another env.
-    """
+    """Read the skills of a run or an agent."""
     loss = make_loss(kit)
     try:
         path = load_networks(loss, folder)
@@ -269,9 +252,6 @@ def make_loss(kit: Kit) -> Any:
 
     The actor sees the kit's ``worker_keys``; DIAYN's discriminator the displacement since the skill
     began, other objectives the place; DIAYN's critics the displacement too.
-
-    Args:
-        kit: gives the env, the keys, and the configuration with its seed.
     """
     loss = kit.make_loss()
     if loss is None:
@@ -305,13 +285,7 @@ def _make_loss(kit: Kit) -> Any:
 
 
 def make_objective(kit: Kit, env: EnvBase, node: Mapping[str, Any]) -> SkillObjective:
-    """Build a skill objective with the network that it learns.
-
-    Args:
-        kit: gives the keys.
-        env: whose specs give the sizes.
-        node: path of the class, and keywords.
-    """
+    """Build a skill objective with the network that it learns."""
     name, number = node["_component_"].rpartition(".")[2], kit.config.num_skills
     spec = env.full_observation_spec_unbatched
     key = kit.config.objective_key or kit.place_key
@@ -434,13 +408,7 @@ def _solve(
 
 
 def with_second_search(first: Results, again: np.ndarray, second: Results) -> Results:
-    """Return results where some starts have what a second search gave, at the cost of both.
-
-    Args:
-        first: of all starts.
-        again: indices of those that were searched again.
-        second: the results of these.
-    """
+    """Return results where the starts ``again`` have those of a second search, at both costs."""
     columns = {k: v.copy() for k, v in vars(first).items()}
     for name in ("simulated_steps", "expansions", "simulations"):
         columns[name][again] += getattr(second, name)

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_hmcts.envs import AtariOptionPool, AtariRAMEnv
 from torchrl_hmcts.trainers.figures.animation import write_gif
+from torchrl_hmcts.trainers.figures.atari_scores import HUMAN_AND_RANDOM, TABLE_5_1
 from torchrl_hmcts.trainers.figures.curves import draw_band, style
 from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
@@ -84,3 +85,27 @@ def write_atari_gif(
     frames = [p.repeat(2, axis=1) for p in pictures]  # a console's pixels are wide
     write_gif(frames, path, milliseconds=1000.0 * seconds, last=None)
     return shown, score
+
+
+def plot_sticky(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Plot the score of each planned episode against all emulated frames, a panel for each game.
+
+    The dotted line is a human's score; rows of a game are its seeds.
+    """
+    games = [game for game in TABLE_5_1 if any(row["game"] == game for row in rows)]
+    figure = Figure(figsize=(10.0, 5.2), layout="constrained")
+    panels = figure.subplots(2, 4).flatten()
+    for axes, game in zip(panels, games, strict=False):
+        for row, color in zip((r for r in rows if r["game"] == game), itertools.cycle(COLORS)):
+            frames = [episode["frames"] for episode in row["episodes"]]
+            scores = [episode["score"] for episode in row["episodes"]]
+            axes.plot(frames, scores, ".", color=color, alpha=0.4)
+            means = [np.mean(scores[max(0, i - 9) : i + 1]) for i in range(len(scores))]
+            axes.plot(frames, means, color=color)
+        axes.axhline(HUMAN_AND_RANDOM[game][0], color="#71717a", linestyle=":")
+        style(axes, game, short=True)
+    for axes in panels[len(games) :]:
+        axes.set_axis_off()
+    figure.supxlabel("emulated frames, all kinds", fontsize=10)
+    figure.supylabel("score: episodes, and the mean of the last ten", fontsize=10)
+    save_figure(figure, path, dpi=110)

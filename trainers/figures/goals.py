@@ -32,7 +32,7 @@ def draw_goals(
     Args:
         env: draws the maze.
         start: first state of the episode, without batch dimensions.
-        track: the episode, as ``run_goal_episodes(..., record=True)`` records it.
+        track: the episode, as ``play_mazes(..., record=True)`` records it.
         step: base step, 0 to the last of the episode.
         tile_pixels: pixels per tile.
 

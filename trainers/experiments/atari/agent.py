@@ -25,6 +25,7 @@ from torchrl_hmcts.planners import (
     WidthNovelty,
 )
 from torchrl_hmcts.trainers.experiments.atari.guide import SearchGuide
+from torchrl_hmcts.trainers.experiments.atari.reactive import ReactiveManager
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class AtariSearch:
 
     Attributes:
         ratio: simulated base steps per base step of an option, after which no new leaf is selected;
-            ρ. The leaves and rollouts under way are finished: with 4 leaves and 25, about 38
-            in Breakout.
+            ρ. 0: the guide chooses, without search. The leaves and rollouts under way are finished:
+            with 4 leaves and 25, about 38 in Breakout.
         tree_policy: ``"puct"`` over values scaled to [0, 1], or ``"uct"``, its c times the greatest
             reward seen.
         backup: ``"max"``, ``"mean"`` or ``"default"``: the max for PUCT, the mean for UCT.
@@ -123,7 +124,8 @@ class AtariAgent:
         pool (AtariOptionPool): simulator of the options.
         search (AtariSearch): how to search.
         play_in (AtariOptionPool, optional): where to play. Default: in ``pool``.
-        guide (SearchGuide, optional): learns from the searches and guides those after them.
+        guide (SearchGuide or ReactiveManager, optional): learns from the searches and guides
+            those after them; needed with a ratio of 0.
         replant_every (int): decisions between new trees. Default 100.
         seed (int): of the searches.
 
@@ -135,7 +137,8 @@ class AtariAgent:
         options_taken: how often each option was executed.
 
     Raises:
-        ValueError: if the two pools have not the same options, or a number is out of range.
+        ValueError: if the two pools have not the same options, a number is out of range, or nothing
+            chooses: a ratio of 0 without a ReactiveManager.
 
     Reference:
         Dissertation, chapter 5; Silver et al. 2017 for PUCT.
@@ -156,7 +159,7 @@ class AtariAgent:
         search: AtariSearch | None = None,
         *,
         play_in: AtariOptionPool | None = None,
-        guide: SearchGuide | None = None,
+        guide: SearchGuide | ReactiveManager | None = None,
         replant_every: int = 100,
         seed: int = 0,
     ) -> None:
@@ -168,6 +171,11 @@ class AtariAgent:
         self.replant_every = whole_number("AtariAgent", "replant_every", replant_every, least=1)
         self.pool, self.real = pool, pool if play_in is None else play_in
         self.search = AtariSearch() if search is None else search
+        if self.search.ratio == 0.0 and not isinstance(guide, ReactiveManager):
+            raise ValueError(
+                f"AtariAgent with a ratio of 0 does not search: a ReactiveManager chooses; got "
+                f"guide={guide!r}. Pass one, or a ratio above 0."
+            )
         self.guide = guide
         self.seed = seed
         self.greatest_reward = 0.0
@@ -242,30 +250,37 @@ class AtariAgent:
     def _decide(self) -> None:
         state = self.state
         assert state is not None
+        seed = (self.seed * 1_000_003 + self.decisions) & 0x7FFFFFFF
+        if self.search.ratio == 0.0 and isinstance(self.guide, ReactiveManager):
+            self._execute(self.guide.act(state, seed))
+            return
         self.pool.life_loss_penalty = self.greatest_reward
         if self._scale != self._wanted_scale:
             self._make_planner()
-        seed = (self.seed * 1_000_003 + self.decisions) & 0x7FFFFFFF
         kept = self.real is self.pool and self.decisions % self.replant_every
         if self._tree is None or not kept:
             self._tree = self.planner.plant(state, seed=seed)
         search = self._tree
         self.planner.resume(search)
         option = torch.from_numpy(self.planner.choose(search))
+        self._execute(option)
+        rewards = search.tree.nodes["reward"][0, : int(search.tree.num_nodes[0])]
+        self.greatest_reward = max(self.greatest_reward, float(rewards.max(initial=0.0)))
+        if self.guide is not None:
+            self.guide.learn(search, self.greatest_reward, self.last_option)
+        if not self.done and self.real is self.pool:
+            self.planner.advance(search, option, self.state, seed=seed)
+
+    def _execute(self, option: torch.Tensor) -> None:
+        assert self.state is not None
         self.last_option = int(option)
-        after = self.real.step(state.clone().set("option", option))["next"]
+        after = self.real.step(self.state.clone().set("option", option))["next"]
         self.score += float(after["score"].sum())
         self.real_steps += int(after["duration"].sum())
         self.decisions += 1
         self.options_taken[self.last_option] += 1
         self.done = bool(after["done"].any())
-        rewards = search.tree.nodes["reward"][0, : int(search.tree.num_nodes[0])]
-        self.greatest_reward = max(self.greatest_reward, float(rewards.max(initial=0.0)))
-        if self.guide is not None:
-            self.guide.learn(search, self.greatest_reward)
         self.state = after.select("emulator_state", "ram", "observation", strict=False)
-        if not self.done and self.real is self.pool:
-            self.planner.advance(search, option, self.state, seed=seed)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is needed to continue from here with a new tree."""

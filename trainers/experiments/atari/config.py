@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from torchrl_hmcts.trainers.runs.config import ExperimentError, RunConfig, need_package
 
-RULES = ("best", "goals", "actions", "action_sets", "repeat")
+RULES = ("best", "goals", "actions", "action_sets", "repeat", "screened")
 SKILLS = ("diayn", "diayn_displacement", "diayn_controllable", "metra")
 _RETRAINED = ("goals_retrained", *(f"{name}_retrained" for name in SKILLS))
 NETWORKS = (*SKILLS, *_RETRAINED)
@@ -32,19 +32,22 @@ class AtariConfig(RunConfig):
     protocol: str = "deterministic"
     """"deterministic" (comparable with the dissertation and the planning papers) or "sticky"
     (actions stick with probability 0.25, and the planner is given no random generator)."""
-    source: str = "best"
-    """Source of the options; `options=` and `worker=` are the same key. Rules: "best"
+    source: str = "auto"
+    """Source of the options; `options=` and `worker=` are the same key. "auto": "screened" for a
+    manager that practises, else "best". Rules: "best"
     ("action_sets", "actions" or "goals", with which a planner's trials score best), "goals"
     (found by a probe and trials), "repeat" (one for each action), "actions" (some of these,
     chosen by trials), "action_sets" (all of these, those that fire or those that do not, chosen
-    by trials). Networks: "goals_network" (has learned the goals), "goals_fine_tuned" (that
-    network, trained further by SAC on its goals and the game), "diayn" (the dissertation's
-    worker), "diayn_displacement", "diayn_controllable" (with other discriminators), "metra".
+    by trials), "screened" (goals found by a probe, and all actions, without any trial).
+    Networks: "goals_network" (has learned the goals), "goals_fine_tuned" (that network, trained
+    further by SAC on its goals and the game), "diayn" (the dissertation's worker),
+    "diayn_displacement", "diayn_controllable" (with other discriminators), "metra".
     With "_retrained" behind its name ("goals_retrained" for "goals_network") a network is
     retrained on what the manager's searches simulate, Algorithm 3."""
     episodes: int = 10
     """Scored episodes, whose mean, least and largest score are the result; none of their starts
-    is used to choose anything."""
+    is used to choose anything. A manager that practises plays until the frames are spent, and the
+    result is that of the last so many."""
     frames: int = 40_000_000
     """Emulated frames in all, 10 million base steps as in the dissertation, after which no further
     episode begins."""
@@ -78,17 +81,22 @@ class AtariConfig(RunConfig):
     """Test episodes of such a point."""
     curve_steps: int = 0
     """Base steps after which such an episode is ended; 0: it is played to its end."""
-    ratio: float = 25.0
-    """Simulated base steps per real one, after which a search selects no new leaves."""
-    rollout_options: int = 5
-    """Options of the rollouts that stay in the tree."""
+    ratio: float = -1.0
+    """Simulated base steps per real one, after which a search selects no new leaves; -1: 25, or 10
+    where the guide is reactive; 0: a reactive guide plays without search."""
+    rollout_options: int = -1
+    """Options of the rollouts that stay in the tree; -1: 5, or none where the guide is reactive,
+    whose values take their place."""
     tree_policy: str = "puct"
     """"puct" (values scaled to [0, 1]) or "uct", e.g. to compare with."""
     backup: str = "default"
     """"max", "mean" or "default": the max for PUCT, the mean for UCT."""
-    guide: str = "none"
-    """Network that learns from the searches and guides those after them: "none", "prior" or
-    "prior_value"."""
+    guide: str = "auto"
+    """Network that learns from the searches and guides those after them: "none", "prior",
+    "prior_value", or "reactive", a manager that also practises and can play without search
+    (`ratio=0`). "auto": "reactive" with sticky actions, else "none"."""
+    practice: float = 0.5
+    """Share of the frames in which a manager that practises does so."""
     c: float = 2.0
     """Weight of exploration; for UCT in units of the greatest reward seen."""
     gamma: float = 0.99
@@ -117,17 +125,17 @@ class AtariConfig(RunConfig):
     ALIASES = {"options": "source", "worker": "source"}
     CHOICES = {
         "protocol": ("deterministic", "sticky"),
-        "source": (*RULES, "goals_network", "goals_fine_tuned", *NETWORKS),
+        "source": ("auto", *RULES, "goals_network", "goals_fine_tuned", *NETWORKS),
         "tune_with": ("grid", "optuna"),
         "tree_policy": ("puct", "uct"),
         "backup": ("default", "max", "mean"),
-        "guide": ("none", "prior", "prior_value"),
+        "guide": ("auto", "none", "prior", "prior_value", "reactive"),
     }  # fmt: skip
     LEAST = {
-        "option_steps": 0, "rollout_options": 0, "num_processes": -1, "num_skills": 0,
+        "option_steps": 0, "rollout_options": -1, "num_processes": -1, "num_skills": 0,
         "curve_every": 0, "curve_steps": 0,
     }  # fmt: skip
-    ABOVE_ZERO = ("ratio", "c", "trial_ratio")
+    ABOVE_ZERO = ("c", "trial_ratio")
     TOY = {
         "frames": 20_000,
         "max_episode_frames": 2_000,
@@ -137,10 +145,41 @@ class AtariConfig(RunConfig):
         "skill_base_steps": 512,
     }
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.ratio != -1.0 and not self.ratio >= (0.0 if self._guide == "reactive" else 1e-9):
+            raise ValueError(
+                f"ratio must be above 0; got {self.ratio}. With guide=reactive ratio=0 plays "
+                f"without search; here it is guide={self.guide}."
+            )
+        if not 0.0 <= self.practice < 1.0:
+            raise ValueError(
+                f"practice is a share of the frames, 0 to below 1; got {self.practice}."
+            )
+
     @property
     def KEPT(self) -> tuple[str, ...]:  # type: ignore[override]  # noqa: N802
         """Keys that a run keeps when it is resumed: all but those that may change on the way."""
         return tuple(field.name for field in fields(self) if field.name not in self.FREE)
+
+    @property
+    def _guide(self) -> str:
+        auto = "reactive" if self.protocol == "sticky" else "none"
+        return auto if self.guide == "auto" else self.guide
+
+    def resolved(self) -> AtariConfig:
+        """Return the configuration with what "auto" stands for."""
+        guide = self._guide
+        source = self.source
+        if source == "auto":
+            source = "screened" if guide == "reactive" else "best"
+        options = self.rollout_options
+        if options < 0:
+            options = 0 if guide == "reactive" else 5
+        ratio = self.ratio
+        if ratio < 0.0:
+            ratio = 10.0 if guide == "reactive" else 25.0
+        return replace(self, guide=guide, source=source, rollout_options=options, ratio=ratio)
 
     def check_inputs(self) -> None:
         """Check what the run needs from outside, before anything is written.

@@ -7,7 +7,7 @@ import dataclasses
 import math
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,17 @@ from torchrl_hmcts.trainers.experiments.atari.kit import FRAMES_PER_STEP, AtariK
 from torchrl_hmcts.trainers.experiments.atari.learning import LearningCurve
 from torchrl_hmcts.trainers.experiments.atari.memory import TrialMemory
 from torchrl_hmcts.trainers.experiments.atari.options import Options, has_network
+from torchrl_hmcts.trainers.experiments.atari.reactive import ReactiveManager
 from torchrl_hmcts.trainers.experiments.atari.sources import make_source
 from torchrl_hmcts.trainers.experiments.atari.trials import GRID_SKILLS, Tuned, tune_search
 from torchrl_hmcts.trainers.runs import console
 from torchrl_hmcts.trainers.runs.config import ExperimentError
 from torchrl_hmcts.trainers.saving.checkpoints import newest_checkpoint, read_state
 
+CHECKPOINTS = (2_000_000, 5_000_000, 10_000_000, 40_000_000)
+_REACTIVE_STEPS = 5  # of an option of a manager that practises
+_PRACTICE_FRAMES = 100_000  # at a time
+_PRACTICE_SEED = 1_000_003
 _FRAMES_PER_POINT = 1_000 * FRAMES_PER_STEP  # of the curves: the dissertation's 1,000 samples
 _HISTORY = ("scores", "points", "best", "decisions", "seconds")
 
@@ -50,7 +55,8 @@ class AtariRun:
     tuned: Tuned
 
     def __init__(self, config: AtariConfig) -> None:
-        self.config = config
+        self._asked = config
+        self.config = config = config.resolved()
         self.kit = AtariKit(
             config.game,
             gamma=config.gamma,
@@ -58,8 +64,6 @@ class AtariRun:
             num_processes=None if config.num_processes < 0 else config.num_processes,
             seed=config.seed,
         )
-        names = [field.name for field in dataclasses.fields(AtariSearch)]
-        self.search = AtariSearch(**{name: getattr(config, name) for name in names})
         self.sticky = config.protocol == "sticky"
         self.scores: list[dict[str, float]] = []
         self.points: list[tuple[int, float]] = []
@@ -72,11 +76,20 @@ class AtariRun:
         self._frames_before = 0  # of pools that are closed, and of earlier parts of the run
         self._resumed: dict[str, Any] | None = None
         self._learned: dict[str, Any] | None = None  # what another run's guide knew
+        self._practice: AtariOptionPool | None = None
+        self._practised = 0  # frames before the pool was made
+
+    @property
+    def search(self) -> AtariSearch:
+        """How the agent plans."""
+        names = [field.name for field in dataclasses.fields(AtariSearch)]
+        return AtariSearch(**{name: getattr(self.config, name) for name in names})
 
     @property
     def num_frames(self) -> int:
         """Frames emulated so far, for all purposes."""
-        return self._frames_before + (0 if self.agent is None else self.agent.num_frames)
+        frames = self._frames_before + (0 if self.agent is None else self.agent.num_frames)
+        return frames + (0 if self._practice is None else self._practice.num_frames)
 
     def settings(self) -> dict[str, Any]:
         """Return the keys that a run keeps when it continues."""
@@ -97,7 +110,10 @@ class AtariRun:
         for number in (config.num_skills,) if config.num_skills else GRID_SKILLS:
             source = make_source(dataclasses.replace(config, num_skills=number), self.search)
             options = source.find(kit)
-            tuned = tune_search(options.worker, kit, self.search, config)
+            if config.guide == "reactive":  # which finds out by itself what they are good for
+                tuned = Tuned(config.option_steps or _REACTIVE_STEPS, config.c)
+            else:
+                tuned = tune_search(options.worker, kit, self.search, config)
             tried.append((options, tuned))
         self.options, self.tuned = max(tried, key=lambda pair: pair[1].best)
         for options, tuned in tried:
@@ -135,6 +151,9 @@ class AtariRun:
                 f"{self.config.game}, whose actions are others."
             )
         self._take_options(other)
+        if self._asked.guide == "auto":
+            guide = other["config"].get("guide", "none")
+            self.config = dataclasses.replace(self._asked, guide=guide).resolved()
         if other["config"].get("guide", "none") == self.config.guide:
             self._learned = other["agent"].get("guide")
         self._frames_before += self.options.num_frames + self.tuned.num_frames
@@ -163,9 +182,12 @@ class AtariRun:
             self._resumed = None
             self._saved = len(self.scores), agent.decisions
         self._frames_before -= agent.num_frames  # a console's start is no part of the run
+        if self._practice is not None:
+            self._frames_before -= self._practice.num_frames
         if agent.done:  # nothing is under way
             if resumed is not None and self._played_enough:
                 return
+            self._practise(tick)
             self._begin_episode(agent)
         due = resumed is None
         while True:
@@ -182,13 +204,16 @@ class AtariRun:
             else:
                 self._end_episode(agent)
                 if not self._played_enough:
+                    self._practise(tick)
                     self._begin_episode(agent)
             due = agent.done or agent.decisions % self.config.replant_every == 0
 
     @property
     def _played_enough(self) -> bool:
         config = self.config
-        return len(self.scores) >= config.episodes or self.num_frames >= config.frames
+        practising = config.guide == "reactive" and config.practice > 0.0
+        enough = not practising and len(self.scores) >= config.episodes
+        return enough or self.num_frames >= config.frames
 
     def kept(self) -> str:
         """Return a sentence on what the latest checkpoint holds, and what is to be played again."""
@@ -203,14 +228,21 @@ class AtariRun:
 
     def _make_agent(self) -> AtariAgent:
         config, worker, steps = self.config, self.options.worker, self.tuned.option_steps
-        guide = None
-        if config.guide != "none":
+        guide: SearchGuide | ReactiveManager | None = None
+        if config.guide == "reactive":
+            guide = ReactiveManager(worker.num_options, gamma=config.gamma, seed=config.seed)
+            self._practice = self.kit.make_pool(
+                worker, steps, sticky=self.sticky, end_on_life_loss=True
+            )
+        elif config.guide != "none":
             values = config.guide == "prior_value"
             guide = SearchGuide(worker.num_options, values=values, seed=config.seed)
-            if self._learned is not None:
-                guide.load_state_dict(self._learned)
+        if guide is not None and self._learned is not None:
+            guide.load_state_dict(self._learned)
         self.agent = AtariAgent(
-            self.kit.make_pool(worker, steps, split="test"),
+            self.kit.make_pool(
+                worker, steps, split="test", sticky=self.sticky and config.guide == "reactive"
+            ),
             dataclasses.replace(self.search, c=self.tuned.c),
             play_in=self.make_player() if self.sticky else None,
             guide=guide,
@@ -222,7 +254,8 @@ class AtariRun:
     def make_player(self, *, record: bool = False) -> AtariOptionPool:
         """Make a pool in which the scored episodes begin."""
         worker, steps = self.options.worker, self.tuned.option_steps
-        return self.kit.make_pool(worker, steps, split="test", sticky=self.sticky, record=record)
+        kit = dataclasses.replace(self.kit, num_processes=0) if self.sticky else self.kit
+        return kit.make_pool(worker, steps, split="test", sticky=self.sticky, record=record)
 
     def close(self) -> None:
         """Stop the processes."""
@@ -230,6 +263,9 @@ class AtariRun:
             self._frames_before = self.num_frames
             self.agent.close()
             self.agent = None
+        if self._practice is not None:
+            self._practice.close()
+            self._practice = None
 
     def _seed_episode(self, agent: AtariAgent) -> None:
         """Give an episode a start and draws of its own, independent of those before."""
@@ -237,6 +273,21 @@ class AtariRun:
         agent.seed = self.kit.start_seed(number)
         agent.pool.set_seed(agent.seed)
         agent.real.set_seed(self.kit.start_seed(number, sticky=self.sticky))
+
+    def _practise(self, tick: Callable[[], object]) -> None:
+        """Let a manager that practises do so until that took its share of the frames so far."""
+        manager, pool, share = self.agent and self.agent.guide, self._practice, self.config.practice
+        if not isinstance(manager, ReactiveManager) or pool is None:
+            return
+        pool.set_seed(_PRACTICE_SEED + self.kit.start_seed(len(self.scores), sticky=self.sticky))
+        before = manager.practised
+        rest = self.num_frames - before
+        while (due := rest * share / (1.0 - share) - manager.practised) > 0:
+            manager.practise(pool, min(math.ceil(due), _PRACTICE_FRAMES))
+            tick()
+        if manager.scores and manager.practised > before:
+            mean = sum(manager.scores) / len(manager.scores)
+            console.note(f"Practice: {manager.practised:,} frames, latest episodes {mean:.1f}")
 
     def _begin_episode(self, agent: AtariAgent) -> None:
         self._seed_episode(agent)
@@ -274,7 +325,8 @@ class AtariRun:
     def figures(self) -> dict[str, Any]:
         """Return the run's figures."""
         config, options, tuned = self.config, self.options, self.tuned
-        scores = [row["score"] for row in self.scores]
+        counted = self.scores[-config.episodes :]
+        scores = [row["score"] for row in counted]
         decisions = max(1, sum(int(row["decisions"]) for row in self.scores))
         spent = self.num_frames - options.num_frames - tuned.num_frames
         real = sum(int(row["real_frames"]) for row in self.scores)
@@ -289,6 +341,7 @@ class AtariRun:
             "score_min": min(scores),
             "score_final": scores[-1],
             "score_mean": sum(scores) / len(scores),
+            "score_at": score_at(self.scores, config.episodes),
             "episodes": self.scores,
             "frames": self.num_frames,
             "base_steps": self.num_frames // FRAMES_PER_STEP,
@@ -348,6 +401,21 @@ class AtariRun:
             setattr(self, name, copy.copy(state_dict.get(name, getattr(self, name))))
         self._frames_before = int(state_dict["frames"])
         self._resumed = state_dict["agent"]
+
+
+def score_at(episodes: Sequence[Mapping[str, float]], last: int = 10) -> dict[str, float]:
+    """Return the mean score of the ``last`` episodes over by 2, 5, 10 and 40 million frames.
+
+    Example:
+        >>> score_at([{"frames": 1e6, "score": 2.0}, {"frames": 4e6, "score": 6.0}], last=1)
+        {'2000000': 2.0, '5000000': 6.0}
+    """
+    found = {}
+    for frames in CHECKPOINTS:
+        scores = [row["score"] for row in episodes if row["frames"] <= frames][-last:]
+        if scores and episodes[-1]["frames"] >= 0.8 * frames:  # the run went so far
+            found[str(frames)] = sum(scores) / len(scores)
+    return found
 
 
 def trials_file(folder: Path) -> Path:

@@ -127,12 +127,13 @@ class SearchGuide:
             return Evaluation(priors)
         return Evaluation(priors, values * self.scale)
 
-    def learn(self, search: Search, scale: float) -> None:
+    def learn(self, search: Search, scale: float, option: int = -1) -> None:
         """Take examples from a search of one root, and train if it is time.
 
         Args:
             search: before its subtree is taken.
             scale: the greatest reward of an option so far, which a value of 1 is worth from now on.
+            option: unused; the visits are learned.
         """
         examples = search_examples(
             search,

@@ -84,6 +84,7 @@ class AtariKit:
         split: str = "train",
         sticky: bool = False,
         record: bool = False,
+        end_on_life_loss: bool = False,
     ) -> AtariOptionPool:
         """Make a pool of emulators.
 
@@ -91,15 +92,18 @@ class AtariKit:
             worker: executes the options.
             max_steps: base steps of an option at most.
             split: of the starts.
-            sticky: whether actions stick, with probability 0.25: to play in, not to plan.
+            sticky: whether actions stick, with probability 0.25. Who plans there needs a seed of
+                its own, by ``set_seed``.
             record: whether the steps inside an option are written, too.
+            end_on_life_loss: whether an option ends when a life is lost.
         """
         return AtariOptionPool(
             self.game,
             worker,
             max_steps=max_steps,
-            num_processes=0 if sticky else self.num_processes,
+            num_processes=self.num_processes,
             record=record,
+            end_on_life_loss=end_on_life_loss,
             gamma=self.gamma,
             repeat_action_probability=0.25 if sticky else 0.0,
             **self._episode(split),

@@ -68,6 +68,8 @@ class RuleSource:
     ``"action_sets"`` all of these, those that fire or those that do not. Where an action can move
                       and fire at once, the firing ones lose nothing and are a third of all. The
                       names of the actions are all that is known of the game
+    ``"screened"``    nothing: the six goals of the first two steps below that score best alone,
+                      and all actions; a manager that practises finds out what they are good for
     ``"goals"``       goals "bring byte c to byte b plus an offset" and repeated actions, see below
     ``"best"``        the three above, and of these the one whose options score best
     ================= ==============================================================================
@@ -163,6 +165,10 @@ class RuleSearch:
             report.update(reports[best], source=best, sources=tried)
             return sets[best]
         rules = self.repeats()
+        if candidates == "screened":
+            ranked, states = self.probe(report)
+            best = self.screen(ranked, states[:1], report)
+            return [rule for rule in best if not isinstance(rule.worker, RepeatActions)] + rules
         if candidates == "actions":
             return self.grow(rules, report)
         if candidates == "action_sets":

@@ -120,16 +120,53 @@ def evaluate_atari(config: AtariConfig) -> dict[str, Any]:
     Reference:
         Dissertation, chapter 5.
     """
+    run, checkpoint, before = _one_more(config)
+    row = run.scores[-1]
+    return {"checkpoint": checkpoint.name, "test": {**row, "frames": int(row["frames"]) - before}}
+
+
+def show_atari(config: AtariConfig, film: Path) -> str:
+    """Play one episode more of a run, write its first half minute as a GIF and tell how it went.
+
+    Args:
+        config: as in :func:`evaluate_atari`; with ``ratio`` 0 a reactive manager plays alone.
+        film: the file.
+    """
+    run = _one_more(config)[0]
+    shown, score = _film(run, film)
+    row, how = run.scores[-1], "searches" if run.config.ratio else "plays without search"
+    return (
+        f"{run.config.game}, {run.config.protocol}: the agent {how} and scores {row['score']:g} in "
+        f"{row['real_frames']:,.0f} frames; the film has the first {shown * FRAMES_PER_STEP:,} and "
+        f"a score of {score:g}"
+    )
+
+
+def _one_more(config: AtariConfig) -> tuple[AtariRun, Path, int]:
+    """Play an episode more of a run; return its checkpoint and the frames before, too."""
     torch.set_num_threads(1)
     run = AtariRun(dataclasses.replace(config.sized(), options_from="", frames=1))
     checkpoint = run.take_over(Path(config.out), "out")
     before = run.num_frames
     try:
         run.play(lambda: None, lambda: None)
-        row = run.scores[-1]
     finally:
         run.close()
-    return {"checkpoint": checkpoint.name, "test": {**row, "frames": int(row["frames"]) - before}}
+    return run, checkpoint, before
+
+
+def _film(run: AtariRun, path: Path) -> tuple[int, float]:
+    """Write the beginning of a run's best episode; return its base steps and their score."""
+    from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif
+
+    recorder = run.make_player(record=True)
+    recorder.set_seed(run.kit.start_seed(run.best["episode"], sticky=run.sticky))
+    try:
+        return write_atari_gif(
+            recorder, run.best["decisions"], path, real_steps=60 if run.config.toy else 450
+        )
+    finally:
+        recorder.close()
 
 
 def draw(run: AtariRun, pictures: Pictures) -> None:
@@ -150,17 +187,7 @@ def draw(run: AtariRun, pictures: Pictures) -> None:
     if not run.best:  # of a run that was begun by an older version
         return
     with left_out("episode.gif"):
-        from torchrl_hmcts.trainers.figures.atari_figures import write_atari_gif
-
-        recorder = run.make_player(record=True)
-        recorder.set_seed(run.kit.start_seed(run.best["episode"], sticky=run.sticky))
-        path = pictures.folder / "episode.gif"
-        try:
-            shown, score = write_atari_gif(
-                recorder, run.best["decisions"], path, real_steps=60 if run.config.toy else 450
-            )
-        finally:
-            recorder.close()
+        shown, score = _film(run, pictures.folder / "episode.gif")
         pictures.captions["episode.gif"] = (
             f"The best episode (number {run.best['episode'] + 1}), which scored "
             f"{run.best['score']:g}: its first {shown} base steps of {FRAMES_PER_STEP} frames, "

@@ -31,14 +31,14 @@ from torchrl_hmcts.trainers.evaluation import (
     option_reach,
     plan_and_execute,
 )
-from torchrl_hmcts.trainers.experiments.kits.four_stages import four_stages
 from torchrl_hmcts.trainers.experiments.kits.showing import (
     CAPTIONS,
+    LearnedSkills,
+    Trial,
     draw_run,
     start_to_show,
     write_film,
 )
-from torchrl_hmcts.trainers.experiments.kits.trial import LearnedSkills, Trial
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.manager import make_manager, scale_by
@@ -120,11 +120,7 @@ class Kit:
     # ------------------------------------------------------- envs: what every kit has
 
     def make_training_env(self, num_envs: int = 32) -> EnvBase:
-        """Return the env to learn skills in: copies under a ``SkillTransform``.
-
-        Args:
-            num_envs: copies.
-        """
+        """Return the env to learn skills in: copies under a ``SkillTransform``."""
         raise NotImplementedError
 
     def make_loss(self) -> LossModule | None:
@@ -132,28 +128,15 @@ class Kit:
         return None
 
     def trainer_part(self, loss: LossModule) -> dict[str, Any]:
-        """Return keywords of the trainer at the kit's defaults.
-
-        Args:
-            loss: that is trained.
-        """
+        """Return keywords of the trainer of a loss at the kit's defaults."""
         return {}
 
     def make_env(self, split: str) -> EnvBase:
-        """Return a base env to act in.
-
-        Args:
-            split: of its mazes, levels or tasks.
-        """
+        """Return a base env of a split to act in."""
         raise NotImplementedError
 
     def starts(self, split: str, num_starts: int) -> TensorDictBase:
-        """Return states to act from, ``[num_starts]``.
-
-        Args:
-            split: as of the env.
-            num_starts: how many.
-        """
+        """Return states of a split to act from, ``[num_starts]``."""
         raise NotImplementedError
 
     def make_options(
@@ -164,13 +147,11 @@ class Kit:
         *,
         gamma: float | None = None,
     ) -> EnvBase:
-        """Return the macro env over a base env, whose actions are the options.
+        """Return the macro env over a base env, whose actions are the options that a worker
+        executes.
 
-        Args:
-            env: the base env.
-            worker: executes the options.
-            trajectory_keys: base transitions to hand out, see ``OptionTransform``.
-            gamma: discount per base step of its rewards. Default: the configuration's.
+        ``trajectory_keys`` are base transitions to hand out, see ``OptionTransform``; ``gamma``,
+        the discount per base step of its rewards, is by default the configuration's.
         """
         config = self.config
         options = OptionTransform(
@@ -186,9 +167,6 @@ class Kit:
         """Return the worker of options that need no learning; None where they are learned.
 
         With ``options="actions"`` an option repeats one action.
-
-        Raises:
-            ExperimentError: if the actions cannot be counted.
         """
         if self.config.options == "learned":
             return None
@@ -235,40 +213,38 @@ class Kit:
         return part
 
     def make_simulator(self, worker: TensorDictModuleBase, split: str = "test") -> EnvBase:
-        """Return the macro env to plan in.
-
-        Args:
-            worker: executes the options.
-            split: of its mazes, levels or tasks.
-        """
+        """Return the macro env to plan in."""
         return self.make_options(self.make_env(split), worker)
 
     def make_real(
         self, worker: TensorDictModuleBase, trajectory_keys: Any = None, split: str = "test"
     ) -> EnvBase:
-        """Return the macro env to act in; its rewards are not discounted.
-
-        Args:
-            worker, trajectory_keys: as of :meth:`make_options`.
-            split: of its mazes, levels or tasks.
-        """
+        """Return the macro env to act in; its rewards are not discounted."""
         return self.make_options(self.make_env(split), worker, trajectory_keys, gamma=1.0)
 
     # ------------------------------------------------------- the planner
 
     def planner_part(self) -> dict[str, Any]:
-        """Return the entries of the planner at the kit's defaults, by keyword."""
-        config = self.config
-        if config.manager == "four_stages":
-            return four_stages(config.expansions)
-        return {
-            "_component_": "torchrl_hmcts.planners.MCTSPlanner",
-            "novelty": self.novelty_part(),
+        """Return the entries of the planner at the kit's defaults, by keyword.
+
+        With ``manager="four_stages"`` they are the dissertation's (section 2.4.2): UCT, expansion
+        of one option, a simulation of ten random options from there, backup of the mean.
+        """
+        config, planners = self.config, "torchrl_hmcts.planners"
+        part: dict[str, Any] = {
+            "_component_": f"{planners}.MCTSPlanner",
             "budget": {
-                "_component_": "torchrl_hmcts.planners.SearchBudget",
+                "_component_": f"{planners}.SearchBudget",
                 "expansions": config.expansions,
             },
-            "leaves_per_wave": config.leaves_per_wave,
+        }
+        if config.manager != "four_stages":
+            own = {"novelty": self.novelty_part(), "leaves_per_wave": config.leaves_per_wave}
+            return part | own
+        return part | {
+            "tree_policy": {"_component_": f"{planners}.UCT"},
+            "leaf_evaluator": {"_component_": f"{planners}.RolloutEvaluator"},
+            "expand": "one",
         }
 
     def parts(self) -> dict[str, dict[str, Any]]:
@@ -287,11 +263,8 @@ class Kit:
         }
 
     def make_planner(self, simulator: EnvBase, **budget: Any) -> MCTSPlanner:
-        """Return the planner that the configuration describes.
-
-        Args:
-            simulator: the macro env to plan in.
-            **budget: changes of its :class:`~torchrl_hmcts.planners.SearchBudget`.
+        """Return the planner that the configuration describes, with changes of its
+        ``SearchBudget``.
         """
         encoder = self._encoder
         if self.config.features == "learned" and (
@@ -314,9 +287,7 @@ class Kit:
     def make_round_planner(self, simulator: EnvBase, **own: Any) -> MCTSPlanner:
         """Return the planner of Algorithm 3's training rounds: bare, with the keys of ``planner``.
 
-        Args:
-            simulator: the macro env to plan in.
-            **own: what the trainer sets; another ``tree_policy`` of the configuration goes first.
+        ``own`` is what the trainer sets; another ``tree_policy`` of the configuration goes first.
         """
         bare: dict[str, Any] = {
             "_component_": "torchrl_hmcts.planners.MCTSPlanner",
@@ -339,13 +310,7 @@ class Kit:
     ) -> TensorDictModuleBase:
         """Return an untrained network for the manager: logits of the options, value of a state.
 
-        Args:
-            planner: over the options.
-            split: in which it is to be used.
-            scale: whether its inputs are scaled by the states that a few searches meet.
-
-        Raises:
-            ExperimentError: if the states have nothing of which a network can learn.
+        With ``scale`` its inputs are scaled by the states that a few searches meet.
         """
         if not self.manager_keys:
             raise ExperimentError(
@@ -362,12 +327,7 @@ class Kit:
         return network
 
     def guide(self, planner: MCTSPlanner, network: TensorDictModuleBase) -> MCTSPlanner:
-        """Return a planner with the prior and the values of a network.
-
-        Args:
-            planner: of :meth:`make_planner`.
-            network: writes ``"logits"`` and ``"state_value"``.
-        """
+        """Return a planner with the prior and the values of a network."""
         guide = PolicyValueEvaluator(network, uniform_share=0.05)
         return MCTSPlanner(
             planner.simulator.given_env,
@@ -394,14 +354,7 @@ class Kit:
         starts: TensorDictBase,
         keys: Sequence[NestedKey] = (),
     ) -> Results:
-        """Plan from each start and execute the plan.
-
-        Args:
-            planner: over the worker's options.
-            real: the macro env to act in.
-            starts: states ``[M]``.
-            keys: entries of the states to return.
-        """
+        """Plan from each start ``[M]`` and execute the plan; ``keys`` are entries to return."""
         return plan_and_execute(planner, real, starts, group=self.group, keys=keys)
 
     # ------------------------------------------------------- figures and pages
@@ -436,10 +389,7 @@ class Kit:
         }
 
     def map(self, env: EnvBase) -> Any:
-        """Return a map that draws the states of a base env; None if there is none.
-
-        See :class:`~torchrl_hmcts.trainers.figures.maps.MapDrawing`.
-        """
+        """Return a ``MapDrawing`` that draws the states of a base env; None if there is none."""
         return None
 
     def draw(self, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
@@ -460,14 +410,11 @@ class Kit:
         *,
         render: str = "",
     ) -> Results:
-        """Act in one episode and keep its states and options, base step by base step.
+        """Act in one episode from a start ``[1]``; keep its states and options, base step by base
+        step.
 
-        Args:
-            worker: executes the options.
-            planner: over the worker's options.
-            start: state ``[1]``.
-            render: ``"human"`` shows it in a window, ``"rgb_array"`` keeps the env's own pictures;
-                of an env that draws any. Default: neither.
+        ``render="human"`` shows it in a window, ``"rgb_array"`` keeps the env's own pictures; of an
+        env that draws any.
         """
         if render == "human":
             raise ValueError(f"{self.title}: no window. Leave render out, or write a film: out=.")
@@ -475,12 +422,7 @@ class Kit:
         return self.act(planner, self.make_real(worker, keys), start, keys)
 
     def write_film(self, episode: Results, path: str | Path) -> None:
-        """Write an episode as a GIF, and as a video beside it.
-
-        Args:
-            episode: of :meth:`film`.
-            path: of the GIF.
-        """
+        """Write an episode of :meth:`film` as a GIF, and as a video beside it."""
         write_film(self.map(self.make_env("test")), episode, path)
 
     def rows(self) -> list[tuple[str, str]]:
@@ -501,10 +443,10 @@ class Kit:
 
 
 def make_kit(config: SkillsConfig, *env: Any) -> Kit:
-    """Return the kit of a configuration.
+    """Return the kit of a configuration, which names it by its ``KIT``.
 
     Args:
-        config: its ``KIT`` names the kit.
+        config: keys of the experiment.
         *env: of a kit of Gymnasium envs, a function that makes the env instead of its id.
 
     Example:

@@ -57,23 +57,12 @@ _LOSS = {"gamma": 0.98, "alpha_init": 0.1, "fixed_alpha": False, "target_entropy
 
 
 def make_ant(name: Any, gait: Mapping[str, Any], **keywords: Any) -> AntView:
-    """Make an ant maze as the worker sees it.
-
-    Args:
-        name: id, or a function that makes the env.
-        gait: keywords of :class:`AntView`.
-        **keywords: of ``gymnasium.make``.
-    """
+    """Make an ant maze as the worker sees it."""
     return AntView(make_gym(name, **keywords), **gait)
 
 
 def open_arena(name: Any, **keywords: Any) -> gymnasium.Env:
-    """Make an ant maze whose walls touch nothing.
-
-    Args:
-        name: id, or a function that makes the env.
-        **keywords: of ``gymnasium.make``.
-    """
+    """Make an ant maze whose walls touch nothing."""
     env: gymnasium.Env = make_gym(name, **keywords)
     model, _ = find_physics(env)
     for i in range(model.ngeom):
@@ -83,12 +72,7 @@ def open_arena(name: Any, **keywords: Any) -> gymnasium.Env:
 
 
 class Arena(MujocoTask):
-    """A task without reward or goal, which ends where the ant falls.
-
-    Args:
-        env (gymnasium.Env): an ant maze.
-        repeat, strength: as of :class:`AntView`.
-    """
+    """A task without reward or goal, which ends where the ant falls."""
 
     def __init__(self, env: gymnasium.Env, *, repeat: int = 1, strength: float = 1.0) -> None:
         super().__init__(env)
@@ -169,10 +153,6 @@ class Imagine(Transform):
 
     Both are exact: the reward is a function of skill and displacement, and a turned body moves as
     the body does.
-
-    Args:
-        num_skills: that are drawn from.
-        share: of the transitions.
     """
 
     def __init__(self, num_skills: int, share: float) -> None:
@@ -210,10 +190,6 @@ class AntKit(GymKit):
 
     Skills are learned by LSD where no wall touches, in an episode that ends where the ant falls;
     :class:`AntView`, :class:`SkillFrame` and :class:`Imagine` say what is given besides.
-
-    Args:
-        config: keys of the experiment.
-        env: makes the env instead of the id of ``config``.
     """
 
     worker_keys = ("body",)  # type: ignore[assignment]

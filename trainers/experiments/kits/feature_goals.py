@@ -36,18 +36,9 @@ def find_goals(
 
     .. math:: e_{af} = \frac{\bar\Delta_{af} - \frac{1}{A} \sum_b \bar\Delta_{bf}}{\text{span}_f}.
 
-    A feature that one action raises and another lowers gets five values, evenly from a tenth
-    of its span below what the walks, the starts and their goals have to a tenth above.
-
-    Args:
-        make: makes the env.
-        features: as of :class:`OptionPool`; the whole observation, where it does not show these.
-        starts: ``[S]`` of episodes, with their ``"features"``.
-        option_steps: base steps for which an action is held.
-        seed: of the walks.
-
-    Raises:
-        ExperimentError: if no action controls a feature.
+    A feature that one action raises and another lowers gets five values, evenly from a tenth of its
+    span below what the walks, the starts ``[S]`` and their goals have to a tenth above. Where a
+    worker's observation does not show the features, it is the whole observation instead.
     """
     env = make()
     try:

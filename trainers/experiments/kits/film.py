@@ -13,17 +13,9 @@ from torchrl_hmcts.envs.gym.features import Features
 
 
 class Film:
-    """Keeps options, features and pictures of all base steps that a pool without processes takes.
+    """Keeps of each base step of a pool without processes the option, features ``[F]`` and picture.
 
-    Args:
-        features: what is kept of a state.
-        render: whether the env is asked for pictures.
-
-    Attributes:
-        options: under way in each base step.
-        points: features ``[F]`` after each base step.
-        frames: pictures after each base step, uint8 ``[height, width, 3]``; none where the env
-            draws none.
+    There are pictures only where they are asked for and the env draws any.
     """
 
     def __init__(self, features: Features, render: bool = False) -> None:
@@ -37,11 +29,7 @@ class Film:
         self.frames: list[np.ndarray] = []
 
     def of(self, make: Callable[[], gymnasium.Env], worker: Any) -> tuple[Any, Any]:
-        """Return what makes the env, and the worker, for a pool that is filmed.
-
-        Args:
-            make, worker: of the pool.
-        """
+        """Return what makes the env, and the worker, for a pool that is filmed."""
         return partial(_Filmed, make, self), _FilmedWorker(worker, self)
 
 

@@ -50,13 +50,7 @@ _GOALS = ("achieved_goal", "desired_goal")
 
 
 def make_seen(name: Any, given: bool, **keywords: Any) -> gymnasium.Env:
-    """Make an env as options see it: MiniGrid without pictures, if no skill is to be learned.
-
-    Args:
-        name: id, or a function that makes the env.
-        given: whether the options are given.
-        **keywords: of ``gymnasium.make``.
-    """
+    """Make an env as options see it: MiniGrid without pictures, if no skill is to be learned."""
     env: gymnasium.Env = make_gym(name, **keywords)
     return GridView(env) if given and MiniGridSnapshot.fits(env) else env
 
@@ -64,11 +58,7 @@ def make_seen(name: Any, given: bool, **keywords: Any) -> gymnasium.Env:
 def make_task(make: Any, look: Look, real: bool, keywords: Mapping[str, Any]) -> gymnasium.Env:
     """Make an env as the task that a look found, in any process.
 
-    Args:
-        make: makes the env.
-        look: of :func:`look_at`.
-        real: pay what the env itself pays, and call only a success terminal.
-        keywords: of ``gymnasium.make``.
+    A ``real`` one pays what the env itself pays, and calls only a success terminal.
     """
     task = look.task(make(**keywords))
     task.is_real = real
@@ -94,16 +84,6 @@ class GymKit(Kit):
 
     Option length, features, novelty radius and the kind of task are found by a short look at the
     env, printed, and changed by the keys of :class:`GymConfig`.
-
-    Args:
-        config: keys of the experiment.
-        env: makes the env instead of the id of ``config``.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.experiments.gym_settings import GymConfig
-        >>> kit = GymKit(GymConfig(id="MountainCar-v0", options="actions"))
-        >>> kit.look.kind, kit.config.option_steps
-        ('goal', 14)
     """
 
     place_key = "features"
@@ -147,11 +127,7 @@ class GymKit(Kit):
         self._radius = config.novelty_radius  # 0: found
 
     def maker(self, name: Any) -> Any:
-        """Return what makes the env as options see it, from keywords of ``gymnasium.make``.
-
-        Args:
-            name: id, or a function that makes the env.
-        """
+        """Return what makes the env as options see it, from keywords of ``gymnasium.make``."""
         return partial(make_seen, name, self.config.options != "learned")
 
     @cached_property
@@ -219,13 +195,11 @@ class GymKit(Kit):
         film: Film | None = None,
         render: str = "",
     ) -> OptionPool:
-        """Return a pool of options.
+        """Return a pool of the worker's options.
 
-        Args:
-            worker: executes them.
-            real: to act in, rather than to plan in: rewards are the env's own, not discounted.
-            film: records what happens.
-            render: mode in which the env draws itself.
+        A ``real`` one is to act in, rather than to plan in: rewards are the env's own, not
+        discounted. A ``film`` records what happens; ``render`` is the mode in which the env draws
+        itself.
         """
         config, keywords = self.config, dict(self.config.make)
         if render:
@@ -249,11 +223,7 @@ class GymKit(Kit):
         )
 
     def pool_worker(self, worker: SkillPolicy) -> OptionWorker:
-        """Return learned skills as the worker of a pool.
-
-        Args:
-            worker: the skills.
-        """
+        """Return learned skills as the worker of a pool."""
         return SkillWorker(worker.actor, deterministic=worker.deterministic)
 
     def describe(self) -> str:

@@ -51,17 +51,7 @@ TURN_ACTIONS = ("forward", "look left", "look right")
 
 
 def make_lab_env(maze_seeds: Sequence[int] = range(TRAINING_MAZES), **kwargs: Any) -> LabMazeEnv:
-    """Build the maze as the experiment plays it: only the goal is rewarded, and ends the episode.
-
-    Args:
-        maze_seeds: of the mazes.
-        **kwargs: of :class:`~torchrl_hmcts.envs.LabMazeEnv`, e.g. ``rows``, ``fps``, ``friction``.
-
-    Example:
-        >>> env = make_lab_env([1])
-        >>> env.num_steps, env.apple_reward, env.goal_reward
-        (4, 0.0, 1.0)
-    """
+    """Build the maze as the experiment plays it: only the goal is rewarded, and ends it."""
     settings: dict[str, Any] = {
         "num_steps": 4,
         "apple_reward": 0.0,  # a search ends with the first reward, which is to be the goal's
@@ -76,15 +66,6 @@ def held_out_seeds(num_mazes: int, size: int = 9, *, first: int = TEST_SEED) -> 
     """Return seeds of mazes none of which is the maze of a training seed, or of another of them.
 
     Small mazes can come twice, from different seeds; such ones are left out.
-
-    Args:
-        num_mazes: how many.
-        size: cells of a side, border included.
-        first: the first seed that is looked at.
-
-    Example:
-        >>> held_out_seeds(3)
-        [1000000, 1000001, 1000002]
     """
     known = {lab_maze(seed, size, size) for seed in range(TRAINING_MAZES)}
 
@@ -99,19 +80,7 @@ def held_out_seeds(num_mazes: int, size: int = 9, *, first: int = TEST_SEED) -> 
 
 
 def make_starts(env: LabMazeEnv, seed: int) -> TensorDict:
-    """Draw one of its spawn points and a heading for each maze of an env.
-
-    Args:
-        env: whose mazes are used, one episode each.
-        seed: of the draw.
-
-    Returns:
-        States ``[M]`` at rest.
-
-    Example:
-        >>> make_starts(make_lab_env([1, 2, 3]), seed=0)["maze_index"].tolist()
-        [0, 1, 2]
-    """
+    """Draw one of its spawn points and a heading for each maze of an env; return states ``[M]``."""
     generator = np.random.default_rng(seed)
     mazes = np.arange(env.num_mazes)
     spawn = (generator.random(len(mazes)) * env.layout.num_spawns).astype(np.int64)
@@ -125,11 +94,6 @@ class LabMazeKit(Kit):
 
     The worker sees how it moves and where east is, the discriminator the displacement in cells:
     skills are directions on the map, whichever way the player faces.
-
-    Example:
-        >>> kit = LabMazeKit(LabMazeConfig(mazes=3))
-        >>> kit.starts("test", 3)["maze_index"].tolist()
-        [0, 1, 2]
     """
 
     config: LabMazeConfig  # type: ignore[assignment]
@@ -437,13 +401,6 @@ def stall_transform(env: LabMazeEnv) -> StallTransform:
 
     Who pushes against a wall has nothing to gain from the rest of an option. A start from rest is
     faster than that within 4 frames.
-
-    Args:
-        env: whose action repeat and speed count.
-
-    Example:
-        >>> round(stall_transform(make_lab_env([1])).tolerance, 2)  # world units
-        6.14
     """
     seconds = env.num_steps * env.frame_msec / 1000.0
     return StallTransform("position", tolerance=_STALL_SPEED * env.TOP_SPEED * seconds)
@@ -452,13 +409,8 @@ def stall_transform(env: LabMazeEnv) -> StallTransform:
 def wrong_models(error: float) -> dict[str, dict[str, Any]]:
     """Return the real env's clock and friction beside a model of 60 frames a second and friction 6.
 
-    Args:
-        error: share by which both differ; the engine rounds the length of a frame to milliseconds,
-            so that 5 % fewer frames a second are 17 ms each instead of 16.
-
-    Example:
-        >>> wrong_models(0.05)["slower clock, more friction"]
-        {'fps': 57, 'friction': 6.3}
+    Both differ by the share ``error``; the engine rounds the length of a frame to milliseconds, so
+    that 5 % fewer frames a second are 17 ms each instead of 16.
     """
     low, high = round(60 * (1 - error)), round(60 * (1 + error))
     less, more = round(6.0 * (1 - error), 4), round(6.0 * (1 + error), 4)

@@ -20,13 +20,8 @@ class ShortestPathScript:
     """Walks from cell to cell along a shortest path: turns to the next centre and walks there.
 
     It knows the maze and needs no learning: a reference for how long an episode takes, not a bound
-    (it does not cut corners, nor does it brake before them).
-
-    Args:
-        env: whose mazes are walked; it plays them in an env of its own, frame by frame.
-
-    Raises:
-        ValueError: if a maze has no goal.
+    (it does not cut corners, nor does it brake before them). It plays an env's mazes in an env of
+    its own, frame by frame.
 
     Reference:
         Dissertation, section 4.3.1, whose mazes take "thousands of time steps".

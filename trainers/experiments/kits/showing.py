@@ -1,18 +1,23 @@
-"""The pictures of a run over any kit: an episode, its search, the skills, their training."""
+"""What a run over any kit gives: learned skills, episodes, and pictures of both."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives import LossModule
 
 from torchrl_hmcts.modules import SkillPolicy
+from torchrl_hmcts.planners import MCTSPlanner
 from torchrl_hmcts.trainers.evaluation import Results
-from torchrl_hmcts.trainers.experiments.kits.trial import LearnedSkills, Trial
 from torchrl_hmcts.trainers.figures.pictures import Pictures
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 
 CAPTIONS: Mapping[str, str] = {
     "episode.gif": "A test maze as it was solved: the plan (pale; colours are skills) and the "
@@ -27,13 +32,54 @@ CAPTIONS: Mapping[str, str] = {
 """Captions of the pictures."""
 
 
-def start_to_show(trial: Trial, lengths: np.ndarray) -> int:
-    """Return a start that was solved, if any, with a rather long way.
+@dataclass
+class LearnedSkills:
+    """A worker and how it became what it is.
 
-    Args:
-        trial: the episodes.
-        lengths: how far each start is from its goal, ``[M]``.
+    Attributes:
+        worker (TensorDictModule): with its most probable actions.
+        loss (LossModule, optional): with its networks; None where nothing was learned.
+        history (mapping): all logged curves.
+        tests (RoundRecords): what it achieved while it learned.
+        steps (int): base steps of training, simulated ones included.
+        worker_step (int): those that the networks have seen that are kept.
+        rounds (int): of Algorithm 3.
+        seconds (float): of the processor, tests included.
     """
+
+    worker: TensorDictModuleBase
+    loss: LossModule | None
+    history: Mapping[str, list[float]]
+    tests: RoundRecords
+    steps: int
+    worker_step: int
+    rounds: int
+    seconds: float
+
+
+@dataclass
+class Trial:
+    """One episode from each start: a plan, executed in another instance of the env.
+
+    Attributes:
+        starts (TensorDict): states ``[M]``.
+        planner (MCTSPlanner): with which the plans were made.
+        results (Results): what they led to.
+        second_searches (int): starts that were searched twice.
+        compile_seconds (float): until the first plan of all was made.
+        cpu_seconds (float): of all searches and episodes.
+    """
+
+    starts: TensorDictBase
+    planner: MCTSPlanner
+    results: Results
+    second_searches: int
+    compile_seconds: float
+    cpu_seconds: float
+
+
+def start_to_show(trial: Trial, lengths: np.ndarray) -> int:
+    """Return a start that was solved, if any, with a rather long way, by their lengths ``[M]``."""
     solved = np.flatnonzero(trial.results.solved)
     among = solved if len(solved) else np.arange(len(trial.starts))
     by_length = among[np.argsort(lengths[among], kind="stable")]
@@ -41,14 +87,7 @@ def start_to_show(trial: Trial, lengths: np.ndarray) -> int:
 
 
 def draw_run(kit: Any, pictures: Pictures, learned: LearnedSkills, trial: Trial) -> None:
-    """Draw the pictures of a run.
-
-    Args:
-        kit: the :class:`Kit` of the run.
-        pictures: receives them.
-        learned: the skills.
-        trial: the episodes.
-    """
+    """Draw the pictures of a run."""
     config, captions = kit.config, kit.captions
     shown, episode, search = kit.replay(learned.worker, trial)
     drawing = kit.map(kit.make_env("test"))
@@ -83,13 +122,7 @@ def draw_run(kit: Any, pictures: Pictures, learned: LearnedSkills, trial: Trial)
 
 
 def write_film(drawing: Any, episode: Results, path: str | Path) -> None:
-    """Write an episode as a GIF, and as a video beside it.
-
-    Args:
-        drawing: draws the states of the env, see ``Kit.map``; the env's own pictures go first.
-        episode: with its states and options, or frames.
-        path: of the GIF.
-    """
+    """Write an episode as a GIF, and as a video beside it, of the env's own pictures if any."""
     from torchrl_hmcts.trainers.figures import animation, maps
 
     if episode.frames or drawing is None:

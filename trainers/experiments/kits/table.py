@@ -23,11 +23,8 @@ class ValueTable:
 
     over the outcomes that option :math:`o` had in :math:`s`; 0 where nothing is known. So what was
     drawn in one branch of a tree counts in all others. An outcome backs up its state, then those
-    that led to it, a few at a time (prioritized sweeping).
-
-    Args:
-        keys: entries that tell states apart, but for clocks and generators.
-        gamma: discount per base step.
+    that led to it, a few at a time (prioritized sweeping). ``keys`` are the entries that tell
+    states apart, but for clocks and generators.
 
     Reference:
         Moore and Atkeson, "Prioritized sweeping", 1993.
@@ -50,12 +47,7 @@ class ValueTable:
         return [b"".join(part[i].tobytes() for part in parts) for i in range(len(td))]
 
     def note(self, before: TensorDictBase, after: TensorDictBase) -> None:
-        """Take note of outcomes.
-
-        Args:
-            before: states ``[m]`` and options.
-            after: what a pool's step wrote.
-        """
+        """Take note of outcomes."""
         discounts = np.where(after["terminated"], 0.0, self.gamma ** after["duration"].numpy())
         rows = zip(
             self._states(before.reshape(-1)),
@@ -89,11 +81,7 @@ class ValueTable:
             self._waiting.extend(s for s in self._before[state] if s not in self._waiting)
 
     def choose(self, search: Search) -> np.ndarray:
-        """Return the best option of each root, by all that is known of its state, ``[B]``.
-
-        Args:
-            search: whose roots have been searched.
-        """
+        """Return the best option of each root, by all that is known of its state, ``[B]``."""
         roots = np.arange(search.num_roots)
         states = search.tree.get_states(roots, 0 * roots, self.keys)
         found = [self._option_values(state) for state in self._states(states)]

@@ -136,11 +136,6 @@ class WaterworldKit(Kit):
     """Waterworld's mazes: skills thrust, options last 25 base steps, a maze is its target reached.
 
     Starts while it learns (split ``"curve"``) are in training mazes.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.experiments.settings import DemoConfig
-        >>> WaterworldKit(DemoConfig()).make_env("test").num_mazes
-        342
     """
 
     config: DemoConfig

@@ -75,12 +75,7 @@ class _AntToGoal(_ToGoal):
 
 
 def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel | EffectModel:
-    """Return the option model of recorded episodes: of effects in puzzles, of places in mazes.
-
-    Args:
-        data: as of :func:`~torchrl_hmcts.trainers.experiments.ogbench.data.record`.
-        config: of the run.
-    """
+    """Return the option model of recorded episodes: of effects in puzzles, of places in mazes."""
     seen, ends = data["observation"].float(), data["done"][:, 0]
     places = seen[:, config.place]
     if config.recipe.kind == "play":
@@ -98,13 +93,7 @@ def fit_model(data: TensorDictBase, config: OGBenchConfig) -> LandmarkModel | Ef
 
 @dataclass
 class Learned:
-    """A worker and its training, which a checkpoint keeps beside the networks.
-
-    Attributes:
-        loss: with the worker in ``actor_network``.
-        curves: of the loss's outputs, by name, and the ``"updates"`` at which they were taken.
-        cpu_seconds: of the training.
-    """
+    """A worker in ``loss.actor_network``, and its training, which a checkpoint keeps beside it."""
 
     loss: GoalCloningLoss
     curves: dict[str, list[float]] = field(default_factory=dict)
@@ -115,21 +104,12 @@ class Learned:
         return {"curves": self.curves, "cpu_seconds": self.cpu_seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over a training.
-
-        Args:
-            state_dict: of :meth:`state_dict`.
-        """
+        """Take over a training."""
         self.curves, self.cpu_seconds = state_dict["curves"], state_dict["cpu_seconds"]
 
 
 def make_loss(data: TensorDictBase, config: OGBenchConfig) -> GoalCloningLoss:
-    """Return the loss of a worker that reads ``"observation"`` and ``"goal"``, writes ``"action"``.
-
-    Args:
-        data: recorded episodes, for the sizes and the spread of the observation.
-        config: of the run.
-    """
+    """Return the loss of a worker of ``"observation"`` and ``"goal"`` that writes ``"action"``."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         actions, seen = data["action"].shape[-1], data["observation"].float()
@@ -247,16 +227,8 @@ class _NextEffect(_Hindsight):
 class OptionAgent:
     """Acts towards a goal: a search before every option, and a worker that takes it.
 
-    It sees observations and a goal, and nothing of the env.
-
-    Args:
-        model: of the options.
-        worker: reads ``"observation"`` and ``"goal"``, writes ``"action"``.
-        config: of the run.
-
-    Attributes:
-        planner: of type :class:`MCTSPlanner`.
-        num_options: options taken in this episode.
+    It sees observations and a goal, and nothing of the env. Its worker reads ``"observation"`` and
+    ``"goal"`` and writes ``"action"``.
     """
 
     def __init__(self, model: Any, worker: TensorDictModule, config: OGBenchConfig) -> None:
@@ -276,21 +248,13 @@ class OptionAgent:
         )
 
     def begin(self, goal: np.ndarray) -> None:
-        """Begin an episode.
-
-        Args:
-            goal: an observation of it.
-        """
+        """Begin an episode with an observation of its goal."""
         self._begin(torch.from_numpy(goal).float())
         self._has_begun = False
         self._steps, self._limit, self.num_options = 0, 0, 0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return an action.
-
-        Args:
-            observation: of the env.
-        """
+        """Return an action in an observation."""
         seen = torch.from_numpy(observation).float()
         if not self._has_begun or self._is_over(seen):
             self._has_begun, self._steps = True, 0
@@ -302,11 +266,7 @@ class OptionAgent:
         return action
 
     def search(self, landmark: Tensor) -> int:
-        """Return the option with which a search begins.
-
-        Args:
-            landmark: of the agent, int64 ``[1]``.
-        """
+        """Return the option with which a search from a landmark, int64 ``[1]``, begins."""
         self.num_options += 1
         state = TensorDict(landmark=landmark, goal=self._goal_landmark, batch_size=[1])
         return int(self.planner(self._env.reset(state, set_state=True))["action"])
@@ -329,19 +289,11 @@ def _limit(duration: Tensor) -> int:
 
 
 class LandmarkAgent(OptionAgent):
-    """Goes from landmark to landmark.
+    """Goes from landmark to landmark; ``path`` has those of this episode.
 
     An option ends near its landmark, after a jump, or when it has taken three times its base steps;
     then it is thought longer by these for the rest of the episode, so that the next search may find
     another way.
-
-    Args:
-        model: of the options, a :class:`LandmarkModel`.
-        worker: reads ``"observation"`` and ``"goal"``, writes ``"action"``.
-        config: of the run.
-
-    Attributes:
-        path: landmarks to which the options of this episode led.
     """
 
     def __init__(
@@ -400,11 +352,6 @@ class EffectAgent(OptionAgent):
     """Makes one effect after another: it goes where it happens, until switches change.
 
     When nothing has changed after three times the base steps of an option, it searches again.
-
-    Args:
-        model: of the options, an :class:`EffectModel`.
-        worker: reads ``"observation"`` and ``"goal"``, writes ``"action"``.
-        config: of the run.
     """
 
     def _begin(self, goal: Tensor) -> None:
@@ -426,13 +373,7 @@ class EffectAgent(OptionAgent):
 def make_agent(
     model: LandmarkModel | EffectModel, worker: TensorDictModule, config: OGBenchConfig
 ) -> OptionAgent:
-    """Return the agent that plans in a model.
-
-    Args:
-        model: of :func:`fit_model`.
-        worker: of :func:`learn`.
-        config: of the run.
-    """
+    """Return the agent that plans in a model."""
     if isinstance(model, EffectModel):
         return EffectAgent(model, worker, config)
     return LandmarkAgent(model, worker, config)

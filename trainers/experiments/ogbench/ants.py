@@ -26,9 +26,6 @@ class AntWalker:
     that is turned it leads elsewhere. Of the four quarters the one is taken whose frame is nearest
     to the heading. So an action is a function of the state and the direction, as it is of OGBench's
     expert, and a network can clone it.
-
-    Args:
-        folder: of a run or an agent of the kit ``ant`` in one of OGBench's mazes.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -59,15 +56,7 @@ class AntWalker:
         return self._action(self._skills.act(body, self._skill, self._draws), -quarter % 4)
 
     def __call__(self, seen: np.ndarray, way: np.ndarray) -> np.ndarray:
-        """Return an action.
-
-        Args:
-            seen: positions and velocities of the ant, ``[29]``.
-            way: where it shall walk, a vector ``[2]``.
-
-        Returns:
-            ``[8]``.
-        """
+        """Return an action ``[8]`` of an ant, ``[29]``, that shall walk along a vector ``[2]``."""
         _, (c, s) = body_of(seen)
         first = math.atan2(way[1], way[0]) - self._angle  # of the frame, without a quarter
         quarter = round((first - math.atan2(s, c)) / (math.pi / 2))

@@ -19,7 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs.gym.settable import make_gym
-from torchrl_hmcts.trainers.experiments.ogbench.names import Recipe, split_name
+from torchrl_hmcts.trainers.experiments.ogbench.config import Recipe, split_name
 from torchrl_hmcts.trainers.saving.files import replacing
 
 Cell = tuple[int, int]
@@ -195,18 +195,7 @@ def _steps_from(free: np.ndarray, cell: Cell) -> np.ndarray:
 
 
 def load(path: str | Path) -> TensorDictBase:
-    """Read recorded episodes: a folder that :func:`save` wrote, or a file of OGBench's.
-
-    Args:
-        path: folder, or ``.npz``.
-
-    Returns:
-        As of :func:`record`.
-
-    Raises:
-        FileNotFoundError: if it is not there.
-        ValueError: if it holds something else.
-    """
+    """Read recorded episodes: a folder that :func:`save` wrote, or OGBench's own ``.npz``."""
     path = Path(path)
     if path.suffix != ".npz":
         found = TensorDict.load_memmap(path, allow_pickle=False)
@@ -224,12 +213,7 @@ def load(path: str | Path) -> TensorDictBase:
 
 
 def save(data: TensorDictBase, folder: str | Path) -> None:
-    """Write recorded episodes, whole or not at all, as memory-mapped tensors.
-
-    Args:
-        data: of :func:`record`.
-        folder: made if absent.
-    """
+    """Write recorded episodes, whole or not at all, as memory-mapped tensors."""
     Path(folder).parent.mkdir(parents=True, exist_ok=True)
     with replacing(folder) as temporary:
         data.memmap(temporary)

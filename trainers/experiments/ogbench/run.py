@@ -22,9 +22,8 @@ from torchrl_hmcts.trainers.experiments.ogbench.agent import (
     make_agent,
     make_loss,
 )
-from torchrl_hmcts.trainers.experiments.ogbench.config import FOLDER, OGBenchConfig
+from torchrl_hmcts.trainers.experiments.ogbench.config import FOLDER, OGBenchConfig, split_name
 from torchrl_hmcts.trainers.experiments.ogbench.data import load, quiet, record, save
-from torchrl_hmcts.trainers.experiments.ogbench.names import split_name
 from torchrl_hmcts.trainers.figures.intervals import wilson
 from torchrl_hmcts.trainers.runs.console import counted, table
 from torchrl_hmcts.trainers.runs.run import open_run
@@ -37,11 +36,7 @@ _TASKS = 5
 def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
     """Run ``hmcts train kit=ogbench env.id=NAME``; return its figures.
 
-    Args:
-        config: of the run.
-
-    Returns:
-        The figures. Nothing of the simulator's state is read: the agent sees what a step returns.
+    Nothing of the simulator's state is read: the agent sees what a step returns.
 
     Reference:
         Park et al., "OGBench: Benchmarking offline goal-conditioned RL", 2024, arXiv 2410.20092.
@@ -92,11 +87,7 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
 
 
 def evaluate_ogbench(config: OGBenchConfig) -> dict[str, Any]:
-    """Act again with what a run has learned.
-
-    Args:
-        config: of the run, whose folder is ``out``; changed keys change the test.
-    """
+    """Act again with what a run, whose folder is ``out``, has learned."""
     config = config.sized()
     torch.set_num_threads(1)
     data = recorded(config)
@@ -108,11 +99,7 @@ def evaluate_ogbench(config: OGBenchConfig) -> dict[str, Any]:
 
 
 def recorded(config: OGBenchConfig) -> TensorDictBase:
-    """Return the recorded episodes of a run; record them where there are none yet.
-
-    Args:
-        config: of the run.
-    """
+    """Return the recorded episodes of a run; record them where there are none yet."""
     path = Path(config.data) if config.data else FOLDER / config.id
     if not config.data and not path.exists():
         print(f"Recording {config.id} in {path} ...", flush=True)
@@ -129,14 +116,8 @@ def play_tasks(
 ) -> list[dict[str, Any]]:
     """Act in every episode of every task; an episode is drawn by its number and the run's seed.
 
-    Args:
-        agent: acts.
-        config: of the run.
-        progress: wraps the episodes.
-
-    Returns:
-        Of each episode ``task``, ``solved``, ``steps``, ``options``, ``cpu_seconds``,
-        ``plan_seconds`` (of each option) and ``places`` (``[steps + 1, F]``).
+    Returns of each ``task``, ``solved``, ``steps``, ``options``, ``cpu_seconds``, ``plan_seconds``
+    (of each option) and ``places`` (``[steps + 1, F]``).
     """
     env = make_gym(split_name(config.id).env)
     numbers = [(task, i) for task in range(1, _TASKS + 1) for i in range(config.episodes)]
@@ -149,17 +130,7 @@ def play_tasks(
 def act_once(
     env: gymnasium.Env, agent: OptionAgent, task: int, seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Act in one episode.
-
-    Args:
-        env: of OGBench, as :func:`make_gym` makes it.
-        agent: acts.
-        task: 1 to 5.
-        seeds: what start, goal and chance are drawn from.
-
-    Returns:
-        As of :func:`play_tasks`, for one episode.
-    """
+    """Act in one episode of a task, 1 to 5; start, goal and chance are drawn from ``seeds``."""
     seed = int(np.random.SeedSequence(seeds).generate_state(1)[0])
     env.seed_globals(seed)  # type: ignore[attr-defined]
     begin = time.process_time()
@@ -186,11 +157,7 @@ def act_once(
 
 
 def summary(episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of episodes: shares solved with 95 % intervals, steps and seconds.
-
-    Args:
-        episodes: of :func:`play_tasks`.
-    """
+    """Return the figures of episodes: shares solved with 95 % intervals, steps and seconds."""
     tasks = sorted({e["task"] for e in episodes})
     by_task = [np.mean([e["solved"] for e in episodes if e["task"] == task]) for task in tasks]
     solved = [e for e in episodes if e["solved"]]

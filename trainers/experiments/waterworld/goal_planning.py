@@ -14,7 +14,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv
 from torchrl_hmcts.planners import (
     GoalPlanner,
@@ -88,8 +87,6 @@ class TilePlanner:
 
     Args:
         env: Waterworld, or another env with such a state and ``mazes``.
-        leaves_per_wave: leaves of each root in one look-up of the table. Default 16: about all that
-            are open at a time.
 
     Reference:
         Dissertation, sections 3.1.2 and 3.2.1. The bound is that of A* (Hart, Nilsson and Raphael,
@@ -107,9 +104,7 @@ class TilePlanner:
 
     in_keys = list(_IN_KEYS)
 
-    def __init__(self, env: WaterworldMazeEnv, *, leaves_per_wave: int = 16) -> None:
-        leaves = whole_number("TilePlanner", "leaves_per_wave", leaves_per_wave, least=1)
-        self.leaves_per_wave = leaves
+    def __init__(self, env: WaterworldMazeEnv) -> None:
         self.width = env.width
         self.moves = tile_moves(env.mazes.cpu())  # [M, T, A]
         tiles = np.arange(env.height * env.width)
@@ -155,7 +150,7 @@ class TilePlanner:
             num_options,
             SearchSettings(
                 novelty=RadiusNovelty("tile", 0.5, shorter_paths=True, max_relaxations=0),
-                leaves_per_wave=self.leaves_per_wave,
+                leaves_per_wave=16,  # about all that are open at a time
             ),
             capacity=512,
         )
@@ -219,19 +214,7 @@ class TilePlanner:
 
 
 def tile_moves(mazes: Tensor) -> np.ndarray:
-    """Read the moves of the Gridworld off by one step with each action from each tile.
-
-    Args:
-        mazes: bool ``[M, H, W]``.
-
-    Returns:
-        int16 array ``[M, T, A]``: the tile that an action leads to.
-
-    Example:
-        >>> import torch
-        >>> tile_moves(torch.zeros(1, 1, 2, dtype=torch.bool))[0].tolist()  # up to right, none
-        [[0, 0, 0, 1, 0], [1, 1, 0, 1, 1]]
-    """
+    """Read off the Gridworld of ``[M, H, W]`` where actions lead, int16 ``[M, T, A]``."""
     env = GridworldMazeEnv(mazes, observation=False, seed=0)
     num_tiles, num_actions = env.height * env.width, int(env.action_spec.space.n)
     state = env.reset().expand(env.num_mazes, num_tiles, num_actions).clone()
@@ -249,7 +232,6 @@ def make_goal_env(
     observation: bool = True,
     batch_size: Sequence[int] = (),
     seed: int | None = None,
-    device: torch.device | str | None = None,
     **subgoal_kwargs: Any,
 ) -> TransformedEnv:
     """Make the worker's env: Waterworld with the manager's goals and the worker's reward.
@@ -257,7 +239,7 @@ def make_goal_env(
     Args:
         mazes: bool ``[M, H, W]``. Default: the training split.
         planner: the manager. Default: a :class:`TilePlanner`.
-        max_steps, observation, batch_size, seed, device: as in :class:`WaterworldMazeEnv`.
+        max_steps, observation, batch_size, seed: as in :class:`WaterworldMazeEnv`.
         **subgoal_kwargs: passed to :class:`SubgoalTransform`.
 
     Returns:
@@ -269,14 +251,8 @@ def make_goal_env(
         >>> td["goals"].shape, td["next", "reward"].shape
         (torch.Size([4, 5, 6]), torch.Size([4, 5, 1]))
     """
-    env = WaterworldMazeEnv(
-        mazes,
-        max_steps=max_steps,
-        observation=observation,
-        batch_size=batch_size,
-        seed=seed,
-        device=device,
-    )
+    own: dict[str, Any] = {"max_steps": max_steps, "observation": observation}
+    env = WaterworldMazeEnv(mazes, batch_size=batch_size, seed=seed, **own)
     settings = {"max_goals": env.height * env.width - env.num_walls, **subgoal_kwargs}
     manager = TilePlanner(env) if planner is None else planner
     return TransformedEnv(env, SubgoalTransform(manager, **settings))

@@ -7,18 +7,18 @@ columns, A options, C channels.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 _FAR = 99.0  # tiles, farther than any tile can be
+_STEPS_PER_TILE = 15.0  # base steps, at the speed that thrust reaches
 _NEIGHBOURS = tuple((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx)
 _TARGET_STEPS_PER_TILE = 256  # targets are told apart to that fraction of a tile
 _CACHE_SIZE = 4096
@@ -27,36 +27,21 @@ _CACHE_SIZE = 4096
 class MazeNetwork(TensorDictModuleBase):
     r"""Prior and value for mazes of tiles: learned step costs, shortest paths, a small head.
 
-    A convolution over the walls gives each tile the costs :math:`c > 0` of moving to its 8
-    neighbours. Shortest paths by these costs give each tile its distance to the target,
+    A convolution over the walls of ``mazes``, bool ``[M, H, W]``, gives each tile the costs
+    :math:`c > 0` of moving to its 8 neighbours. Shortest paths by these costs give each tile its
+    distance to the target,
 
     .. math:: d(x) = \min\bigl(d_0(x),\ \min_{y \in N(x)} c(x, y) + d(y)\bigr), \qquad
               d_0(x) = \lVert x - x_{target} \rVert_\infty \text{ if below 1, else far,}
 
     through which gradients flow along the shortest paths: value iteration inside the network, in
     logarithms of values. A fully connected head reads the distances and walls of the 3 x 3 tiles
-    around the player, its place in its tile, its velocity and the near target, and writes logits of
-    the options and the base steps :math:`n` to the target; the value is :math:`\gamma^n`.
+    around the player, its place in its tile, its velocity and the near target, and writes
+    ``"logits"`` of the options, ``[*B, A]``, and the base steps :math:`n` to the target; the
+    ``"state_value"``, ``[*B, 1]``, is :math:`\gamma^n`.
 
     Without gradients the distances of a maze and its target are computed once and kept until a
     weight changes, so that a planner pays only for the head at each node of a tree.
-
-    Args:
-        mazes: bool ``[M, H, W]``, True = wall, that ``"maze_index"`` counts. Not part of the state
-            dict: see :meth:`on`.
-        num_options: A. Default 4.
-        gamma: discount per base step, as in the macro environment. Default 0.99.
-        channels: C of the convolution. Default 32.
-        hidden: width of the head's two hidden layers. Default 64.
-        steps_per_tile: unit of the distances in base steps. Default 15, what a tile takes at the
-            speed that thrust reaches.
-        keys: entries read: place, velocity, target (float ``[*B, 2]``, in tiles), number of the
-            maze (int64 ``[*B]``). Default: Waterworld's.
-
-    Writes: ``"logits"`` (float ``[*B, A]``), ``"state_value"`` (float ``[*B, 1]``).
-
-    Raises:
-        ValueError: if ``mazes`` has not three dimensions, or a number is out of its range.
 
     Reference:
         Tamar et al., "Value iteration networks", 2016, arXiv 1602.02867, for planning inside a
@@ -80,36 +65,27 @@ class MazeNetwork(TensorDictModuleBase):
         num_options: int = 4,
         *,
         gamma: float = 0.99,
-        channels: int = 32,
-        hidden: int = 64,
-        steps_per_tile: float = 15.0,
-        keys: Sequence[NestedKey] = KEYS,
     ) -> None:
         super().__init__()
-        self.in_keys = list(keys)
+        self.in_keys = list(self.KEYS)
         if not 0.0 < gamma < 1.0:
             raise ValueError(
                 f"MazeNetwork writes values gamma ** n, so gamma must lie in (0, 1); got {gamma}."
             )
-        if not steps_per_tile > 0.0:
-            raise ValueError(
-                f"MazeNetwork needs steps_per_tile > 0, in base steps; got {steps_per_tile}."
-            )
         self.gamma = gamma
         self.num_options = num_options
-        self.steps_per_tile = steps_per_tile
-        first, last = nn.Conv2d(1, channels, 3, padding=1), nn.Conv2d(channels, 8, 1)
+        first, last = nn.Conv2d(1, 32, 3, padding=1), nn.Conv2d(32, 8, 1)
         assert last.bias is not None
         with torch.no_grad():  # at first all moves cost about a tile
             last.weight.mul_(0.3)
             last.bias.fill_(0.54)
         self.costs = nn.Sequential(first, nn.ReLU(), last)
         self.head = nn.Sequential(
-            nn.Linear(9 + 9 + 6, hidden),
+            nn.Linear(9 + 9 + 6, 64),
             nn.ReLU(),
-            nn.Linear(hidden, hidden),
+            nn.Linear(64, 64),
             nn.ReLU(),
-            nn.Linear(hidden, num_options + 1),
+            nn.Linear(64, num_options + 1),
         )
         self._set_mazes(mazes)
 
@@ -171,9 +147,8 @@ class MazeNetwork(TensorDictModuleBase):
     def fields(self, maze: Tensor, target: Tensor) -> Tensor:
         """Return what is known of mazes ``[U]`` and targets ``[U, 2]`` before looking at states.
 
-        Returns:
-            Distance to the target in tiles, and 1 where a tile is free; both with one tile around
-            the maze, ``[U, 2, H + 2, W + 2]``.
+        That is the distance to the target in tiles, and 1 where a tile is free; both with one tile
+        around the maze, ``[U, 2, H + 2, W + 2]``.
         """
         free = self.free[maze]  # [U, H, W]
         costs = F.softplus(self.costs(free[:, None])) + 0.01
@@ -207,7 +182,7 @@ class MazeNetwork(TensorDictModuleBase):
         out = self.head(
             torch.cat((around[:, :4], here, around[:, 5:], free, inside, velocity, near), -1)
         )
-        steps = self.steps_per_tile * F.softplus(here + out[:, -1:])
+        steps = _STEPS_PER_TILE * F.softplus(here + out[:, -1:])
         return torch.cat((out[:, :-1], steps), -1)
 
 
@@ -252,28 +227,9 @@ def shortest_distances(costs: Tensor, start: Tensor) -> Tensor:
     .. math:: d(x) = \min\bigl(d_0(x),\ \min_{y \in N(x)} c(x, y) + d(y)\bigr), \qquad
               \frac{\partial d(x)}{\partial c(y, z)} = 1 \text{ if } (y, z) \text{ is on the path}
 
-    Args:
-        costs: of moving from a tile to its 8 neighbours, row by row, float ``[U, 8, H, W]``,
-            positive.
-        start: distance of a tile if a path ends there, float ``[U, H, W]``.
-
-    Returns:
-        Distances, float ``[U, H, W]``.
-
-    Raises:
-        ValueError: if the shapes do not fit each other.
-
-    Example:
-        >>> import torch
-        >>> costs, start = torch.ones(1, 8, 1, 3), torch.tensor([[[0.0, 99.0, 99.0]]])
-        >>> shortest_distances(costs, start)
-        tensor([[[0., 1., 2.]]])
+    of costs of moving to the 8 neighbours, row by row, ``[U, 8, H, W]``, and the distances with
+    which paths may end, ``[U, H, W]``.
     """
-    if costs.shape != (start.shape[0], 8, *start.shape[1:]):
-        raise ValueError(
-            f"shortest_distances needs costs [U, 8, H, W] for start [U, H, W]; got "
-            f"{list(costs.shape)} and {list(start.shape)}."
-        )
     distances: Tensor = _ShortestDistances.apply(costs, start)
     return distances
 

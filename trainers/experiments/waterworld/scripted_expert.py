@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
 
 from torchrl_hmcts.checks import real_number
 
@@ -30,18 +29,13 @@ class ScriptedExpert(TensorDictModuleBase):
     turns the thrust into the next corridor, whose wall takes the old speed away. It knows neither
     walls nor maze: the manager's goals lead around them.
 
-    Args:
-        next_goal (float): :math:`w_1`. Default 0.4.
-        second_goal (float): :math:`w_2`. Default 0.1.
-        damping (float): :math:`k`, seconds. Default 0.2. The three were the best of 69 drawn at
-            random, in 220 episodes in mazes of the training split; the number of base steps changes
-            by 2 % around them.
-        relative (bool): whether the env shows goals relative to the position, as
-            :class:`~torchrl_hmcts.transforms.SubgoalTransform` does by default.
-        goals_key, velocity_key, position_key, action_key (NestedKey): entries of the env.
+    Reads ``"goals"``, relative to the position, ``[*B, 2 K]``, and ``"velocity"``; writes
+    ``"action"``, int64 ``[*B]``: 0 up, 1 down, 2 left, 3 right.
 
-    Reads goals ``[*B, 2 K]``, velocity and, for goals that are not relative, position; writes the
-    action, int64 ``[*B]``: 0 up, 1 down, 2 left, 3 right.
+    Args:
+        next_goal, second_goal, damping (float): :math:`w_1`, :math:`w_2` and :math:`k`, seconds.
+            Default 0.4, 0.1 and 0.2, the best of 69 drawn at random, in 220 episodes in mazes of
+            the training split; the number of base steps changes by 2 % around them.
 
     Example:
         >>> import torch
@@ -52,42 +46,25 @@ class ScriptedExpert(TensorDictModuleBase):
         1.0
     """
 
+    in_keys, out_keys = ["goals", "velocity"], ["action"]
+
     def __init__(
-        self,
-        next_goal: float = 0.4,
-        second_goal: float = 0.1,
-        damping: float = 0.2,
-        *,
-        relative: bool = True,
-        goals_key: NestedKey = "goals",
-        velocity_key: NestedKey = "velocity",
-        position_key: NestedKey = "position",
-        action_key: NestedKey = "action",
+        self, next_goal: float = 0.4, second_goal: float = 0.1, damping: float = 0.2
     ) -> None:
         super().__init__()
         numbers = {"next_goal": next_goal, "second_goal": second_goal, "damping": damping}
         weights = [real_number("ScriptedExpert", name, value) for name, value in numbers.items()]
         self.weights: Sequence[float] = (1.0, *weights[:2])
         self.damping = weights[2]
-        self.relative = relative
-        self.goals_key, self.velocity_key, self.position_key, self.action_key = map(
-            unravel_key, (goals_key, velocity_key, position_key, action_key)
-        )
-        self.in_keys = [self.goals_key, self.velocity_key]
-        if not relative:
-            self.in_keys.append(self.position_key)
-        self.out_keys = [self.action_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of each row, towards its goals."""
-        goals = tensordict.get(self.goals_key).unflatten(-1, (-1, 2))  # [*B, K, 2]
-        if not self.relative:
-            goals = goals - tensordict.get(self.position_key).unsqueeze(-2)
+        goals = tensordict.get("goals").unflatten(-1, (-1, 2))  # [*B, K, 2]
         steps = torch.cat((goals[..., :1, :], goals.diff(dim=-2)), -2)[..., :3, :]
         weights = steps.new_tensor(self.weights[: steps.shape[-2]])
         error = (weights.unsqueeze(-1) * steps).sum(-2)
-        error = error - self.damping * tensordict.get(self.velocity_key)
+        error = error - self.damping * tensordict.get("velocity")
         axis = error.abs().argmax(-1, keepdim=True)  # 0 for x, 1 for y
         forwards = error.gather(-1, axis) > 0
         action = torch.where(axis == 0, 2, 0) + forwards.to(torch.int64)
-        return tensordict.set(self.action_key, action.squeeze(-1))
+        return tensordict.set("action", action.squeeze(-1))
