@@ -46,6 +46,9 @@ def check_settable(
         unread_keys (sequence of NestedKey): entries that no step reads as they are, e.g. the bytes
             of a snapshot, in which equal states may differ. Default ``("snapshot",)``.
 
+    Raises:
+        ContractError: if an entry differs, with its name and whether the env is deterministic.
+
     Examples:
         >>> from torchrl_hmcts.envs import SettableGymEnv
         >>> from torchrl_hmcts.testing import check_settable

@@ -51,6 +51,9 @@ class SkillTransform(EnvTransform):
         seed (int, optional): seed of an own generator, whose state is saved in the state dict.
             Default: torch's global generator.
 
+    Raises:
+        ValueError: if a prior is given for vectors, or is no distribution over the skills.
+
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4
         (mini-episodes of 100 steps).
