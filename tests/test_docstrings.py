@@ -103,7 +103,8 @@ NOTHING_TO_CITE = set(
     "free_tiles maze_from_text maze_to_text "
     "shortest_path_lengths Snapshot AttributeSnapshot ReplaySnapshot "
     "SnapshotError option_color GridMoves GridView MujocoTask SkillWorker PolicyWorker FeatureGoal "
-    "FollowGoals OccasionalAction JoinedWorkers MazeItems".split()
+    "FollowGoals OccasionalAction JoinedWorkers MazeItems "
+    "GrowingSkillPrior LandmarkEnv SkillPolicy StallTransform find_jumps".split()
 )
 # What works on tensors, so that its docstring has to give their shapes.
 TENSORS = re.compile(r"\b(Tensor|TensorDict|TensorDictBase|ndarray|Plan|Search)\b")
