@@ -156,12 +156,11 @@ class ReactiveManager:
         )
         self._networks = nn.ModuleList([actor, critic])
         self.optimizer = torch.optim.Adam(self._networks.parameters(), lr=lr, eps=1e-5)
+        self._generators = [torch.Generator().manual_seed(seed) for _ in range(2)]
+        self._generator, generator = self._generators
         self._labels = ReplayBuffer(
-            storage=LazyTensorStorage(buffer_size),
-            batch_size=batch_size,
-            generator=torch.Generator().manual_seed(seed),
+            storage=LazyTensorStorage(buffer_size), batch_size=batch_size, generator=generator
         )
-        self._generator = torch.Generator().manual_seed(seed)
         self.practised, self.num_labels, self.scores = 0, 0, list[float]()
         self._earned, self._earning = 0.0, 0  # sum and number of the rewards that are not 0
         self._places: TensorDictBase | None = None  # where the practice stands
@@ -310,11 +309,6 @@ class ReactiveManager:
         self._places = None if places is None else TensorDict(places, [self.num_envs])
         for name in _COUNTERS:
             setattr(self, name, state_dict[name])
-
-    @property
-    def _generators(self) -> list[torch.Generator]:
-        sampler: Any = self._labels
-        return [self._generator, sampler._rng]
 
 
 _COUNTERS = ("practised", "num_labels", "scores", "_earned", "_earning")
