@@ -22,7 +22,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from table import markdown, read_arguments, write
+from table import read_arguments, write
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
@@ -164,14 +164,6 @@ def asynchrony(repeats: int, window_seconds: float) -> dict[str, Any]:
     }
 
 
-COLUMNS = {
-    "CartPole-v1, seed": lambda run: run["seed"],
-    "mean return of 100 episodes": lambda run: run["mean_return"],
-    "frames": lambda run: f"{run['frames']:,}",
-    "seconds": lambda run: run["seconds"],
-}
-
-
 def main() -> None:
     args = read_arguments(
         __doc__,
@@ -184,7 +176,7 @@ def main() -> None:
     if args.only != "asynchrony":
         frames = {"total_frames": 5_000} if args.quick else {}
         results["cartpole"] = [solve_cartpole(seed, **frames) for seed in args.seeds]
-        print(markdown(results["cartpole"], COLUMNS))
+        print(*results["cartpole"], sep="\n")
     if args.only != "cartpole":
         results["asynchrony"] = asynchrony(*((1, 3.0) if args.quick else (args.repeats, 20.0)))
         ratio = results["asynchrony"]["ratio"]

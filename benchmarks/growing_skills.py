@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from mazes import greedy, make_option_env, make_starts, planner
 from skill_figures import search_coverage
-from table import markdown, read_arguments, write
+from table import read_arguments, write
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 
@@ -133,24 +133,6 @@ def measure(name: str, seed: int, base_steps: int, num_mazes: int) -> dict[str, 
     }
 
 
-COLUMNS = {
-    "skills": lambda row: row["skills"],
-    "seed": lambda row: row["seed"],
-    "at the end": lambda row: row["skills_at_the_end"],
-    "solved": lambda row: "{solved} of {starts}".format(**row["mazes"]),
-    "simulated base steps, mean / median (95 %)": lambda row: (
-        "{mean:,.0f} / {median:,.0f} ({p95:,.0f})".format(**row["mazes"]["simulated_steps"])
-    ),
-    "executed base steps, median (95 %)": lambda row: "{median:,.0f} ({p95:,.0f})".format(
-        **row["mazes"]["episode_steps"]
-    ),
-    "coverage, mean": lambda row: f"{row['coverage']['mean']:.3f}",
-    "training base steps + simulated for coverage": lambda row: (
-        f"{row['train_base_steps']:,} + {row['coverage_base_steps']:,}"
-    ),
-}
-
-
 def main() -> None:
     quick = {"seeds": [0], "skills": ["4", "grown"], "mazes": 38}
     skills = (WORKERS, "of: " + ", ".join(WORKERS))
@@ -162,7 +144,6 @@ def main() -> None:
         for seed in args.seeds:
             rows.append(measure(name, seed, args.base_steps, args.mazes))
             print(json.dumps(rows[-1]), flush=True)
-    print(markdown(rows, COLUMNS))
     write(args, {"rows": rows})
 
 

@@ -6,7 +6,7 @@
 For each seed, skills are learned by the rounds of ``HMCTSTrainer``, from scratch and from a dataset
 D of 40,000 base steps that an earlier training of skills recorded in other episodes. The curve is
 that of test rounds in held-out mazes with the greedy worker; at the end the final worker plans in
-all test mazes. Writes the figures as JSON, the curves as PNG beside it, and prints a table.
+all test mazes. Writes the figures as JSON, and the curves as PNG beside it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mazes import RADIUS, greedy, solve
-from table import markdown, read_arguments, write
+from table import read_arguments, write
 from tensordict import TensorDictBase
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
@@ -85,19 +85,6 @@ def learn(args: argparse.Namespace, seed: int, dataset: TensorDictBase | None) -
     }
 
 
-COLUMNS = {
-    "worker": lambda pair: pair[0],
-    "seed": lambda pair: pair[1]["seed"],
-    "training base steps": lambda pair: f"{pair[1]['training_base_steps']:,}",
-    "rounds": lambda pair: pair[1]["rounds"],
-    "test mazes solved": lambda pair: "{solved} of {starts}".format(**pair[1]["final"]),
-    "simulated base steps, median": lambda pair: (
-        f"{pair[1]['final']['simulated_steps']['median']:,.0f}"
-    ),
-    "executed, median": lambda pair: f"{pair[1]['final']['episode_steps']['median']:,.0f}",
-}
-
-
 def main() -> None:
     quick = {"seeds": [0], "steps": 4_000, "dataset_steps": 4_032}
     quick.update(test_rounds=8, test_expansions=60, mazes=10)
@@ -137,7 +124,6 @@ def main() -> None:
         title=f"Algorithm 3 in Waterworld: {args.test_rounds} held-out mazes, "
         + (f"{len(args.seeds)} seeds (mean, range)" if len(args.seeds) > 1 else "one seed"),
     )
-    print("\n" + markdown([(name, run) for name in runs for run in runs[name]], COLUMNS))
 
 
 if __name__ == "__main__":

@@ -19,10 +19,9 @@ import sys
 import time
 from typing import Any
 
-import numpy as np
 import torch
 from mazes import RADIUS, demo_loss, greedy, make_option_env, make_starts, planner
-from table import markdown, read_arguments, write
+from table import read_arguments, write
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -155,7 +154,7 @@ def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     for name, searcher in fixed_planners(simulator).items():
         rows[name] = measure(searcher, real, starts)
-        report(seed, name, rows[name])
+        print(seed, name, rows[name]["solved"], rows[name]["simulated_steps"], flush=True)
     for i, snapshot in enumerate(snapshots):
         on_test = snapshot.on(test)
         for name, searcher in learned_planners(simulator, on_test).items():
@@ -163,70 +162,13 @@ def run(seed: int, args: argparse.Namespace) -> dict[str, Any]:
                 continue
             key = f"{name}, iteration {i}"
             rows[key] = measure(searcher, real, starts)
-            report(seed, key, rows[key])
+            print(seed, key, rows[key]["solved"], rows[key]["simulated_steps"], flush=True)
     return {
         "worker_cpu_seconds": round(worker_seconds, 1),
         "iterations": learned,
         "history": trainer.history,
         "planners": rows,
     }
-
-
-def report(seed: int, name: str, row: dict[str, Any]) -> None:
-    print(
-        f"seed {seed}  {name:46s} solved {row['solved']}/{row['starts']}  simulations "
-        f"{row['simulations']['median']:.0f}  simulated base steps "
-        f"{row['simulated_steps']['median']:.0f} (mean {row['simulated_steps']['mean']:.0f}, p95 "
-        f"{row['simulated_steps']['p95']:.0f})  episode {row['episode_steps']['median']:.0f}",
-        flush=True,
-    )
-
-
-def pooled(runs: dict[str, Any], name: str) -> dict[str, Any]:
-    """The rows of a planner, of all seeds, and their simulated base steps in one array."""
-    rows = [run["planners"][name] for run in runs.values()]
-    return {
-        "name": name,
-        "rows": rows,
-        "simulated": np.concatenate([row["simulated"] for row in rows]),
-        "mean": lambda key, figure: np.mean([row[key][figure] for row in rows]),
-    }
-
-
-def table(runs: dict[str, Any]) -> str:
-    """All seeds together as markdown: medians over all mazes, each seed's solved."""
-    first = next(iter(runs.values()))
-    plain = np.median(pooled(runs, "plain, 4 leaves a wave")["simulated"])
-    planners = {
-        "planner": lambda p: p["name"],
-        "solved, by seed": lambda p: (
-            f"{', '.join(str(r['solved']) for r in p['rows'])} of {p['rows'][0]['starts']}"
-        ),
-        "simulations": lambda p: f"{p['mean']('simulations', 'median'):.0f}",
-        "simulated base steps (mean; p95)": lambda p: (
-            f"{np.median(p['simulated']):.0f} ({p['simulated'].mean():.0f}; "
-            f"{np.percentile(p['simulated'], 95):.0f})"
-        ),
-        "expansions": lambda p: f"{p['mean']('expansions', 'median'):.0f}",
-        "CPU ms a maze": lambda p: f"{1e3 * p['mean']('cpu_seconds_alone', 'median'):.0f}",
-        "episode base steps (mean)": lambda p: (
-            f"{p['mean']('episode_steps', 'median'):.0f} ({p['mean']('episode_steps', 'mean'):.0f})"
-        ),
-        "against plain": lambda p: f"{np.median(p['simulated']) / plain:.2f}",
-    }
-    iterations = {
-        "iteration": lambda its: its[0]["iteration"],
-        "training base steps, so far": lambda its: (
-            f"{np.mean([it['training_base_steps_so_far'] for it in its]):,.0f}"
-        ),
-        "a search": lambda its: (
-            f"{np.mean([it['training_base_steps_per_search'] for it in its]):,.0f}"
-        ),
-        "CPU s, so far": lambda its: f"{np.mean([it['training_cpu_seconds'] for it in its]):.0f}",
-    }
-    followed = zip(*(run["iterations"] for run in runs.values()), strict=True)
-    rows = [pooled(runs, name) for name in first["planners"]]
-    return markdown(rows, planners) + "\n\n" + markdown(followed, iterations)
 
 
 def main() -> None:
@@ -240,9 +182,7 @@ def main() -> None:
         updates=(200, "updates an iteration"),
     )
     runs = {str(seed): run(seed, args) for seed in args.seeds}
-    text = table(runs)
-    print(text)
-    write(args, {"arguments": vars(args), "table": text.splitlines(), "seeds": runs})
+    write(args, {"arguments": vars(args), "seeds": runs})
 
 
 if __name__ == "__main__":

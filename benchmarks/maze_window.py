@@ -22,19 +22,6 @@ class MazeWindow(TensorDictModuleBase):
     the tiles is the target's; the player's offset from its tile's centre, its velocity, the vector
     to the target (clipped to R tiles) and its length; and the option one-hot.
     Mazes are read from the observation, so that the features of a maze never seen are as good.
-
-    Args:
-        num_options: number of options.
-        radius: R, in tiles. Default 3: an option of 25 base steps moves the disc 2.5 at most.
-        height, width: tiles of the mazes. Default 9.
-
-    Example:
-        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
-        >>> td = WaterworldMazeEnv(batch_size=[5], seed=0).reset()
-        >>> td["option"] = torch.zeros(5, dtype=torch.int64)
-        >>> window = MazeWindow(num_options=4)
-        >>> window(td)["features"].shape, window.num_features
-        (torch.Size([5, 117]), 117)
     """
 
     in_keys = ["observation", "position", "velocity", "target", "option"]

@@ -13,14 +13,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
+
+from reliability import run_pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "numba", "gymnasium", "pymunk", "ale-py")
@@ -90,29 +90,10 @@ def run_tests(environment: Path, source: Path, folder: Path, tests: list[str]) -
         if environment.resolve() not in Path(name).resolve().parents:
             raise RuntimeError(f"{name} would be tested instead of the wheel in {environment}.")
 
-    report, log = folder / "report.xml", folder / "pytest.log"
-    command = [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={report}"]
-    before = os.times()
-    command += [f"tests/{name}" for name in tests]
-    with log.open("w") as file:
-        subprocess.run(command, cwd=folder, env=settings, stdout=file, stderr=subprocess.STDOUT)
-    after = os.times()
-    printed_text = log.read_text()
-    print("\n".join(printed_text.splitlines()[-15:]), flush=True)
-    (suite,) = ElementTree.parse(report).getroot().iter("testsuite")
-    count = {kind: int(suite.get(kind, 0)) for kind in ("tests", "failures", "errors", "skipped")}
-    user = after.children_user - before.children_user
-    system = after.children_system - before.children_system
-    return {
-        **found,
-        "test_files": len(tests),
-        "tests": count["tests"],
-        "passed": count["tests"] - count["failures"] - count["errors"] - count["skipped"],
-        "skipped": count["skipped"],
-        "failed": re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", printed_text, re.MULTILINE),
-        "wall_seconds": round(after.elapsed - before.elapsed),
-        "cpu_seconds": round(user + system),
-    }
+    counts = run_pytest(
+        *(f"tests/{name}" for name in tests), python=python, cwd=folder, env=settings
+    )
+    return {**found, "test_files": len(tests), **counts}
 
 
 def main() -> None:
@@ -122,7 +103,7 @@ def main() -> None:
     parser.add_argument(
         "--folder",
         type=Path,
-        help="where environments and logs stay, and are used again; else all is temporary",
+        help="where environments stay, and are used again; else all is temporary",
     )
     parser.add_argument("--out", type=Path, help="a JSON file, to which the counts are added")
     args = parser.parse_args()

@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,16 +63,17 @@ LEAKS, RAY = (
 )
 
 
-def run_pytest(*words: str, **environment: str) -> dict[str, Any]:
-    """Runs tests; returns how many passed, failed and were skipped, and the CPU seconds."""
+def run_pytest(
+    *words: str,
+    python: str = sys.executable,
+    cwd: Path = ROOT,
+    env: Mapping[str, str] = os.environ,
+    **further: str,
+) -> dict[str, Any]:
+    """Run tests; return how many passed, failed and were skipped, and the CPU seconds."""
     begin = os.times()
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words],
-        cwd=ROOT,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-    )
+    command = [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
+    done = subprocess.run(command, cwd=cwd, env={**env, **further}, capture_output=True, text=True)
     end = os.times()
     last = (done.stdout.strip().splitlines() or [""])[-1]
     counts: dict[str, Any] = {

@@ -86,23 +86,7 @@ class _RefreshObservation(TensorDictModuleBase):
 
 
 def record_transitions(worker: Any, config: OptionModelConfig) -> tuple[TensorDict, int]:
-    """Record options drawn at random in the training mazes, in ordinary episodes.
-
-    Args:
-        worker: carries the options out.
-        config: how much, and of what.
-
-    Returns:
-        The macro transitions ``[N]`` with the paths of the options (``("next", "trajectory")``),
-        and the base steps they took.
-
-    Example:
-        >>> from tensordict.nn import TensorDictModule
-        >>> worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-        >>> data, steps = record_transitions(worker, OptionModelConfig(base_steps=100, copies=2))
-        >>> data.batch_size, steps
-        (torch.Size([4]), 100)
-    """
+    """Record options drawn at random in the training mazes, in ordinary episodes."""
     torch.manual_seed(config.seed)
     env = TransformedEnv(
         WaterworldMazeEnv(
@@ -132,15 +116,6 @@ def relabel_targets(data: TensorDictBase, *, gamma: float, seed: int) -> TensorD
 
     The target has no influence on the disc until they touch, so the path answers: either it never
     comes near the new target, and the transition stays as it was, or the option ends there.
-
-    Args:
-        data: transitions ``[N]`` of :func:`record_transitions`.
-        gamma: discount per base step.
-        seed: of the targets: tiles near the player or its way, which it does not touch yet.
-
-    Returns:
-        As many transitions, without the paths. One that ended at its own target keeps it, since
-        what would have come after is not known; so does one for which no free tile was drawn.
 
     Reference:
         Andrychowicz et al., "Hindsight Experience Replay", 2017, arXiv 1707.01495.
@@ -191,16 +166,7 @@ def _draw_targets(
 
 
 def make_option_model(config: OptionModelConfig) -> OptionModel:
-    """Build an untrained model of Waterworld's options.
-
-    Args:
-        config: sizes.
-
-    Example:
-        >>> model = make_option_model(OptionModelConfig(num_models=2))
-        >>> model.num_models, model.num_deltas
-        (2, 4)
-    """
+    """Build an untrained model of Waterworld's options."""
     window = MazeWindow(config.num_options)
 
     def make_network(out_features: int) -> nn.Module:
@@ -228,16 +194,7 @@ def train_option_model(
     *,
     progress: Callable[[int, TensorDictBase], None] | None = None,
 ) -> OptionModel:
-    """Learn a model from recorded transitions.
-
-    Args:
-        data: of :func:`record_transitions`.
-        config: sizes and steps.
-        progress: told the number of the update and its losses.
-
-    Returns:
-        The model, in eval mode.
-    """
+    """Learn a model from recorded transitions."""
     parts = [data.exclude(("next", "trajectory"))]
     for i in range(config.hindsight):
         parts.append(relabel_targets(data, gamma=config.gamma, seed=1_000 * config.seed + i))
@@ -267,14 +224,7 @@ def train_option_model(
 
 
 def make_model_env(model: OptionModel, real: Any, **options: Any) -> OptionModelEnv:
-    """Build the macro env to plan in for a model of Waterworld's options.
-
-    Args:
-        model: of :func:`train_option_model`.
-        real: the macro env it stands for.
-        **options: keywords of :class:`~torchrl_hmcts.modules.OptionModelEnv`, e.g.
-            ``max_disagreement``.
-    """
+    """Build the macro env to plan in for a model of Waterworld's options."""
     return OptionModelEnv(
         model,
         real,
@@ -285,17 +235,7 @@ def make_model_env(model: OptionModel, real: Any, **options: Any) -> OptionModel
 
 
 def error_by_horizon(model_env: EnvBase, real: EnvBase, horizon: int) -> list[float]:
-    """Return how far the model is from the real env after 1 to ``horizon`` random options.
-
-    Args:
-        model_env: of :func:`make_model_env`.
-        real: the macro environment, batch ``[M]``.
-        horizon: options in a row.
-
-    Returns:
-        Median distance of the predicted from the real position, tiles, over the episodes that
-        continue.
-    """
+    """Return how far the model is from the real env after 1 to ``horizon`` random options."""
     with torch.no_grad():
         td = real.rollout(horizon, break_when_any_done=False, break_when_all_done=True)
     state, going = td[:, 0].exclude("next"), torch.ones(len(td), dtype=torch.bool)

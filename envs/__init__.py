@@ -7,10 +7,9 @@ from torchrl_hmcts.envs.atari.pool import AtariOptionPool
 from torchrl_hmcts.envs.atari.ram import AtariRAMEnv
 from torchrl_hmcts.envs.atari.workers import SharedMLP
 from torchrl_hmcts.envs.gym.attributes import AttributeSnapshot
-from torchrl_hmcts.envs.gym.grid_features import GridFeatures
+from torchrl_hmcts.envs.gym.features import GridFeatures
 from torchrl_hmcts.envs.gym.grid_moves import GridMoves, GridView
-from torchrl_hmcts.envs.gym.mujoco_batch import MujocoBatch
-from torchrl_hmcts.envs.gym.mujoco_tasks import MujocoTask
+from torchrl_hmcts.envs.gym.mujoco_batch import MujocoBatch, MujocoTask
 from torchrl_hmcts.envs.gym.option_pool import OptionPool
 from torchrl_hmcts.envs.gym.option_run import OptionWorker
 from torchrl_hmcts.envs.gym.settable import SettableGymEnv

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_trainers import make_networks
+from small_trainers import Bars, make_networks, weights
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import Tensor, nn
@@ -28,7 +28,6 @@ from torchrl.envs import EnvBase, GymEnv
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import A2CLoss
 from torchrl.record import CSVLogger
-from trainer_parts import Bars, weights
 
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.testing import ChainEnv
@@ -195,17 +194,6 @@ class TestInThisProcess:
         assert history["eval_frames"] == [3 * SEGMENT]
         assert history["eval_x"] == [float(next(trainer.policy().parameters()).sum())]
 
-    def test_each_learner_can_be_configured(self) -> None:
-        entropy = []
-        for coefficient in (0.0, 1e6):
-            trainer = make_trainer(
-                configure_learner=lambda loss, i, c=coefficient: loss.entropy_coeff.fill_(c)
-            )
-            entropy.append(trainer.train()["loss_entropy"][-1])
-            assert trainer.loss_module.entropy_coeff.item() == pytest.approx(0.01)
-        assert entropy[0] == 0.0
-        assert entropy[1] < -1e5
-
     def test_a_gradient_that_is_not_finite_is_refused(self) -> None:
         loss = make_loss()
         trainer = make_trainer(loss, lambda: NaNAfter(2 * T))
@@ -213,25 +201,6 @@ class TestInThisProcess:
             trainer.train()
         assert torch.isfinite(weights(trainer)).all()
         assert trainer.frames == 2 * SEGMENT
-
-    def test_an_env_that_keeps_its_own_state_and_has_no_batch_will_do(self) -> None:
-        torch.manual_seed(0)
-        actor = ProbabilisticActor(
-            TensorDictModule(nn.Linear(4, 2), ["observation"], ["logits"]),
-            in_keys=["logits"],
-            distribution_class=torch.distributions.Categorical,
-        )
-        loss = A3CLoss(actor, ValueOperator(nn.Linear(4, 1), in_keys=["observation"]))
-        trainer = A3CTrainer(
-            lambda: GymEnv("CartPole-v1", categorical_action_encoding=True),
-            loss,
-            total_frames=120,
-            num_learners=0,
-        )
-        history = trainer.train()
-        assert history["frames"] == [120]
-        assert history["episode_return"] == history["episode_length"]  # 1 per step
-        assert history["episodes"][0] >= 2
 
     @pytest.mark.parametrize("functional", [True, False])
     def test_torchrls_a2c_loss_can_be_trained_too(self, functional: bool) -> None:
@@ -284,11 +253,6 @@ class TestCheckpoints:
             learner = ActorLearner(trainer.settings, trainer.shared, 0, frames)
             actions.append(learner.collect()["action"])
         assert not torch.equal(*actions)
-
-    def test_a_run_that_is_done_only_says_so(self, tmp_path: Path) -> None:
-        done = make_trainer(save_dir=tmp_path).train()
-        again = make_trainer().load(tmp_path)
-        assert again.train()["frames"] == done["frames"]
 
     def test_what_cannot_be_loaded_or_saved_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=f"no checkpoint in '{tmp_path}'"):

@@ -16,7 +16,7 @@ from torchrl_hmcts.envs import AtariOptionPool, RepeatActions  # noqa: E402
 from torchrl_hmcts.trainers import AtariAgent, AtariSearch, ReactiveManager  # noqa: E402
 from torchrl_hmcts.trainers.cli import main  # noqa: E402
 from torchrl_hmcts.trainers.experiments.atari.config import AtariConfig  # noqa: E402
-from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun, score_at  # noqa: E402
+from torchrl_hmcts.trainers.experiments.atari.episodes import AtariRun, choose_arm, score_at  # noqa: E402
 
 SMALL = {"hidden": (16,), "num_envs": 4, "steps": 8, "batch_size": 16, "lr": 0.01}
 
@@ -121,6 +121,7 @@ def test_a_sticky_run_practises_its_share_and_plays_until_the_frames_are_spent(t
     config = AtariConfig(
         game="Breakout", protocol="sticky", source="repeat", frames=60_000, ratio=2.0,
         max_episode_frames=400, num_processes=0, episodes=2, out=str(tmp_path), practice=0.6,
+        rollout_options=0,
     )  # fmt: skip
     run = AtariRun(config)
     run.play(lambda: None, lambda: None)
@@ -133,6 +134,7 @@ def test_a_sticky_run_practises_its_share_and_plays_until_the_frames_are_spent(t
     last = [row["score"] for row in run.scores[-2:]]
     assert run.figures()["score_mean"] == sum(last) / 2
     assert run.figures()["source"] == "repeat, guide=reactive"
+    assert {row["guided"] for row in run.scores} == {False, True}  # a bandit tries both
     run.close()
     alone = AtariRun(dataclasses.replace(config, ratio=0.0, frames=20_000))
     alone.play(lambda: None, lambda: None)
@@ -140,10 +142,33 @@ def test_a_sticky_run_practises_its_share_and_plays_until_the_frames_are_spent(t
     alone.close()
 
 
+def test_the_arm_of_the_bandit_is_that_of_ucb1() -> None:
+    assert choose_arm([], [3.0]) == 0
+    # Means 0 and 1 after scaling; n = 4: 0 + sqrt(ln 4 / 6) = 0.48 against 1 + sqrt(ln 4 / 2).
+    assert choose_arm([1.0, 1.0, 1.0], [2.0]) == 1
+    # 0.5 + sqrt(ln 21 / 2) = 1.73 against 1 + sqrt(ln 21 / 40) = 1.28: the rare one is due.
+    assert choose_arm([5.0], [10.0] * 19 + [0.0], last=1) == 0
+    assert choose_arm([0.0] * 9 + [8.0] * 10, [4.0] * 19) == 0  # what it scored of late counts
+
+
+def test_an_episode_without_the_guide_is_searched_as_if_there_were_none() -> None:
+    def played(**guide: object) -> AtariAgent:
+        pool = AtariOptionPool("Breakout", RepeatActions(4), max_steps=5, num_processes=0, seed=0)
+        agent = AtariAgent(pool, AtariSearch(ratio=4.0), seed=1, **guide)
+        agent.begin(guided=False)
+        return agent.play(5)
+
+    manager = ReactiveManager(4, seed=1)
+    alone, beside = played(), played(guide=manager)
+    assert beside.options_taken == alone.options_taken
+    assert beside.pool.num_frames == alone.pool.num_frames
+    assert manager.num_labels == 5  # it learns from the searches all the same
+
+
 def test_what_auto_stands_for() -> None:
     plain, sticky = AtariConfig().resolved(), AtariConfig(protocol="sticky").resolved()
-    assert (plain.guide, plain.source, plain.rollout_options) == ("none", "best", 5)
-    assert (sticky.guide, sticky.source, sticky.rollout_options) == ("reactive", "screened", 0)
+    assert (plain.guide, plain.source) == ("none", "best")
+    assert (sticky.guide, sticky.source) == ("reactive", "screened")
     assert AtariConfig(protocol="sticky", guide="none").resolved().source == "best"
     assert AtariConfig(ratio=0.0, guide="reactive").ratio == 0.0
     with pytest.raises(ValueError, match="practice is a share of the frames"):

@@ -136,9 +136,7 @@ def test_log_level_warning_is_silent_on_standard_output(tmp_path, monkeypatch, c
 
 @pytest.mark.parametrize("verb", ["demo", "train", "evaluate", "report", "sweep"])
 def test_help_says_what_a_verb_needs_and_where_results_go(capsys, verb) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main([verb, "--help"])
-    assert stop.value.code == 0
+    assert main([verb, "--help"]) == 0
     printed = capsys.readouterr().out
     for word in ("\nneeds ", "\nwrites ", "log_level="):
         assert word in printed
@@ -219,8 +217,3 @@ def test_names_are_in_groups_where_a_page_shows_groups(name: str, shown: str) ->
     board = Board()
     ScalarLoggers([board]).log_scalar(name, 1.0, step=0)
     assert board.names == [shown]
-
-
-def test_an_unknown_logger_is_refused(capsys) -> None:
-    assert main(["demo", "logger=paper"]) == 2
-    assert "logger is one of csv, tensorboard, wandb; got 'paper'" in capsys.readouterr().err

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from small_trainers import Bars, weights
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.objectives import DiscreteSACLoss, SoftUpdate
+from torchrl.objectives import DiscreteSACLoss
 from torchrl.record import CSVLogger
-from torchrl.trainers import (
-    DefaultOptimizationStepper,
-    ReplayBufferTrainer,
-    TargetNetUpdaterHook,
-    Trainer,
-)
-from torchrl.trainers.algorithms import SACTrainer
-from trainer_parts import Bars, weights
 
 from torchrl_hmcts.modules import SkillEncoder, SkillPolicy
 from torchrl_hmcts.objectives import DIAYNLoss, METRAEncoderLoss
@@ -31,7 +21,6 @@ from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
-    SkillReward,
     SkillTransform,
 )
 
@@ -191,58 +180,6 @@ def test_the_same_seed_gives_the_same_weights_and_prints_nothing(
     assert torch.equal(runs[0], runs[1])
     assert not torch.equal(runs[0], runs[2])
     assert "it/s" not in "".join(capsys.readouterr())
-
-
-def plain(buffer: ReplayBuffer, loss: DIAYNLoss, **kwargs: Any) -> Trainer:
-    trainer = Trainer(
-        optimizer=make_skill_optimizer(loss),
-        optimization_stepper=DefaultOptimizationStepper(),
-        **kwargs,
-    )
-    replay = ReplayBufferTrainer(buffer, batch_size=32, flatten_tensordicts=True)
-    trainer.register_op("batch_process", replay.extend)
-    trainer.register_op("process_optim_batch", replay.sample)
-    trainer.register_op("post_optim", TargetNetUpdaterHook(SoftUpdate(loss, tau=0.05)))
-    return trainer
-
-
-def soft_actor_critic(buffer: ReplayBuffer, loss: DIAYNLoss, **kwargs: Any) -> Trainer:
-    return SACTrainer(
-        optimizer=torch.optim.Adam(loss.parameters()),
-        replay_buffer=buffer,
-        batch_size=32,
-        target_net_updater=SoftUpdate(loss, tau=0.05),
-        enable_logging=False,
-        **kwargs,
-    )
-
-
-@pytest.mark.filterwarnings("ignore:SACTrainer is an experimental:UserWarning")
-@pytest.mark.filterwarnings("ignore:The '(post_loss|optimizer)' hook stage:FutureWarning")
-@pytest.mark.parametrize("make", [plain, soft_actor_critic])
-def test_the_loss_runs_in_torchrls_own_trainers(make: Callable[..., Trainer]) -> None:
-    env = make_env(16)
-    loss = DIAYNTrainer.make_loss(env, num_skills=4)
-    collector = Collector(
-        env,
-        loss.actor_network,
-        frames_per_batch=64,
-        total_frames=192,
-        auto_register_policy_transforms=False,
-    )
-    reward = SkillReward(loss.objective)
-    before = [p.detach().clone() for p in loss.parameters()]
-    make(
-        ReplayBuffer(storage=LazyTensorStorage(1000), transform=reward, batch_size=32),
-        loss,
-        collector=collector,
-        total_frames=192,
-        frame_skip=1,
-        optim_steps_per_batch=2,
-        loss_module=loss,
-        progress_bar=False,
-    ).train()
-    assert not any(torch.equal(a, b) for a, b in zip(before, loss.parameters(), strict=True))
 
 
 @torch.no_grad()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import importlib
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -197,40 +196,6 @@ def test_pictures_and_links_of_a_page_exist(page: str) -> None:
             assert ((DOCS / page).parent / target).exists(), f"{page} leads to {target}"
 
 
-class TestRepositoryLink:
-    @pytest.fixture
-    def links(self, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.syspath_prepend(str(DOCS / "_extensions"))
-        return importlib.import_module("repository_links")
-
-    def test_the_address_is_that_of_pyproject_or_of_gits_origin(self, links, tmp_path) -> None:
-        project = tmp_path / "pyproject.toml"
-        project.write_text('[project]\nname = "x"\n')
-        assert links.repository(tmp_path) == ""  # no repository at all
-        subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
-        origin = ["git", "-C", str(tmp_path), "remote", "add", "origin"]
-        subprocess.run([*origin, "https://example.org/a/b.git"], check=True)
-        assert links.repository(tmp_path) == "https://example.org/a/b"
-        project.write_text('[project.urls]\nRepository = "https://example.org/c/d"\n')
-        assert links.repository(tmp_path) == "https://example.org/c/d"
-
-    @pytest.mark.parametrize(
-        "address",
-        [
-            "",
-            "/srv/git/x",
-            "git@example.org:a/b.git",
-            "http://example.org/a",
-            "https://box/a/b",
-            "https://10.0.0.7/a/b",
-            "https://me:secret@example.org/a/b",
-            "https://a.b:8443/x",
-        ],
-    )
-    def test_what_is_no_public_address_gives_no_link(self, links, address: str) -> None:
-        assert links.public_address(address) == ""
-
-
 class TestResultsPage:
     @pytest.fixture
     def module(self, monkeypatch: pytest.MonkeyPatch):
@@ -261,9 +226,9 @@ class TestResultsPage:
         (tmp_path / "README.md").write_text("| `skills/training_speed.json` | `run it` |\n")
         (tmp_path / "skills").mkdir()
         (tmp_path / "skills" / "training_speed.json").write_text(
-            '{"runs": [{"seed": 7, "steps_per_second": {"ours": 1234.4, "theirs": 99.0}}]}'
+            '{"runs": [{"seed": 7, "ratio": 0.5, "steps_per_second": {"DIAYNTrainer": 1234.4}}]}'
         )
         page = module.page(tmp_path)
-        assert "| base steps per CPU second | seeds 7 |" in page
-        assert "| ours | 1,234 |" in page
+        assert "| seed | ratio | steps per second DIAYNTrainer |" in page
+        assert "| 7 | 0.5 | 1,234 |" in page
         assert "`run it`" in page

@@ -139,7 +139,7 @@ def test_an_agent_presses_the_buttons_of_a_puzzle_and_reads_nothing_else(tmp_pat
     from torchrl_hmcts.trainers.experiments.ogbench.config import OGBenchConfig
     from torchrl_hmcts.trainers.experiments.ogbench.data import record
     from torchrl_hmcts.trainers.experiments.ogbench.run import act_once
-    from torchrl_hmcts.trainers.figures.landmarks import plot_ways
+    from torchrl_hmcts.trainers.figures.maps import plot_ways
 
     config = OGBenchConfig(id=NAME, updates=100)
     data = record(NAME, episodes=3)

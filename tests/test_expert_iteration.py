@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from pathlib import Path
 
 import pytest
 import torch
+from small_trainers import Bars, weights
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from trainer_parts import Bars, weights
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_from_text
 from torchrl_hmcts.objectives import ExpertIterationLoss
@@ -31,7 +30,6 @@ from torchrl_hmcts.trainers.experiments.waterworld.maze_network import (
     MazeNetwork,
     shortest_distances,
 )
-from torchrl_hmcts.trainers.expert_iteration import SearchCollector
 
 
 class TwoHeads(nn.Module):
@@ -110,16 +108,6 @@ def test_value_losses_have_their_closed_forms(name: str, expected: list[float]) 
         out = loss(examples())
         torch.testing.assert_close(out["loss_value"], coeff * torch.tensor(expected).double())
         torch.testing.assert_close(out["value_error"], torch.tensor([0.2, 0.1]).double())
-
-
-def test_the_log_loss_of_discounted_distances_counts_base_steps() -> None:
-    gamma, steps, goal = 0.99, [10.0, 400.0], [13.0, 397.0]
-    net = given(LOGITS, [gamma**n for n in steps])
-    td = examples()
-    td["value_target"] = torch.tensor([[gamma**n] for n in goal]).double()
-    out = ExpertIterationLoss(net, value_loss="log", reduction="none")(td)
-    off = 0.5 * (3.0 * math.log(gamma)) ** 2
-    torch.testing.assert_close(out["loss_value"], torch.tensor([off, off]).double())
 
 
 def test_a_value_of_zero_gives_a_finite_log_loss() -> None:
@@ -334,25 +322,6 @@ def test_a_run_repeats_with_its_seed_and_goes_on_where_it_was_stopped(tmp_path: 
     assert second.history == whole.history
     assert torch.equal(weights(second), weights(whole))
     assert make_trainer().load(tmp_path).collected_frames == second.collected_frames > 0
-
-
-def test_a_collector_goes_on_where_another_stopped() -> None:
-    env = ChainEnv(length=5)
-    planner = MCTSPlanner(env)
-
-    def make() -> SearchCollector:
-        settings = {"iterations": 3, "searches": 2, "keys": ["state"], "seed": 0}
-        return SearchCollector(env, planner, planner, example_kwargs={}, **settings)
-
-    whole, begun, resumed = make(), make(), make()
-    batches = list(whole)
-    begun.collect()
-    resumed.load_state_dict(copy.deepcopy(begun.state_dict()))
-    rest = list(resumed)
-    assert len(rest) == 2
-    assert resumed.state_dict() == whole.state_dict()
-    for one, other in zip(rest, batches[1:], strict=True):
-        assert (one == other).all()
 
 
 @pytest.mark.parametrize("name", ["iterations", "searches_per_iteration", "updates_per_iteration"])

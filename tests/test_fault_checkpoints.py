@@ -13,7 +13,6 @@ import sys
 import warnings
 import zipfile
 from collections.abc import Callable
-from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,12 @@ import pytest
 import torch
 from small_trainers import make_diayn
 from torch import nn
-from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointRotation,
+    StateDictCheckpointAdapter,
+)
 
 from torchrl_hmcts.trainers.saving import checkpoints
 from torchrl_hmcts.trainers.saving.checkpoints import (
@@ -109,15 +113,6 @@ class TestDamage:
         assert said.startswith(f"Checkpoint {NAME.format(3)} is damaged (")
         assert said.endswith(f"Continuing from {NAME.format(2)}.\n")
 
-    def test_every_cut_of_a_checkpoint_is_noticed(self, tmp_path) -> None:
-        (path,) = save(tmp_path, 1).checkpoints()
-        whole = path.read_bytes()
-        for length in range(0, len(whole), len(whole) // 50):
-            path.write_bytes(whole[:length])
-            assert find_damage(path), length
-        path.write_bytes(whole)
-        assert find_damage(path) is None
-
     def test_a_damaged_checkpoint_that_was_asked_for_is_refused(self, tmp_path) -> None:
         path = save(tmp_path, 1, 2).checkpoints()[-1]
         harm(path)
@@ -129,18 +124,6 @@ class TestDamage:
             harm(path, "cut")
         with refused(match=r"is whole.*02\.torchrl.*01\.torchrl.*again"):
             newest_checkpoint(tmp_path)
-
-    @pytest.mark.parametrize("damage", ["cut", "missing"])
-    def test_folders_that_torchrl_wrote_are_read_and_checked_too(
-        self, damage: str, tmp_path
-    ) -> None:
-        rotation = CheckpointRotation(tmp_path, keep_last=2)
-        for step in (1, 2):
-            rotation.save(Checkpoint(net=Big(step)), step=step)
-        assert load(newest_checkpoint(tmp_path)) == 2.0
-        (array,) = (tmp_path / "checkpoint-000000000002").rglob("*.memmap")
-        harm(array, "cut") if damage == "cut" else array.unlink()
-        assert load(newest_checkpoint(tmp_path)) == 1.0
 
     def test_torchrl_reads_what_is_written_here(self, tmp_path) -> None:
         save(tmp_path, 7)
@@ -172,10 +155,6 @@ class TestDamage:
 
 
 class TestRotation:
-    def test_only_the_newest_are_kept(self, tmp_path) -> None:
-        assert loaded(save(tmp_path, 1, 2, 3, 4, keep_last=2)) == [3.0, 4.0]
-        assert len(names(tmp_path)) == 2
-
     def test_a_damaged_one_does_not_count_so_that_the_last_good_one_stays(self, tmp_path) -> None:
         rotation = save(tmp_path, 1, 2, 3)
         rotation.keep_last = 1
@@ -192,26 +171,12 @@ class TestRotation:
         assert names(tmp_path) == [NAME.format(150)]
         assert load(newest_checkpoint(tmp_path)) == 150.0
 
-    def test_a_clock_that_is_set_back_changes_nothing(self, tmp_path, monkeypatch) -> None:
-        class Clock(datetime):
-            @classmethod
-            def now(cls, tz: Any = None) -> datetime:
-                return datetime.now(tz) - timedelta(days=9)
-
-        rotation = save(tmp_path, 1, 2, keep_last=2)
-        monkeypatch.setattr("torchrl.checkpoint._checkpoint.datetime", Clock)
-        for step in (3, 4):
-            path = rotation.save(plain_checkpoint(net=Big(step)), step=step)
-            os.utime(path, (0, 0))
-            assert load(newest_checkpoint(tmp_path)) == step
-        assert loaded(DurableRotation(tmp_path)) == [3.0, 4.0]
-
-    def test_checkpoints_of_older_versions_are_in_the_order_of_their_steps(self, tmp_path) -> None:
+    def test_checkpoints_of_older_versions_are_read(self, tmp_path) -> None:
         for step in (3, 1, 2):
             Checkpoint(net=Big(step), format="archive").save(tmp_path / NAME.format(step))
         assert load(newest_checkpoint(tmp_path)) == 3.0
-        save(tmp_path, 1, keep_last=2)  # of this version: newer than they are
-        assert loaded(DurableRotation(tmp_path)) == [3.0, 1.0]
+        save(tmp_path, 2, keep_last=2)
+        assert loaded(DurableRotation(tmp_path)) == [1.0, 2.0]
 
     def test_the_same_step_can_be_saved_again(self, tmp_path) -> None:
         save(tmp_path, 5).save(plain_checkpoint(net=Big(6)), step=5)
@@ -300,14 +265,7 @@ class TestDisk:
 
 
 FORM = '{"format": "torchrl.checkpoint", "format_version": 1, "components": '
-METADATA = (
-    "null",
-    "[1]",
-    '{"torchrl_hmcts": []}',
-    '{"torchrl_hmcts": {"settings": "x"}}',
-    '{"torchrl_hmcts": {"checkpoint_version": NaN}}',
-    '{"torchrl_hmcts": {"serial": true}}',
-)
+METADATA = ("null", "[1]", '{"torchrl_hmcts": {"settings": "x", "checkpoint_version": NaN}}')
 
 
 class TestForeign:
@@ -318,70 +276,46 @@ class TestForeign:
             *(f'{FORM}{{}}, "metadata": {metadata}}}' for metadata in METADATA),
         ],
     )
-    @pytest.mark.parametrize("form", ["archive", "directory"])
     def test_a_manifest_of_any_content_is_an_error_of_the_checkpoint(
-        self, manifest: str, form: str, tmp_path
+        self, manifest: str, tmp_path
     ) -> None:
         path = tmp_path / "c"
-        if form == "directory":
-            path.mkdir()
-            (path / "manifest.json").write_text(manifest)
-        else:
-            with zipfile.ZipFile(path, "w") as archive:
-                archive.writestr("manifest.json", manifest)
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("manifest.json", manifest)
         assert find_damage(path)
         for read in (newest_checkpoint, load, lambda path: check_settings(path, {"a": 1})):
             with refused():
                 read(path)
 
-    @pytest.mark.parametrize("name", ["twice", "/root", "../up", "folder/", "components/other"])
-    def test_files_that_the_manifest_does_not_have_are_refused(self, name: str, tmp_path) -> None:
+    def test_a_file_that_is_in_it_twice_is_refused(self, tmp_path) -> None:
         path = Checkpoint(net=Big(1), format="archive").save(tmp_path / "c")
         with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of names that are there already
-            archive.writestr("manifest.json" if name == "twice" else name, b"x")
-        with refused(match=r"in it 2 times|not in its manifest|damaged"):
+            warnings.simplefilter("ignore")
+            archive.writestr("manifest.json", archive.read("manifest.json"))
+        with refused(match="a file twice"):
             load(path)
 
-    @pytest.mark.parametrize("what", ["shape", "dtype", "short", "link"])
-    def test_arrays_that_are_not_what_they_say_are_refused(self, what: str, tmp_path) -> None:
-        path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
-        (array,), (meta,) = path.rglob("*.memmap"), path.rglob("meta.json")
-        said = json.loads(meta.read_text())
-        if what == "short":
-            harm(array, "cut")
-        elif what == "link":
-            array.rename(tmp_path / "elsewhere")
-            array.symlink_to(tmp_path / "elsewhere")
-        else:
-            said["tensor_00000000"][what] = {"shape": [2**40], "dtype": "torch.nn"}[what]
-        meta.write_text(json.dumps(said))
-        with refused(match="cut off|damaged|is a link"):
-            load(path)
-
-    def test_an_archive_whose_arrays_are_shorter_than_they_say_is_refused(self, tmp_path) -> None:
-        def stretch(content: dict[str, bytes]) -> dict[str, bytes]:
+    @pytest.mark.parametrize(("old", "new"), [(b"131072", b"9" * 13), (b"float32", b"nn")])
+    def test_arrays_that_are_not_what_they_say_are_refused(
+        self, old: bytes, new: bytes, tmp_path
+    ) -> None:
+        def change(content: dict[str, bytes]) -> dict[str, bytes]:
             (name,) = (name for name in content if name.endswith("meta.json"))
-            return {**content, name: content[name].replace(b"131072", b"991072")}
+            return {**content, name: content[name].replace(old, new)}
 
         path = Checkpoint(net=Big(1), format="archive").save(tmp_path / "c")
-        rewrite(path, stretch)
-        with refused(match="cut off"):
+        rewrite(path, change)
+        with refused(match="Failed to load"):
             load(path)
 
-    def test_a_checkpoint_that_would_unpack_to_too_much_is_refused_unopened(
-        self, tmp_path, monkeypatch
+    def test_a_checkpoint_that_would_unpack_to_more_than_its_size_is_refused(
+        self, tmp_path
     ) -> None:
         made = Checkpoint(net=Big(1), format="archive", archive_compression="deflate")
         path = made.save(tmp_path / "c")  # 0.5 MiB of ones, in some KiB
-        monkeypatch.setenv("TORCHRL_HMCTS_MAX_UNPACKED_BYTES", "500000")
         for read in (load, newest_checkpoint):
-            with refused(match=r"unpack to 52\d,\d+ bytes, and 500,000"):
+            with refused(match="unpack to more than its size"):
                 read(path)
-        stored = plain_checkpoint(net=Big(2)).save(tmp_path / "d")
-        assert load(stored) == 2.0  # it is as large on the disk
-        monkeypatch.setenv("TORCHRL_HMCTS_MAX_UNPACKED_BYTES", "600000")
-        assert load(path) == 1.0
 
     def test_a_newer_version_is_named_and_nothing_older_is_taken_instead(self, tmp_path) -> None:
         path = save(tmp_path, 1, 2).checkpoints()[-1]
@@ -404,14 +338,6 @@ class TestForeign:
         with refused(match="size mismatch|shape"):
             make_diayn(tmp_path / "new", hidden=9).load(tmp_path / "run")
 
-    @pytest.mark.parametrize("frames", [float("nan"), -16, "16", None])
-    def test_base_steps_that_are_no_count_are_refused(self, frames: Any, tmp_path) -> None:
-        one = make_diayn(None)
-        one.collected_frames = frames
-        path = one._sync_checkpoint_components(one.checkpoint).save(tmp_path / "c")
-        with refused(match=f"has {frames!r} base steps"):
-            make_diayn(None).load(path)
-
     def test_a_checkpoint_without_a_component_is_refused(self, tmp_path) -> None:
         one = make_diayn(None)
         path = plain_checkpoint(loss_module=one.loss_module).save(tmp_path / "c")
@@ -431,15 +357,15 @@ class TestForeign:
             def __reduce__(self) -> Any:
                 return os.mkdir, (str(tmp_path / "exploded"),)
 
-        path = plain_checkpoint(net=Big()).save(tmp_path / "c", format="directory")
-        (state,) = path.rglob("state")
-        for bomb in (state / "other.pickle", state.parent / "state.pt"):
-            bomb.write_bytes(pickle.dumps(Bomb()))
-            with refused(match=f"holds '{bomb.name}'.*could execute code"):
-                load(path)
-            bomb.unlink()
+        class Pickled(StateDictCheckpointAdapter):
+            def save(self, component: Any, path: Path, **_: Any) -> None:
+                path.mkdir(parents=True)
+                (path / "state.pt").write_bytes(pickle.dumps(Bomb()))
+
+        made = Checkpoint(format="archive").register("net", Big(), adapter=Pickled())
+        with refused(match="holds 'state.pt'.*could execute code"):
+            load(made.save(tmp_path / "c"))
         assert not (tmp_path / "exploded").exists()
-        assert load(path) == 0.0
 
 
 class TestNaN:

@@ -92,7 +92,7 @@ def _of_trainer(make: Callable[[], Any]) -> Kind:
     first, trainer = make(), make()
     first.train()
     a3c = isinstance(first, A3CTrainer)
-    path = (first.rotation if a3c else first.checkpoint_rotation).latest()
+    path = first.rotation.latest()
 
     def load() -> Any:
         trainer.load(path)
@@ -194,12 +194,12 @@ def atari_trials(folder: Path) -> Kind:
 
 def run_record(folder: Path) -> Kind:
     config = DemoConfig(seed=3, out=str(folder))
-    start_record("demo", config, ["hmcts", "demo", "seed=3"], {"versions": {"torch": "2"}})
+    start_record("demo", config, ["hmcts", "demo", "seed=3"])
     return folder / "run.json", lambda: vars(load_config(read_run(folder))[1])
 
 
 def sweep_journal(folder: Path) -> Kind:
-    journal = pytest.importorskip("torchrl_hmcts.trainers.runs.journal")
+    journal = pytest.importorskip("torchrl_hmcts.trainers.runs.sweep")
     folder.mkdir(parents=True)
     path = folder / "journal.log"
     for i in range(20):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import errno
 import os
-import pickle
 import shutil
 import signal
 import stat
@@ -20,12 +18,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import make_networks
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
-from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_hmcts import compiling, processes
-from torchrl_hmcts.envs import GridworldMazeEnv, WaterworldMazeEnv, maze_pool
+from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.objectives import A3CLoss
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty
 from torchrl_hmcts.testing import ChainEnv
@@ -152,30 +150,6 @@ def test_code_is_not_loaded_from_a_temporary_folder_that_others_can_write(
 # ------------------------------------------------------------------ threads and copies
 
 
-def played(env: Any, actions: torch.Tensor) -> torch.Tensor:
-    td = env.reset()
-    root = td.clone()
-
-    def play(row: torch.Tensor) -> torch.Tensor:
-        td = root.clone()
-        for action in row:
-            td = env.step(td.set("action", action))["next"].exclude("reward")
-        return td["position"]
-
-    in_turn = torch.stack([play(row) for row in actions])
-    with ThreadPoolExecutor(4) as pool:
-        together = torch.stack(list(pool.map(play, actions)))
-    assert torch.equal(in_turn, together)
-    return in_turn
-
-
-@pytest.mark.parametrize("kind", [WaterworldMazeEnv, GridworldMazeEnv])
-def test_threads_that_share_an_env_step_as_one_after_the_other(kind: Any) -> None:
-    actions = torch.randint(4, (6, 40), generator=torch.Generator().manual_seed(0))
-    end = played(kind(maze_pool("test")[:1], seed=0, max_steps=1000), actions)
-    assert len(end.unique(dim=0)) > 1
-
-
 def make_planner_env() -> Any:
     worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
     base = WaterworldMazeEnv(maze_pool("test")[:2], seed=0)
@@ -224,14 +198,6 @@ def test_a_process_forked_while_a_thread_steps_can_step() -> None:
         thread.join()
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_a_copy_steps_as_the_env_that_was_copied(copied: Any) -> None:
-    env = WaterworldMazeEnv(maze_pool("test")[:1], seed=0)
-    td = env.reset().set("action", torch.tensor(2))
-    one, other = (e.step(td.clone())["next", "position"] for e in (env, copied(env)))
-    assert one.equal(other)
-
-
 # ------------------------------------------------------------------ signs of life
 
 
@@ -246,15 +212,6 @@ def test_a_look_after_a_long_sleep_counts_two_seconds(monkeypatch: pytest.Monkey
     assert silence.look("a") == 2.5
     now[0] += 0.5
     assert silence.look("b") == 0.0
-
-
-def make_loss() -> A3CLoss:
-    actor = ProbabilisticActor(
-        TensorDictModule(torch.nn.Embedding(4, 2), ["state"], ["logits"]),
-        in_keys=["logits"],
-        distribution_class=torch.distributions.Categorical,
-    )
-    return A3CLoss(actor, ValueOperator(torch.nn.Embedding(4, 1), in_keys=["state"]))
 
 
 def stop_a_learner(trainer: A3CTrainer) -> list[int]:
@@ -272,7 +229,9 @@ def stop_a_learner(trainer: A3CTrainer) -> list[int]:
 
 
 def make_trainer(**kwargs: Any) -> A3CTrainer:
-    return A3CTrainer(lambda: ChainEnv(4), make_loss(), start_method="fork", **kwargs)
+    return A3CTrainer(
+        lambda: ChainEnv(4), A3CLoss(*make_networks(4)), start_method="fork", **kwargs
+    )
 
 
 @linux
@@ -299,42 +258,6 @@ def test_a_run_that_has_reached_its_frames_ends_though_a_learner_is_stopped(
 
 
 # ------------------------------------------------------------------ what the machine lacks
-
-
-A3C = """
-import torch
-from tensordict.nn import TensorDictModule
-from torchrl.modules import ProbabilisticActor, ValueOperator
-from torchrl_hmcts.objectives import A3CLoss
-from torchrl_hmcts.testing import ChainEnv
-from torchrl_hmcts.trainers import A3CTrainer
-actor = ProbabilisticActor(
-    TensorDictModule(torch.nn.Embedding(4, 2), ['state'], ['logits']), in_keys=['logits'],
-    distribution_class=torch.distributions.Categorical)
-loss = A3CLoss(actor, ValueOperator(torch.nn.Embedding(4, 1), in_keys=['state']))
-try:
-    A3CTrainer(lambda: ChainEnv(4), loss, total_frames=100, num_learners=2).train()
-except Exception as error:
-    print(type(error).__name__, error)
-"""
-POOL = """
-from torchrl_hmcts.envs import AtariOptionPool, RepeatActions
-try:
-    pool = AtariOptionPool('Pong', RepeatActions(2), max_steps=2, num_processes=4, seed=0)
-    pool.rollout(1)
-    pool.close()
-except Exception as error:
-    print(type(error).__name__, error)
-"""
-BUFFER = """
-from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl_hmcts.processes import system_errors
-try:
-    with system_errors("the buffers cannot have the shared memory of their locks"):
-        buffers = [ReplayBuffer(storage=LazyTensorStorage(9)) for _ in range(9)]
-except Exception as error:
-    print(type(error).__name__, error)
-"""
 NETWORK = """
 from torchrl_hmcts.envs import SharedMLP
 try:
@@ -345,47 +268,14 @@ except Exception as error:
 
 
 @root_only
-@pytest.mark.parametrize(
-    "code",
-    [
-        pytest.param(A3C, marks=pytest.mark.slow),
-        pytest.param(POOL, marks=pytest.mark.slow),
-        pytest.param(BUFFER, marks=pytest.mark.slow),
-        NETWORK,
-    ],
-    ids=["a3c", "pool", "buffer", "network"],
-)
-def test_too_little_shared_memory_is_named_with_its_size_and_the_fix(code: str) -> None:
-    code_and_rest = f"{code}import os; print('left', os.listdir('/dev/shm'))"
-    done = python("-c", code_and_rest, before="mount -t tmpfs -o size=16k tmpfs /dev/shm")
+def test_too_little_shared_memory_is_named_with_its_size_and_the_fix() -> None:
+    """The same for A3C, a pool and buffers: ``benchmarks/environments.py``."""
+    code = f"{NETWORK}import os; print('left', os.listdir('/dev/shm'))"
+    done = python("-c", code, before="mount -t tmpfs -o size=16k tmpfs /dev/shm")
     assert done.stdout.startswith("OSError"), done
     assert "/dev/shm has 16,384 bytes" in done.stdout
     assert "docker run --shm-size=" in done.stdout
-    if code is not BUFFER:  # whose locks go when the process ends
-        assert done.stdout.endswith("left []\n")
-
-
-def limited(code: str, limit: str) -> str:
-    """Run code with what stands before its ``try`` executed after its imports."""
-    imports, attempt = code.split("try:\n")
-    attempt = attempt.replace("except Exception", "    print('done')\nexcept Exception")
-    return python("-c", f"{imports}{limit}try:\n{attempt}").stdout
-
-
-@linux
-@pytest.mark.slow
-@pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
-def test_too_few_descriptors_are_an_error_within_thirty_seconds(code: str) -> None:
-    begin = time.monotonic()
-    limit = (
-        "import os, resource\n"
-        "few = len(os.listdir('/proc/self/fd')) + 7\n"
-        "resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
-    )
-    told = limited(code, limit)
-    assert told.startswith("OSError"), told
-    assert "ulimit -n" in told
-    assert time.monotonic() - begin < 60.0  # the imports included
+    assert done.stdout.endswith("left []\n")
 
 
 @linux
@@ -422,25 +312,6 @@ def test_each_process_counts_two_descriptors_before_any_is_started(
     monkeypatch.setattr(resource, "getrlimit", lambda _: (open_files + needed - 1, 4096))
     with pytest.raises(OSError, match=f"it needs {needed} more files, and {needed - 1} are left"):
         processes.need_descriptors(number, pipes)
-
-
-@linux
-@pytest.mark.slow
-@pytest.mark.parametrize("code", [A3C, POOL], ids=["a3c", "pool"])
-def test_as_many_descriptors_as_are_asked_for_suffice(code: str) -> None:
-    limit = (
-        "import os, resource\n"
-        "from torchrl_hmcts import processes\n"
-        "check = processes.need_descriptors\n"
-        "def limit(number, pipes):\n"
-        "    few = len(os.listdir('/proc/self/fd')) + 2 * number + pipes + 16\n"
-        "    resource.setrlimit(resource.RLIMIT_NOFILE, (few, few))\n"
-        "    check(number, pipes)\n"
-        "import torchrl_hmcts.envs.gym.processes as a\n"
-        "import torchrl_hmcts.trainers.a3c.learner_processes as b\n"
-        "a.need_descriptors = b.need_descriptors = limit\n"
-    )
-    assert limited(code, limit) == "done\n"
 
 
 @linux

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 import torch
+from small_trainers import differences
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
-from trainer_parts import differences
 
 from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.modules import FixedSkillPrior, GrowingSkillPrior
@@ -142,13 +142,10 @@ def test_skills_that_are_still_being_learned_are_judged_only_at_the_latest() -> 
     assert run(grow, (0.1 * i for i in itertools.count()), 8) == [2, 2, 2, 3, 3, 3, 3, 4]
 
 
-def test_growing_ends_when_there_is_no_room_or_enough_is_covered_or_it_is_late() -> None:
-    for ending in ({"room": 3}, {"enough": 2.0}, {"until": 400}):
-        grow = make([1.0, 2.0, 3.0], **ending)
-        assert run(grow, flat(), 8)[-1] == 3
-        assert grow.finished
-    # A useless skill is switched off even when it is late.
-    assert run(make([1.0, 1.0], until=300), flat(), 8) == [2, 3, 3, 2, 2, 2, 2, 2]
+def test_growing_ends_when_there_is_no_room() -> None:
+    grow = make([1.0, 2.0, 3.0], room=3)
+    assert run(grow, flat(), 8)[-1] == 3
+    assert grow.finished
 
 
 def test_pruning_drops_the_skills_without_which_coverage_is_no_smaller() -> None:

@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from torchrl.envs import PendulumEnv
 
 from torchrl_hmcts.envs import (
@@ -29,13 +28,6 @@ IDS = {
 @pytest.fixture(params=IDS)
 def env_id(request):
     return request.param
-
-
-@pytest.mark.parametrize("name", [*IDS, "torchrl_hmcts/LabMaze-v0"])
-def test_gymnasium_checker_passes(name):
-    env = gymnasium.make(name, render_mode="rgb_array")
-    check_env(env.unwrapped)
-    env.close()
 
 
 def test_spaces_are_those_of_the_torchrl_env(env_id):

@@ -324,7 +324,7 @@ def test_goals_are_found_on_features_that_actions_control() -> None:
 
 
 def test_what_does_not_fit_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(TypeError, match="no key 'option_step'. Nearest: option_steps"):
+    with pytest.raises(TypeError, match="key 'option_step'. Did you mean: option_steps"):
         HMCTS("CartPole-v1", option_step=3)
     given = HMCTS("MountainCar-v0", option_steps=14).save(tmp_path / "given")
     with pytest.raises(ValueError, match=r"options are given \(options=directions\), not learned"):

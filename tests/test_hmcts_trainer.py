@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import Bars, differences, weights
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import (
     Binary,
@@ -23,14 +24,13 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase
-from trainer_parts import Bars, differences, weights
 
 from torchrl_hmcts.planners import MCTSPlanner, SearchBudget
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.hmcts import HMCTSTrainer
 from torchrl_hmcts.trainers.skills.dataset import load_dataset
-from torchrl_hmcts.trainers.skills.rounds import RoundRecords, seeded
+from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 
 STEPS = torch.tensor([[0.0, -1.0], [0.0, 1.0], [-1.0, 0.0], [1.0, 0.0]])
 
@@ -283,14 +283,6 @@ def test_the_same_seed_gives_the_same_run_whatever_was_drawn_before() -> None:
     assert not torch.equal(runs[0], runs[2])
 
 
-def test_seeds_of_different_rounds_and_phases_differ() -> None:
-    drawn = set()
-    for phase, index in (("round", 0), ("round", 1), ("train", 0), ("train", 1)):
-        with seeded(0, phase, index) as seed:
-            drawn.add((seed, float(torch.rand(()))))
-    assert len(drawn) == len({a for a, _ in drawn}) == len({b for _, b in drawn}) == 4
-
-
 def resumable(folder: Path, rounds: int, saved: str) -> HMCTSTrainer:
     return make_trainer(
         rounds=rounds,
@@ -340,19 +332,6 @@ def test_what_would_change_the_run_is_refused_when_resuming(tmp_path: Path) -> N
         make_trainer(seed=1).load(tmp_path)
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
         make_trainer().load(tmp_path / "elsewhere")
-
-
-def test_ucb_gets_the_given_constant() -> None:
-    seen: list[tuple[float, int]] = []
-
-    def make_planner(env: EnvBase, *, tree_policy: Any, seed: int) -> MCTSPlanner:
-        seen.append((tree_policy.c, seed))
-        budget = SearchBudget(expansions=2)
-        return MCTSPlanner(env, tree_policy=tree_policy, seed=seed, budget=budget)
-
-    trained(make_planner=make_planner, c_p=0.3)
-    assert [c for c, _ in seen] == [0.3, 0.3, 0.3]
-    assert len({seed for _, seed in seen}) == 3
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import re
 from functools import lru_cache
 from pathlib import Path
 
-import gymnasium
 import pytest
 import torch
 from hypothesis import given, settings
@@ -352,15 +351,6 @@ class TestReadOuts:
         parts = ["tile_position", "heading", "body_velocity", "goal", "map", "apples"]
         assert (td["observation"] == torch.cat([td[key] for key in parts])).all()
 
-    def test_heading_and_body_velocity_are_a_rotation(self):
-        env = pool_env("constant")
-        td = env.reset(TensorDict(batch_size=[500]))
-        td = play_native(env, td, [env.action_spec.expand(500, 7).rand() for _ in range(20)])[-1]
-        cosine, sine = td["heading"].unbind(-1)
-        forward, left = td["body_velocity"].unbind(-1)
-        world = torch.stack((forward * cosine - left * sine, forward * sine + left * cosine), -1)
-        torch.testing.assert_close(world * 320, td["velocity"], atol=1e-3, rtol=0)
-
     def test_without_a_goal_it_is_nowhere(self):
         assert make_env().reset()["goal"].tolist() == [-1.0, -1.0]
 
@@ -424,21 +414,6 @@ class TestTorchRL:
         check_env_specs(env)
 
 
-class TestGymnasium:
-    ID = "torchrl_hmcts/LabMaze-v0"
-
-    def test_an_episode_ends_at_the_goal(self):
-        env = gymnasium.make(self.ID, mazes=[["******", "*P  G*", "******"]], num_steps=4)
-        state = env.unwrapped.env.make_state(0, START)
-        _, info = env.reset(options={"state": state})
-        assert info["position"].tolist() == list(START)
-        steps = [env.step(FORWARD)]
-        while not (steps[-1][2] or steps[-1][3]):
-            steps.append(env.step(FORWARD))
-        assert sum(step[1] for step in steps) == 10.0
-        assert steps[-1][2]
-
-
 class TestBadInput:
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -489,13 +464,8 @@ class TestBadInput:
         with pytest.raises(ValueError, match=message):
             env.reset(td, set_state=True)
 
-    def test_a_state_of_another_form_is_refused(self):
+    def test_what_is_no_place_or_heading_is_refused(self):
         env = make_env()
-        td = env.make_state(0, START)
-        with pytest.raises(ValueError, match=r"missing: \['level'\]"):
-            env.reset(td.exclude("level"), set_state=True)
-        with pytest.raises(ValueError, match='"position" must be torch.float32'):
-            env.reset(td.set("position", td["position"].double()), set_state=True)
         with pytest.raises(ValueError, match="position must be .* pairs"):
             env.make_state(0, (1.0, 2.0, 3.0))
         with pytest.raises(ValueError, match="heading must be finite"):

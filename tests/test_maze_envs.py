@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, EnvBase, ParallelEnv, RewardSum, SerialEnv, StepCounter
+from torchrl.envs import Compose, EnvBase, RewardSum, StepCounter
 from torchrl.envs import TransformedEnv as Transformed
 from torchrl.envs.utils import check_env_specs
 
@@ -127,18 +127,6 @@ def test_the_same_seed_gives_the_same_episodes_and_no_global_generator_is_used(n
 
 
 @each_kind
-def test_only_the_elements_asked_for_are_reset(name: str) -> None:
-    env = MAKE[name](seed=0)
-    td = play(env, env.reset(TensorDict(batch_size=[3])), actions(env, 3, 3))[-1]
-    before = td.clone()
-    td["_reset"] = torch.tensor([[True], [False], [True]])
-    after = env.reset(td, set_state=False)
-    keys = state_keys(env)
-    assert (after[1].select(*keys) == before[1].select(*keys)).all()
-    assert not (after[::2].select(*keys) == before[::2].select(*keys)).all()
-
-
-@each_kind
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
 def test_a_copy_continues_as_the_original(name: str, duplicate: Any) -> None:
     env = MAKE[name](seed=0)
@@ -191,20 +179,6 @@ def test_rollouts_of_any_batch_shape_stay_within_the_specs(name: str, batch: lis
         assert env.observation_spec[key].expand(value.shape).is_in(value), key
     gone = td["next", "level"][..., 3] if name == "lab" else td["next", "step_count"]
     assert gone.max() == 6  # and reset afterwards
-
-
-@each_kind
-@pytest.mark.parametrize("batched", [SerialEnv, ParallelEnv])
-def test_batched_envs_run_it(name: str, batched: Any) -> None:
-    envs = batched(2, partial(MAKE[name], **{LIMIT[name]: 5}))
-    try:
-        envs.set_seed(0)
-        td = envs.rollout(12, break_when_any_done=False)
-        assert td.shape == (2, 12)
-        assert td["next", "truncated"].sum(1).min() >= 1
-        assert not (td[0]["position"] == td[1]["position"]).all()
-    finally:
-        envs.close()
 
 
 @pytest.mark.parametrize("name", TILES)

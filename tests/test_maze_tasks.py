@@ -227,6 +227,7 @@ def test_the_dissertations_manager_has_four_stages() -> None:
     assert planner.novelty is None
     assert (planner.settings.expand, planner.settings.backup) == ("one", "mean")
     assert isinstance(planner.evaluate.leaf_evaluator, RolloutEvaluator)
+    assert kit.make_round_planner(planner.simulator.given_env, seed=0).novelty is None
 
 
 def test_a_learned_manager_is_saved_and_plans_in_other_mazes(tmp_path) -> None:
@@ -262,12 +263,6 @@ def test_an_agent_that_is_loaded_reports_the_rewards_that_a_run_does(tmp_path) -
     words = ["kit=waterworld", "options=actions", "option_steps=20", "toy=true", f"out={tmp_path}"]
     assert main(["train", *words]) == 0
     assert HMCTS.load(tmp_path).solve(seed=0).reward == 1.0
-
-
-def test_the_dissertations_manager_plans_the_rounds_too() -> None:
-    kit = make_kit(DemoConfig(manager="four_stages", algorithm="hmcts"))
-    simulator = kit.make_options(kit.make_env("train"), fixed_worker())
-    assert kit.make_round_planner(simulator, seed=0).novelty is None
 
 
 def test_a_manager_that_cannot_learn_says_so() -> None:

@@ -23,7 +23,7 @@ OTHERS = {  # of other packages
     *("_enabled", "_impl", "_load_data"),  # numba's cache: compiling.py
     *("_exit", "_replace"),  # os._exit; a NamedTuple's
     *("_max_episode_steps", "_destroy"),  # of Gymnasium's TimeLimit, and its Box2D envs
-    *("_contact_force_range", "_goal_tol", "_success_timing"),  # of mazes: mujoco_tasks.py
+    *("_contact_force_range", "_goal_tol", "_success_timing"),  # of mazes: mujoco_batch.py
     *("_reward_task_id", "_teleport_info", "_terminate_at_goal"),
 }
 # What is there today: names go, and none comes.

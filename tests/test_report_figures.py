@@ -17,7 +17,6 @@ from torchrl_hmcts.trainers.figures.atari_scores import (
     TABLE_5_1,
     TABLE_A_1,
     best_baseline,
-    what_it_took,
 )
 
 ASKED = (
@@ -159,20 +158,6 @@ def test_table_5_1_has_ours_beside_the_sources_and_the_baselines(tmp_path) -> No
         ["deterministic", "mean", "2.02", "1.68", "to", "2.37", "1"],
         ["sticky", "mean", "1.68", "a", "game", "has", "one", "seed", "1"],
     ]
-
-
-def test_frames_per_decision_are_those_of_the_episodes_alone() -> None:
-    episodes = [{"decisions": 30}, {"decisions": 20}]
-    spent = {"frames": 6_000, "frames_finding_options": 800, "frames_tuning": 200}
-    old = {**spent, "episodes": episodes, "source": "goals", "options": ["a", "b"]}
-    assert what_it_took([{**old, "option_steps": 5, "seconds": 7.4}]) == [
-        "goals",
-        "2, 5",
-        6_000,
-        100,
-        7,
-    ]
-    assert what_it_took([{**old, "frames_per_decision": 90.0}])[3] == 90
 
 
 def test_the_sources_numbers_fit_each_other() -> None:

@@ -163,20 +163,6 @@ class TestReports:
         assert re.search("page of another run|the folder of a run", capsys.readouterr().err)
         assert [Path(name, "index.html").read_bytes() for name in runs] == before
 
-    def test_a_stamped_picture_is_still_the_same_picture(self, tmp_path: Path) -> None:
-        import imageio.v3 as iio
-        from matplotlib import image
-
-        from torchrl_hmcts.trainers.figures.pictures import STAMP, refuse_foreign
-
-        pixels = np.random.default_rng(0).integers(0, 255, (9, 7, 3), np.uint8)
-        iio.imwrite(tmp_path / "x.png", pixels)
-        with pytest.raises(ValueError, match=r"x.png exists"):
-            refuse_foreign(tmp_path / "x.png")
-        image.imsave(tmp_path / "x.png", pixels, metadata=STAMP)
-        refuse_foreign(tmp_path / "x.png")
-        assert np.array_equal(iio.imread(tmp_path / "x.png")[..., :3], pixels)
-
 
 class TestEvaluations:
     def test_what_is_not_finite_is_null(

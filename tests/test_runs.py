@@ -27,7 +27,7 @@ from torchrl_hmcts.trainers.experiments.settings import (
     WaterworldGoalsConfig,
 )
 from torchrl_hmcts.trainers.runs.config import RunConfig, home, parse_overrides
-from torchrl_hmcts.trainers.runs.run import FolderRefused, open_run
+from torchrl_hmcts.trainers.runs.run import open_run
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked, is_locked
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
@@ -124,13 +124,6 @@ class TestFolders:
         assert "out=file is a file" in capsys.readouterr().err
         assert Path("file").read_text() == "mine"
 
-    def test_python_refuses_as_the_command_line_does(self, ran) -> None:
-        with open_run(DemoConfig(out="run")):
-            pass
-        with pytest.raises(FolderRefused, match="run holds a finished run of demo, seed 0"):
-            with open_run(DemoConfig(out="run")):
-                pass
-
     @pytest.mark.parametrize(
         ("words", "package"),
         [
@@ -204,17 +197,6 @@ class TestResuming:
         assert "it begins again" in capsys.readouterr().out
         assert ran[0].mazes == 7
 
-    def test_without_a_folder_the_only_run_is_resumed_and_of_several_none(
-        self, ran, capsys
-    ) -> None:
-        assert main(["demo"]) == main(["demo", "resume=true"]) == main(["demo"]) == 0
-        assert [(c.out, c.resume) for c in ran] == [
-            ("runs/demo", False), ("runs/demo", True), ("runs/demo_2", False),
-        ]  # fmt: skip
-        assert main(["demo", "resume=true"]) == 2
-        said = capsys.readouterr().err
-        assert "hmcts train resume=runs/demo, hmcts train resume=runs/demo_2" in said
-
     def test_a_folder_named_like_a_truth_value_can_be_resumed(
         self, ran, monkeypatch, capsys
     ) -> None:
@@ -243,16 +225,6 @@ class TestWords:
         assert config(out=Path("~/x")).out == expanded
         assert config(out="a/~/x").out == "a/~/x"
         assert home(expanded) == expanded
-
-    def test_every_command_finds_the_home_folder(self, ran, tmp_path) -> None:
-        assert main(["demo", "out=~/runs/x"]) == main(["demo", "out=~/runs/y"]) == 0
-        assert main(["train", "resume=~/runs/x"]) == 0
-        assert main(["report", "~/runs/x", "out=~/page.html"]) == 0
-        assert main(["report", "~/runs/x", "~/runs/y", "out=~/both"]) == 0
-        assert main(["report", "figure=3.1", "results=~", "out=~/figures"]) == 0
-        there = [name for name in os.listdir(tmp_path / "home") if not name.startswith(".")]
-        assert sorted(there) == ["both", "figures", "page.html", "runs"]
-        assert os.listdir(tmp_path) == ["home"]
 
     def test_a_path_that_can_be_no_path_is_refused(self) -> None:
         for out in ("", "a\0b"):

@@ -378,30 +378,6 @@ def test_a_planner_that_says_what_it_reads_gets_only_that() -> None:
     assert {"position", "age"} <= set(everything.calls[0].keys())
 
 
-def test_a_planner_is_no_part_of_the_state_dict() -> None:
-    network = torch.nn.Linear(1, 1)
-
-    class Manager(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = network
-
-        def plan_goals(self, td: TensorDictBase) -> tuple[Tensor, Tensor]:
-            return Ahead().plan_goals(td)
-
-    env = make_env(planner=Manager())
-    assert not env.state_dict()
-    assert not list(env.parameters())
-
-
-def test_goals_may_have_any_number_of_coordinates() -> None:
-    def plan(td: TensorDictBase) -> tuple[Tensor, Tensor]:
-        return td["age"].unsqueeze(1) + torch.arange(1.0, 4.0)[:, None], torch.full((len(td),), 3)
-
-    env = TransformedEnv(Plane((2,)), SubgoalTransform(plan, position_key="age"))
-    assert env.reset()["goals"].shape == (2, 3)
-
-
 @pytest.mark.parametrize(
     ("answer", "message"),
     [

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_trainers import differences
 from torch import nn
 from torchrl.checkpoint import CheckpointError, CheckpointRotation, GlobalRNGState
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, TransformedEnv
-from trainer_parts import differences
 
 from torchrl_hmcts.envs import SettableGymEnv, WaterworldMazeEnv
 from torchrl_hmcts.trainers.diayn import DIAYNTrainer
@@ -146,7 +146,7 @@ def test_a_run_that_continues_from_an_older_checkpoint_keeps_what_it_saves(tmp_p
 
 def test_two_places_for_checkpoints_are_refused(tmp_path: Path) -> None:
     rotation = CheckpointRotation(tmp_path, keep_last=1)
-    with pytest.raises(ValueError, match="save_dir=.* and checkpoint_rotation"):
+    with pytest.raises(ValueError, match="to save_dir; leave checkpoint_rotation out"):
         make_trainer(32, save_dir=tmp_path, checkpoint_rotation=rotation)
 
 
@@ -228,11 +228,6 @@ def test_episodes_that_cannot_continue_are_refused_on_request(tmp_path: Path) ->
     make_gym_trainer(32, tmp_path).train()
     with pytest.raises(CheckpointError, match=r"GymEnv keeps state.*new_episodes=True"):
         make_gym_trainer(64, tmp_path).load(tmp_path, new_episodes=False)
-
-
-def test_a_collector_in_other_processes_is_refused() -> None:
-    with pytest.raises(TypeError, match="MultiSyncCollector keeps them in other"):
-        RunningEpisodes(object.__new__(MultiSyncCollector))
 
 
 class Owner(nn.Module):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from functools import lru_cache, partial
 
-import gymnasium
 import pytest
 import torch
 from hypothesis import given, settings
@@ -291,17 +290,6 @@ class TestState:
         for key, spec in env.observation_spec.items():
             assert spec.expand(td[key].shape).is_in(td[key]), key
         assert (env.reset(td.clone(), set_state=True) == td).all()
-
-
-def test_an_episode_through_gymnasium_ends_at_the_target():
-    env = gymnasium.make("torchrl_hmcts/WaterworldMaze-v0", mazes=maze_from_text("...")[0][None])
-    env.reset(options={"state": far_state(env.unwrapped.env, (0.5, 0.5))})
-    steps = [env.step(RIGHT)]
-    while not (steps[-1][2] or steps[-1][3]):
-        steps.append(env.step(RIGHT))
-    assert [step[1] for step in steps] == [0.0] * (len(steps) - 1) + [1.0]
-    assert steps[-1][2]
-    assert not steps[-1][3]
 
 
 class TestBadInput:

@@ -1,9 +1,7 @@
 """Hierarchical Monte Carlo tree search over learned skills, as TorchRL components.
 
-The parts are in :mod:`torchrl_hmcts.planners`, :mod:`torchrl_hmcts.transforms`,
-:mod:`torchrl_hmcts.modules`, :mod:`torchrl_hmcts.objectives`, :mod:`torchrl_hmcts.envs`,
-:mod:`torchrl_hmcts.trainers` and :mod:`torchrl_hmcts.testing`. The names that a first script needs
-are here as well.
+The parts are in its packages, e.g. :mod:`torchrl_hmcts.planners`; the names that a first script
+needs are here as well.
 """
 
 from __future__ import annotations

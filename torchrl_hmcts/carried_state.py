@@ -1,8 +1,7 @@
 """Transforms that keep a state outside the tensordict, and what a planner does about them.
 
-A planner sets an env to states that are tensordicts. What a transform remembers in itself, e.g. the
-last frames, is not set with them: frames of other nodes would leak into a node, and frames of
-simulated steps into the env that is acted in.
+What a transform remembers in itself, e.g. the last frames, is not set with a state: frames of other
+nodes would leak into a node, and frames of simulated steps into the env that is acted in.
 """
 
 from __future__ import annotations

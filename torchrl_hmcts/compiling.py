@@ -1,8 +1,7 @@
 """Compiled functions whose code is kept on disk where it can be, and compiled again where not.
 
-numba's own cache ends an import where no folder can be written, ends a call where the disk is full
-or a file is damaged, and lets two processes that compile at once write over each other. A cache is
-a convenience: here, none of this costs more than the time to compile.
+numba's own cache ends a program where no folder can be written, the disk is full or a file is
+damaged, and lets two processes that compile at once write over each other. Here it never does.
 """
 
 from __future__ import annotations

@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from torchrl_hmcts.trainers.saving.checkpoints import DurableRotation, plain_checkpoint
     from torchrl_hmcts.trainers.saving.locking import FolderInUse
     from torchrl_hmcts.trainers.saving.resume import ResumableTrainer
-    from torchrl_hmcts.trainers.saving.run_state import GeneratorStates, RunningEpisodes
     from torchrl_hmcts.trainers.skills.controllability import (
         Controllability,
         probe_controllability,

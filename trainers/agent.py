@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import logging
 from collections.abc import Callable, Iterator
 from functools import cached_property, partial
@@ -34,6 +33,7 @@ from torchrl_hmcts.trainers.experiments.managers import (
 from torchrl_hmcts.trainers.experiments.registry import KITS, find_experiment, load_config
 from torchrl_hmcts.trainers.experiments.settings import SkillsConfig
 from torchrl_hmcts.trainers.manager import ManagerPolicy
+from torchrl_hmcts.trainers.runs.config import unknown_key
 from torchrl_hmcts.trainers.runs.console import Bar
 from torchrl_hmcts.trainers.runs.run import FolderRefused, next_free, open_run, run_files
 from torchrl_hmcts.trainers.saving.run_folder import read_run
@@ -124,12 +124,8 @@ class HMCTS:
             if not issubclass(made, GymConfig):
                 raise ValueError(f"kit={kit!r} is not a kit of Gymnasium envs. Use 'gym' or 'ant'.")
             names = [field.name for field in dataclasses.fields(made)]
-            for key in keys:
-                if key not in names:
-                    near = ", ".join(difflib.get_close_matches(key, names, n=3)) or "none"
-                    raise TypeError(
-                        f"HMCTS has no key {key!r}. Nearest: {near}. hmcts list {kit} names all."
-                    )
+            for key in set(keys) - set(names):
+                raise TypeError(f"HMCTS: {unknown_key(key, names)} hmcts list {kit} names all.")
             config = made(id=env if isinstance(env, str) else "", **keys)
         self._asked, self._env = config, None if isinstance(env, SkillsConfig) else env
         self.kit = self._make_kit(config)
@@ -193,10 +189,7 @@ class HMCTS:
         Args:
             base_steps: of training. Default: 50,000, or what the kit names.
             progress: show a bar; False prints nothing.
-            save_dir: folder of checkpoints. Default: none.
-
-        Raises:
-            ValueError: if the agent is none of a Gymnasium env.
+            save_dir: folder of checkpoints.
         """
         if not isinstance(self._asked, GymConfig):
             raise ValueError(
@@ -229,15 +222,9 @@ class HMCTS:
 
         Args:
             searches: of each iteration.
-            iterations: Default 2.
+            iterations: in all.
             updates: of the network, in each iteration.
             progress: show a bar; False prints nothing.
-
-        Returns:
-            The agent.
-
-        Raises:
-            ValueError: if the planner sees nothing but a snapshot of the state.
 
         Reference:
             Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search",
@@ -305,14 +292,7 @@ class HMCTS:
         )
 
     def start(self, seed: int) -> TensorDictBase:
-        """Begin an episode that depends on nothing but its seed.
-
-        Args:
-            seed: of the start, and of all that is drawn from then on.
-
-        Returns:
-            The state to start from, ``[1]``.
-        """
+        """Begin an episode that depends on nothing but its seed; return its first state ``[1]``."""
         own, seed = self.config, whole_number("HMCTS", "seed", seed)
         with torch.random.fork_rng(devices=[]):  # TorchRL seeds its global generator, too
             self.env.set_seed(seed)
@@ -332,13 +312,6 @@ class HMCTS:
         Args:
             folder: made if absent; ``hmcts play run=FOLDER`` shows the agent.
             overwrite: replace the agent or the run that is in the folder.
-
-        Returns:
-            The folder.
-
-        Raises:
-            ValueError: if the env is a function, which cannot be written, or the folder holds an
-                agent or a run already.
         """
         if isinstance(self.kit, GymKit) and not self.kit.config.id:
             raise ValueError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import io
 import os
@@ -10,8 +9,8 @@ import sys
 from collections.abc import Callable, Sequence
 
 from torchrl_hmcts import __version__
-from torchrl_hmcts.trainers.command_line.listing import summaries
 from torchrl_hmcts.trainers.command_line.running import Failure
+from torchrl_hmcts.trainers.command_line.verbs import summaries
 from torchrl_hmcts.trainers.command_line.words import LOG_LEVEL_HELP
 from torchrl_hmcts.trainers.experiments.registry import DEMO
 from torchrl_hmcts.trainers.runs.config import unknown_key
@@ -140,98 +139,67 @@ Print a script that makes Tab complete verbs, experiments, kits and keys.
 _VERBS = {
     "demo": ("learn four skills and solve random mazes (about a minute)", _DEMO, "train:demo"),
     "train": ("run an experiment, or continue one", _TRAIN, "train:train"),
-    "evaluate": ("test a run again with other settings", _EVALUATE, "evaluate:evaluate"),
-    "play": ("show an agent acting", _PLAY, "play:play"),
-    "report": ("write the page of runs, or draw a figure", _REPORT, "report:report"),
+    "evaluate": ("test a run again with other settings", _EVALUATE, "verbs:evaluate"),
+    "play": ("show an agent acting", _PLAY, "verbs:play"),
+    "report": ("write the page of runs, or draw a figure", _REPORT, "verbs:report"),
     "sweep": ("search for good values of an experiment's keys", _SWEEP, "sweep:sweep"),
-    "data": ("record the episodes of an OGBench dataset", _DATA, "data:data"),
-    "list": ("list experiments, their keys, or figures", _LIST, "listing:show"),
-    "completion": (
-        "print what makes Tab complete in a shell",
-        _COMPLETION,
-        "completion:completion",
-    ),
+    "data": ("record the episodes of an OGBench dataset", _DATA, "verbs:data"),
+    "list": ("list experiments, their keys, or figures", _LIST, "verbs:show"),
+    "completion": ("print what makes Tab complete", _COMPLETION, "verbs:completion"),
 }
+_ABOUT = """
+Hierarchical Monte Carlo tree search over learned skills. Each verb has a --help of its own; hmcts
+--version says which this is.
+"""
 _WORDS = {"list": "NAME", "report": "DIR|key=value", "completion": "SHELL"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit status.
-
-    Args:
-        argv: words after the program's name. Default: those of the process.
-
-    Returns:
-        0; 1 if something outside went wrong (a folder, missing data or packages); 2 if the words
-        were wrong; 130 after Ctrl-C; 143 after SIGTERM; 141 if whoever read the output has stopped.
-
-    Example:
-        >>> main(["demo", "sede=1"])
-        2
-    """
+    """Run the command line; return its exit status: 2 after wrong words, 1 after other errors."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # in a locale without UTF-8
-    words = sys.argv[1:] if argv is None else argv
-    if not words:
-        _parser().print_help()
+    given = sys.argv[1:] if argv is None else argv
+    verb, *words = given or ["--help"]
+    if verb in ("-h", "--help"):
+        lines = [f"  {name:<11} {summary}" for name, (summary, *_) in _VERBS.items()]
+        print("usage: hmcts VERB [key=value ...]", _ABOUT, *lines, sep="\n")
+        return 0 if given else 2
+    if verb == "--version":
+        print(f"hmcts {__version__}")
+        return 0
+    if verb not in _VERBS:
+        print(f"hmcts: {unknown_key(verb, _VERBS, 'verb')}", file=sys.stderr)
         return 2
-    if words[0][:1] != "-" and words[0] not in _VERBS:
-        print(f"hmcts: {unknown_key(words[0], _VERBS, 'verb')}", file=sys.stderr)
+    _, text, place = _VERBS[verb]
+    if {"-h", "--help"} & set(words):
+        text = text.replace("{keys}", DEMO.describe() if "{keys}" in text else "")
+        text = text.replace("{experiments}", summaries())
+        print(f"usage: hmcts {verb} [{_WORDS.get(verb, 'key=value')} ...]\n\n{text}")
+        return 0
+    dashes = [word for word in words if word[:1] == "-" and (verb, word) != ("train", "-m")]
+    if dashes:
+        key, _, value = dashes[0].lstrip("-").replace("-", "_").partition("=")
+        loose = [word for word in words if "=" not in word and word[:1] != "-"]
+        value = value or next(iter(loose), "VALUE")
+        print(f"hmcts {verb}: keys are written without dashes: {key}={value}", file=sys.stderr)
         return 2
-    arguments, unknown = _parser().parse_known_args(words)
-    if unknown:
-        print(
-            f"hmcts {arguments.verb}: {_without_dashes(unknown, arguments.words)}", file=sys.stderr
-        )
-        return 2
-    module, _, name = _VERBS[arguments.verb][2].partition(":")
+    module, _, name = place.partition(":")
     run: Callable[[Sequence[str]], int] = getattr(
         importlib.import_module(f"torchrl_hmcts.trainers.command_line.{module}"), name
     )
     try:
-        status = run([*["-m"] * getattr(arguments, "many", False), *arguments.words])
+        status = run(words)
         sys.stdout.flush()
     except Failure as error:
         print(error, file=sys.stderr)
         return error.status
     except KeyboardInterrupt:  # in what is no run, e.g. `hmcts report`
-        print(f"\nhmcts {arguments.verb}: stopped.", file=sys.stderr)
+        print(f"\nhmcts {verb}: stopped.", file=sys.stderr)
         return 130
     except BrokenPipeError:  # e.g. `hmcts list figures | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     return status
-
-
-def _without_dashes(unknown: Sequence[str], words: Sequence[str]) -> str:
-    """Say how keys are written that came as options, e.g. ``--seed 1``."""
-    key, equals, value = unknown[0].lstrip("-").partition("=")
-    loose = [word for word in (*unknown[1:], *words) if "=" not in word and word[:1] != "-"]
-    value = value if equals else next(iter(loose), "VALUE")
-    return f"keys are written without dashes: {key.replace('-', '_')}={value}"
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="hmcts",
-        description="Hierarchical Monte Carlo tree search over learned skills. Each verb has a "
-        "--help of its own.",
-    )
-    parser.add_argument("--version", action="version", version=f"hmcts {__version__}")
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for verb, (summary, description, _) in _VERBS.items():
-        filled = description.replace("{keys}", DEMO.describe() if "{keys}" in description else "")
-        made = verbs.add_parser(
-            verb,
-            help=summary,
-            description=filled.replace("{experiments}", summaries()),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        made.add_argument("words", nargs="*", metavar=_WORDS.get(verb, "key=value"))
-        if verb == "train":
-            words = "run every combination of values with commas"
-            made.add_argument("-m", action="store_true", dest="many", help=words)
-    return parser
 
 
 if __name__ == "__main__":

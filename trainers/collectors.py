@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -14,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+_ASKED = ("update_policy_weights_", "state_dict", "load_state_dict")  # of the processes
 _MAX_DEATHS = 3  # with no batch between them that are borne
 
 
@@ -44,17 +46,6 @@ class RestartingCollector:
 
     The batch that was under way is lost, and the episodes: new ones begin. All other attributes are
     those of the collector it has built last; ``num_restarts`` counts those after the first.
-
-    Args:
-        make: called with the base steps that are left and the number of deaths so far, it builds a
-            collector, with the weights in place.
-        died: called with the collector and what it raised, it tells whether a process of it died.
-            Anything else is raised as it is.
-        total_frames: base steps in all.
-
-    Raises:
-        CollectorError: when collecting, saving or sending weights, after four deaths with no batch
-            between them.
     """
 
     def __init__(
@@ -72,7 +63,7 @@ class RestartingCollector:
     def __getattr__(self, name: str) -> Any:
         if name == "_collector":  # not built yet
             raise AttributeError(name)
-        return getattr(self._collector, name)
+        return partial(self._ask, name) if name in _ASKED else getattr(self._collector, name)
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         while self.collected_frames < self.total_frames:
@@ -88,18 +79,6 @@ class RestartingCollector:
                     return
             except Exception as error:
                 self._restart(error)
-
-    def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
-        """Send the weights to the processes."""
-        self._ask("update_policy_weights_", *args, **kwargs)
-
-    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """Return the collector's state, of the processes too."""
-        return self._ask("state_dict", *args, **kwargs)
-
-    def load_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        """Put back a state of :meth:`state_dict`."""
-        self._ask("load_state_dict", *args, **kwargs)
 
     def _ask(self, method: str, *args: Any, **kwargs: Any) -> Any:
         while True:
@@ -149,18 +128,6 @@ def make_ray_collector(
     there is none, one is started in this process and ended with the collector. The env is sent to
     the cluster as it is, each batch comes back, and the policy's weights go there after it. A
     process that dies is started again, see :class:`RestartingCollector`.
-
-    Args:
-        env: that is sent; it must be picklable.
-        policy: acts there with a copy of the weights.
-        frames_per_batch: steps of a batch, all collectors together.
-        total_frames: steps in all.
-        postproc: applied to every batch here. Default: none.
-        num_collectors: processes that collect. Default 1.
-        **collector_kwargs: of the ``Collector`` in each process.
-
-    Raises:
-        ModuleNotFoundError: if ray is not installed.
     """
     import ray
     from torchrl.collectors.distributed import RayCollector

@@ -1,34 +1,19 @@
 """Configs of every swappable class, in Hydra's store beside TorchRL's own groups.
 
-A config is made from the signature of its class: the same keywords, the same defaults. The meaning
-of a keyword stands in the docstring of the class, and nowhere else.
-
-Parts of a planner and of a loss go to their places by themselves: after ``planner=mcts``,
-``tree_policy=puct`` is ``planner.tree_policy``; after ``loss=discrete_skill_sac``,
-``objective=metra`` is ``loss.objective``. Another place is named: ``tree_policy@my.place=puct``.
-
-Example:
-    >>> from hydra import compose, initialize
-    >>> from hydra.utils import instantiate
-    >>> from torchrl_hmcts.testing import ChainEnv
-    >>> with initialize(version_base=None):
-    ...     config = compose(overrides=["+planner=mcts", "+tree_policy=puct"])
-    >>> planner = instantiate(config.planner, _partial_=True)(env=ChainEnv(length=5))
-    >>> planner.tree_policy.c
-    1.25
+A config has the keywords and defaults of the signature of its class. Parts of a planner and of a
+loss go to their places: after ``planner=mcts``, ``tree_policy=puct`` is ``planner.tree_policy``.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
-import importlib
 import inspect
 import re
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -144,23 +129,9 @@ _BASES = {"loss": LossConfig, "transform": TransformConfig, "env": EnvConfig}
 
 
 @functools.cache
-def config_of(component: type, base: type = ComponentConfig) -> Any:
-    """Make the config of a class from its signature.
-
-    Args:
-        component: class whose constructor is configured.
-        base: dataclass to inherit from. Default: :class:`ComponentConfig`.
-
-    Returns:
-        A dataclass. Its fields are the keywords of the constructor; a required one is ``MISSING``.
-
-    Example:
-        >>> from hydra.utils import instantiate
-        >>> from torchrl_hmcts.planners import UCT
-        >>> instantiate(config_of(UCT)(c=0.5))
-        UCT(c=0.5)
-    """
-    path = _public_path(component)
+def config_of(path: str, base: type = ComponentConfig) -> Any:
+    """Make the config of a class from its signature."""
+    component = named(path)
     hints = _hints(component)
     fields: list[Any] = [
         (name, hints.get(name, Any), _as_field(parameter.default))
@@ -174,37 +145,15 @@ def config_of(component: type, base: type = ComponentConfig) -> Any:
 
 
 def register_configs() -> None:
-    """Put all configs into Hydra's store; importing ``torchrl_hmcts.trainers.configs`` does it.
-
-    A class whose package is not installed (``ale_py`` for Atari) is left out.
-
-    Example:
-        >>> from hydra.core.config_store import ConfigStore
-        >>> register_configs()
-        >>> "puct.yaml" in ConfigStore.instance().list("tree_policy")
-        True
-    """
+    """Put all configs into Hydra's store, but for classes whose package is not installed."""
     store = ConfigStore.instance()
     for group, names in COMPONENTS.items():
         for name, path in names.items():
-            try:
-                component = named(path)
-            except ModuleNotFoundError:
-                continue
-            node = config_of(component, _BASES.get(group, ComponentConfig))
-            store.store(group=group, name=name, node=node, package=_PLACES.get(group))
+            with contextlib.suppress(ModuleNotFoundError):
+                node = config_of(path, _BASES.get(group, ComponentConfig))
+                store.store(group=group, name=name, node=node, package=_PLACES.get(group))
     for name, experiment in ALL_EXPERIMENTS.items():
         store.store(group="experiment", name=name, node=experiment.config_class)
-
-
-def _public_path(component: type) -> str:
-    """The path under which the package exports a class, not that of the file that defines it."""
-    parts = component.__module__.split(".")
-    for end in range(1, len(parts)):
-        package = ".".join(parts[:end])
-        if getattr(importlib.import_module(package), component.__name__, None) is component:
-            return f"{package}.{component.__name__}"
-    return f"{component.__module__}.{component.__qualname__}"
 
 
 def _hints(component: type) -> dict[str, Any]:
@@ -248,26 +197,7 @@ def _as_plain(value: Any) -> Any:
 def compose_parts(
     own: Mapping[str, Mapping[str, Any]], words: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Compose components with Hydra; return them with all their keywords.
-
-    Args:
-        own: entries of the components at their defaults, by part, e.g. ``"planner"``.
-        words: ``PART=NAME`` and ``PART/GROUP=NAME`` choose a class, by its short name (``puct``) or
-            its own (``PUCT``), ``PART.KEY=VALUE`` a keyword.
-
-    Returns:
-        The components by part.
-
-    Raises:
-        ValueError: if there is no such part, name or keyword (the nearest are named), a value is
-            not of its type, or a keyword without a default is missing.
-
-    Example:
-        >>> own = {"planner": {"_component_": "torchrl_hmcts.planners.MCTSPlanner"}}
-        >>> words = ["planner/tree_policy=puct", "planner.tree_policy.c=2.5"]
-        >>> compose_parts(own, words)["planner"]["tree_policy"]["c"]
-        2.5
-    """
+    """Compose components with Hydra; return them with all their keywords."""
     config = {part: full(node) for part, node in own.items()}
     known = [*_flat(config), *_choices(config)]
     overrides = []
@@ -302,33 +232,20 @@ def compose_parts(
             if "/" not in key and key not in known:
                 raise ValueError(unknown_key(key, known)) from None
         raise ValueError(" ".join(str(error).split()).partition(" full_key:")[0]) from None
-    found = {part: _clean(part, composed[part], top=True) for part in config}
-    return found
+    return {part: _clean(part, composed[part], top=True) for part in config}
 
 
 def _compose(overrides: Sequence[str]) -> dict[str, Any]:
-    here = (
-        nullcontext() if GlobalHydra.instance().is_initialized() else initialize(version_base=None)
-    )
-    with here:
+    begun = GlobalHydra.instance().is_initialized()
+    with contextlib.nullcontext() if begun else initialize(version_base=None):
         config = compose("hmcts", list(overrides))
     found: Any = OmegaConf.to_container(config, resolve=True)
     return found
 
 
 def full(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a component with the defaults of its class.
-
-    Args:
-        node: path of the class in ``"_component_"``, and keywords; nested ones too.
-
-    Example:
-        >>> full({"_component_": "torchrl_hmcts.planners.UCT"})
-        {'c': 1.0, '_component_': 'torchrl_hmcts.planners.UCT'}
-    """
-    defaults: Any = OmegaConf.to_container(
-        OmegaConf.structured(config_of(named(node["_component_"])))
-    )
+    """Return the entries of a component with the defaults of its class."""
+    defaults: Any = OmegaConf.to_container(OmegaConf.structured(config_of(node["_component_"])))
     entries = {k: v for k, v in defaults.items() if k not in _INTERNAL and v != MISSING}
     for key, value in node.items():
         entries[key] = (
@@ -346,7 +263,7 @@ def _clean(place: str, node: dict[str, Any], top: bool = False) -> dict[str, Any
     node = {k: v for k, v in node.items() if v != MISSING}
     plain = {k: v for k, v in node.items() if not isinstance(v, Mapping)}
     try:
-        OmegaConf.merge(OmegaConf.structured(config_of(named(node["_component_"]))), plain)
+        OmegaConf.merge(OmegaConf.structured(config_of(node["_component_"])), plain)
     except OmegaConfBaseException as error:
         key = getattr(error, "key", None) or getattr(error, "full_key", "")
         raise ValueError(f"{place}.{key}: {str(error).splitlines()[0]}.") from None

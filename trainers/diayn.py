@@ -36,7 +36,6 @@ from torchrl_hmcts.objectives import (
 from torchrl_hmcts.trainers.collectors import CollectorError
 from torchrl_hmcts.trainers.off_policy import OffPolicyTrainer, Progress, made_by
 from torchrl_hmcts.trainers.skills.coverage import StateCoverage
-from torchrl_hmcts.trainers.skills.curves import Curves, log_curves
 from torchrl_hmcts.transforms import SkillReward
 
 
@@ -48,28 +47,10 @@ class DIAYNTrainer(OffPolicyTrainer):
     objective gives (:class:`SkillReward`), with one Adam over all parameters and a soft update
     of the target critics. Another objective (METRA, LSD, DADS) is another loss, nothing else.
 
-    What is logged, per batch the mean over its updates, in :attr:`history` and to the ``logger``
-    with base steps as x. Figures are the dissertation's.
-
-    ============================  ==========================================  =======
-    name                          entry of the loss's output                  figure
-    ============================  ==========================================  =======
-    ``actor_loss``                ``loss_actor``                              4.6
-    ``critic_1_loss``             ``qvalue_loss_0``                           4.7
-    ``critic_2_loss``             ``qvalue_loss_1``                           4.8
-    ``discriminator_loss``        ``loss_discriminator``                      4.9
-    ``discriminator_accuracy``    the same; share of skills guessed
-    ``entropy``                   the same, of the policy, in nats
-    ``critic_loss``               ``loss_qvalue``, both critics
-    ``alpha``, ``alpha_loss``     ``alpha``, ``loss_alpha``
-    ``grad_norm``                 norm of the gradient before clipping
-    ``optim_steps``               updates so far
-    ``state_coverage``            cells visited, see :class:`StateCoverage`
-    ``state_coverage_total``      the same since the start
-    ============================  ==========================================  =======
-
-    Any other entry ``loss_x`` is logged as ``x_loss``; all others keep their names. In ``history``
-    the entries can also be read by the loss's own names.
+    :attr:`history` and the ``logger`` get the mean of each loss and diagnostic over a batch's
+    updates: ``loss_x`` as ``x_loss``, the critics as ``critic_1_loss`` and ``critic_2_loss``
+    (figures 4.6 to 4.9), ``discriminator_accuracy``, ``entropy`` (nats), ``grad_norm``,
+    ``optim_steps``, and the counts of :class:`StateCoverage`.
 
     Args:
         env (EnvBase): env under :class:`SkillTransform` and what the objective reads (e.g.
@@ -77,36 +58,30 @@ class DIAYNTrainer(OffPolicyTrainer):
             (a stateless env built with ``batch_size=[32]``) go with the defaults below.
         loss_module (LossModule): a :class:`DIAYNLoss`, e.g. from :meth:`make_loss`, or any
             :class:`DiscreteSkillSACLoss` or :class:`SkillSACLoss` (continuous actions).
-        total_frames (int): base steps in all. Default ``40_000``, the dissertation's.
-        frames_per_batch (int): base steps per batch, a multiple of the env's copies. Default
-            ``64``.
-        updates_per_batch (int): updates per batch. Default ``3``.
-        batch_size (int): transitions per update. Default ``256``.
-        buffer_size (int): transitions kept. Default ``20_000``.
-        actor_lr, critic_lr, objective_lr (float): Adam's learning rates. Defaults ``2e-3``,
-            ``3e-3`` and ``1e-2``: the actor is the slowest, so that it follows settled values.
-        alpha_lr (float): learning rate of log alpha, when it is tuned. Default ``1e-2``.
-        target_tau (float): share of the critics moved into their targets per update. Default
-            ``0.05``.
-        clip_norm (float): bound of the gradient's norm, over all parameters. Default ``10.0``.
+        total_frames, frames_per_batch (int): base steps in all, and per batch, a multiple of the
+            env's copies.
+        updates_per_batch (int): updates per batch.
+        batch_size (int): transitions per update.
+        buffer_size (int): transitions kept.
+        actor_lr, critic_lr, objective_lr, alpha_lr (float): Adam's learning rates; the actor is the
+            slowest, so that it follows settled values.
+        target_tau (float): share of the critics moved into their targets per update.
+        clip_norm (float): bound of the gradient's norm, over all parameters.
         reward (Transform, optional): replay buffer transform that writes the reward. Default:
             ``SkillReward(loss_module.objective)``.
-        coverage (StateCoverage, optional): what counts as visited. Default ``None``: the first
-            entry that the objective reads of the next state, in cells of side 0.5.
+        coverage (StateCoverage, optional): what counts as visited. Default: the first entry that
+            the objective reads of the next state, in cells of side 0.5.
         progress (callable, optional): called with ``total=total_frames`` it returns a progress bar,
-            e.g. ``tqdm.tqdm``. Default ``None``: quiet.
-        seed (int, optional): seeds the env and torch before the first reset. Default ``None``. The
-            networks' initial weights are older than the trainer: :meth:`make_loss` has its own.
-        save_dir (path, optional): folder of checkpoints. Default ``None``: none. To continue from
-            one, build env, loss and trainer as before and call ``trainer.load(save_dir)``; the run
-            continues as if it had never stopped, see :class:`ResumableTrainer`.
-        log_interval (int): base steps between two values that reach the ``logger``. Default ``0``:
-            every batch.
-        make_collector (callable): called as ``torchrl.collectors.Collector`` (default) is, with
-            env, policy and keywords; e.g. one that collects in other processes, after each batch of
-            which the weights are sent there. Such a run does not resume exactly.
-        **trainer_kwargs: passed to :class:`ResumableTrainer` and ``torchrl.trainers.Trainer``
-            (``logger``, ``keep_last``, ``save_trainer_interval``, ...).
+            e.g. ``tqdm.tqdm``.
+        seed (int, optional): seeds the env and torch before the first reset. The networks' initial
+            weights are older: :meth:`make_loss` has its own.
+        save_dir (path, optional): folder of checkpoints. To continue from one, build env, loss and
+            trainer as before and call ``trainer.load(save_dir)``.
+        log_interval (int): base steps between two values that reach the ``logger``; 0: every batch.
+        make_collector (callable): called as ``torchrl.collectors.Collector`` is, with env, policy
+            and keywords; e.g. one that collects in other processes. Such a run does not resume
+            exactly.
+        **trainer_kwargs: passed to :class:`ResumableTrainer` (``logger``, ``keep_last``, ...).
 
     Raises:
         ValueError: if a number is out of range, a batch does not divide among the env's copies, or
@@ -259,27 +234,18 @@ class DIAYNTrainer(OffPolicyTrainer):
         Args:
             env (EnvBase): env that writes ``in_keys`` and ``discriminator_keys``.
             num_skills (int or TensorSpec, optional): number of skills, or the spec of one that is a
-                vector. Default ``None``: what the ``objective`` distinguishes, or what the env
-                draws (:class:`SkillTransform`), or 4.
+                vector. Default: what the ``objective`` distinguishes, what the env draws, or 4.
             objective (SkillObjective, optional): what makes skills different, e.g.
-                :class:`METRAEncoderLoss`. Default ``None``: DIAYN's discriminator, built with
-                ``discriminator_keys`` and ``discriminator_hidden``.
-            loss_class (type, optional): one of :func:`worker_losses`. Default ``None``: the first
-                of these that takes the ``objective``.
+                :class:`METRAEncoderLoss`. Default: DIAYN's discriminator.
+            loss_class (type, optional): one of :func:`worker_losses`. Default: the first.
             in_keys (sequence of NestedKey, optional): what the actor sees besides the skill.
-                Default ``None``: ``["velocity"]``, or ``["observation"]`` of an env without.
+                Default: ``["velocity"]``, or ``["observation"]`` of an env without.
             critic_keys (sequence of NestedKey, optional): what the critics see besides the skill.
-                Default ``None``: ``in_keys``, and ``"displacement"`` if the env writes it, of which
-                the reward is a function. Critics serve only in training, so they may see what the
-                actor does not.
+                Default: ``in_keys``, and ``"displacement"`` if the env writes it.
             discriminator_keys (sequence of NestedKey, optional): what the discriminator sees.
-                Default ``None``: ``["displacement"]``, or ``in_keys`` in an env without.
-            hidden (sequence of int): widths of actor's and critics' shared layers. Default
-                ``(64, 64)``.
-            discriminator_hidden (sequence of int): widths of the discriminator's hidden layers.
-                Default ``()``: see :class:`SkillDiscriminator`.
-            seed (int, optional): seed of the initial weights; torch's generator is left as it was.
-                Default ``None``: torch's generator is used.
+                Default: ``["displacement"]``, or ``in_keys`` in an env without.
+            hidden, discriminator_hidden (sequence of int): widths of the hidden layers.
+            seed (int, optional): of the initial weights; torch's generator is left as it was.
             **loss_kwargs: passed to the loss.
 
         Returns:
@@ -341,22 +307,45 @@ class DIAYNTrainer(OffPolicyTrainer):
 def worker_losses(
     action_spec: TensorSpec, objective: SkillObjective | None = None
 ) -> tuple[type[LossModule], ...]:
-    """Returns the losses that train a worker with such actions, the default first.
-
-    Args:
-        action_spec (TensorSpec): discrete, or bounded floats.
-        objective (SkillObjective, optional): what makes skills different. Default ``None``: DIAYN's
-            discriminator, which :class:`DIAYNLoss` builds its objective of.
-
-    Examples:
-        >>> from torchrl.data import Categorical
-        >>> from torchrl_hmcts.trainers.diayn import worker_losses
-        >>> [loss.__name__ for loss in worker_losses(Categorical(4))]
-        ['DIAYNLoss', 'DiscreteSkillSACLoss']
-    """
+    """Returns the losses that train a worker with such actions, the default first."""
     if not hasattr(action_spec.space, "n"):
         return (SkillSACLoss,)
     return (DIAYNLoss, DiscreteSkillSACLoss)[objective is not None :]
+
+
+def curve_name(key: str) -> str:
+    """Return the name under which an entry of a loss's output is logged."""
+    if key == "loss_qvalue":
+        return "critic_loss"
+    if key.startswith("qvalue_loss_"):
+        return f"critic_{int(key.rsplit('_', 1)[1]) + 1}_loss"
+    if key.startswith("loss_"):
+        return f"{key.removeprefix('loss_')}_loss"
+    return key
+
+
+def log_curves(optim_steps: int, average_losses: TensorDictBase | None) -> dict[str, float]:
+    """Name the losses and diagnostics of a batch, averaged over its updates, for the log.
+
+    A hook of any TorchRL ``Trainer`` for the stage ``"post_optim_complete_log"``; turn off the
+    Trainer's own ``auto_log_optim_steps`` with it.
+    """
+    values: dict[str, float] = {"optim_steps": optim_steps}
+    if average_losses is not None:
+        names = [curve_name(key) for key in average_losses.keys()]
+        # One stack and one copy for all of them.
+        values.update(zip(names, torch.stack(list(average_losses.values())).tolist(), strict=True))
+    return values
+
+
+class Curves(dict[str, list[float]]):
+    """Curves by their names; the loss's own names find them as well."""
+
+    def __missing__(self, key: str) -> list[float]:
+        name = curve_name(key)
+        if name == key:
+            raise KeyError(f"{key!r} was not logged; there are {sorted(self)}.")
+        return self[name]
 
 
 def make_skill_optimizer(
@@ -370,13 +359,12 @@ def make_skill_optimizer(
 
     Args:
         loss_module (LossModule): e.g. a :class:`DIAYNLoss` or :class:`DiscreteSkillSACLoss`.
-        actor_lr, critic_lr, objective_lr (float): learning rates. Defaults ``2e-3``, ``3e-3`` and
-            ``1e-2``.
-        alpha_lr (float): of log alpha, when it is tuned. Default ``1e-2``.
+        actor_lr, critic_lr, objective_lr (float): learning rates.
+        alpha_lr (float): of log alpha, when it is tuned.
 
     Returns:
-        torch.optim.Adam: with the groups ``"actor"``, ``"critic"``, ``"objective"`` (left out if
-        it has no parameters) and, when alpha is tuned, ``"alpha"``, under ``"name"``.
+        torch.optim.Adam: with the groups ``"actor"``, ``"critic"``, ``"objective"`` and ``"alpha"``
+        under ``"name"``, those that have parameters.
 
     Examples:
         >>> from torchrl_hmcts.trainers.diayn import DIAYNTrainer, make_skill_optimizer

@@ -48,28 +48,6 @@ def execute_plans(
 
     It is no :class:`~torchrl_hmcts.planners.HierarchicalPolicy`, which would plan again at a plan's
     end and act without one: one trial is one plan, and its failure is to be seen.
-
-    Args:
-        real: the macro environment to act in, which can be set to states; not the planner's.
-        starts: states ``[M]``.
-        options: int64 ``[M, L]``, negative behind a plan's end, as in
-            :class:`~torchrl_hmcts.planners.Plan`.
-        keys: entries of the states to return, e.g. ``["position"]``. To have them after every base
-            step, build the ``OptionTransform`` with ``trajectory_keys``. Default: none.
-
-    Returns:
-        What it led to, in the order of the starts.
-
-    Raises:
-        ValueError: if the env cannot be set to the starts, or has no such entry.
-
-    Example:
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> env = ChainEnv(length=4)  # option 1 goes right, to the reward at the end
-        >>> right = torch.ones(1, 3, dtype=torch.int64)
-        >>> executed = execute_plans(env, env.reset().unsqueeze(0), right, keys=["state"])
-        >>> executed.solved.tolist(), executed.states[0]["state"].flatten().tolist()
-        ([True], [0, 1, 2, 3])
     """
     simulator = Simulator(real, mask_key=None)
     simulator.keep(keys)
@@ -129,13 +107,6 @@ class Results:
     :func:`plan_and_execute` also the ``rewards`` of the episode (float32), ``plan_seconds`` of the
     search (float64, a group's divided among its starts), the ``plans``, and with ``keys`` the
     ``states`` and ``options`` of an :class:`Execution`.
-
-    Example:
-        >>> import numpy as np
-        >>> ones = np.ones(3, dtype=np.int64)
-        >>> results = Results(ones > 0, np.array([True, True, False]), *[ones] * 5)
-        >>> results.summary()["solved"], results.summary()["starts"]
-        (2, 3)
     """
 
     found: np.ndarray
@@ -181,12 +152,7 @@ class Results:
 
 
 def spread(values: Any) -> dict[str, float]:
-    """Return mean, median and 95th percentile; NaN of nothing.
-
-    Example:
-        >>> spread([1, 2, 3])["median"]
-        2.0
-    """
+    """Return mean, median and 95th percentile; NaN of nothing."""
     values = np.asarray(values, dtype=float)
     if not values.size:
         return dict.fromkeys(("mean", "median", "p95"), float("nan"))
@@ -210,24 +176,6 @@ def plan_and_execute(
     Trees do not depend on what is searched beside them, so the results are those of one search
     after the other; a group of starts is only faster. ``planner.last_search`` is that of the last
     group. Base steps of an evaluator's rollouts count as simulated, a group's shared evenly.
-
-    Args:
-        planner: over the worker's options.
-        real, keys: as of :func:`execute_plans`.
-        starts: states ``[M]``.
-        group: starts planned side by side; 38 divides the 342 test mazes.
-
-    Returns:
-        The results, in the order of the starts.
-
-    Example:
-        >>> from torchrl_hmcts.planners import MCTSPlanner
-        >>> from torchrl_hmcts.testing import ChainEnv
-        >>> env = ChainEnv(length=5)
-        >>> starts = env.reset().expand(2).clone()
-        >>> results = plan_and_execute(MCTSPlanner(env), ChainEnv(length=5), starts)
-        >>> results.solved.tolist(), results.plans[0].options.tolist()
-        ([True, True], [1, 1, 1, 1])
     """
     parts = []
     for some in starts.split(group):
@@ -264,14 +212,7 @@ def _rolled(planner: MCTSPlanner) -> int:
 def act_by_policy(
     policy: TensorDictModuleBase, real: EnvBase, start: TensorDictBase, *, limit: int
 ) -> Results:
-    """Act in one episode by a policy over the options, without a search.
-
-    Args:
-        policy: reads the states of ``real``, writes the option.
-        real: the macro env to act in.
-        start: state ``[1]``.
-        limit: options that are taken at most.
-    """
+    """Act in one episode by a policy over the options, without a search."""
     begin = time.perf_counter()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         episode = real.rollout(limit, policy, auto_reset=False, tensordict=start[0].clone())
@@ -296,14 +237,7 @@ def option_reach(
     features: Callable[[TensorDictBase], np.ndarray],
     num_options: int,
 ) -> float:
-    """Return how far options move the features of states; a quarter of them move these farther.
-
-    Args:
-        simulator: the macro env, in which each option is taken from each start.
-        starts: states ``[M]``.
-        features: of states ``[m]``, ``[m, F]``.
-        num_options: of the macro env.
-    """
+    """Return how far options move the features of states; a quarter of them move these farther."""
     before = starts.repeat(num_options)
     options = torch.arange(num_options).repeat_interleave(len(starts))
     after = simulator.step(before.clone().set("option", options))["next"]

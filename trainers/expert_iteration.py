@@ -49,14 +49,12 @@ def make_guided_planner(
     Args:
         env: the macro environment.
         network: writes ``"logits"`` and ``"state_value"`` from entries of the env.
-        c: exploration constant of PUCT, in units of the return. Default 0.3, for returns up to 1.
-        uniform_share: share of the prior that is spread over all options. Default 0.05: a few
-            simulations more where the network is right, far fewer where it is wrong.
+        c: exploration constant of PUCT, in units of the return; for returns up to 1.
+        uniform_share: share of the prior that is spread over all options.
         novelty: which new nodes are worth searching. Default: all. Choose a test much stricter on
             what it calls equal than without a network (in Waterworld a radius of 0.2 tiles instead
-            of 0.7): the values tell near states apart, but a network that is still wrong walks in
-            circles without one.
-        expand: ``"one"`` (default) simulates only the option that PUCT chooses.
+            of 0.7).
+        expand: ``"one"`` simulates only the option that PUCT chooses.
         budget: Default: 4,000 expansions, of one option each.
         **planner_kwargs: passed to ``MCTSPlanner``.
 
@@ -94,16 +92,6 @@ class SearchCollector(LocalCollector):
 
     A frame is an example. What the searches of each iteration cost is in ``base_steps`` and
     ``simulations`` of options; ``solved`` counts those that found a plan.
-
-    Args:
-        env: the macro environment whose resets give the starts; batch size ``[]``.
-        first_planner: searches in iteration 0, before anything is learned.
-        planner: searches in the iterations after it.
-        iterations: batches to yield.
-        searches: starts per iteration.
-        keys: entries of the states that the network reads.
-        seed: of the starts: those of iteration i come from ``seed + i``.
-        example_kwargs: passed to :func:`~torchrl_hmcts.planners.search_examples`.
     """
 
     def __init__(
@@ -182,19 +170,16 @@ class ExpertIterationTrainer(OffPolicyTrainer):
             :func:`make_guided_planner` with at most 400 expansions.
         loss_module (ExpertIterationLoss, optional): Default: ``value_loss="log"`` with
             ``value_coeff=4``, Huber's loss of the base steps to the goal.
-        iterations (int): Default 4.
-        searches_per_iteration (int): starts per iteration. Default 400.
-        updates_per_iteration (int): Default 200.
-        batch_size (int): examples per update. Default 256.
-        buffer_size (int): examples kept. Default 50,000.
-        lr (float): Adam's learning rate at the start. Default 5e-3.
-        clip_norm (float): bound of the gradient's norm. Default 5.
+        iterations, searches_per_iteration, updates_per_iteration (int): how many, and of what in
+            each.
+        batch_size, buffer_size (int): examples per update, and those that are kept.
+        lr (float): Adam's learning rate at the start.
+        clip_norm (float): bound of the gradient's norm.
         example_kwargs (dict, optional): passed to
             :func:`~torchrl_hmcts.planners.search_examples`. Default ``{"roots": False}``: the
             states from which a plan was found.
-        progress (callable, optional): called with ``total=`` the updates it returns a progress bar,
-            e.g. ``tqdm.tqdm``. Default: quiet.
-        seed (int): of the starts and of the batches. Default 0.
+        progress (callable, optional): called with ``total=`` the updates it returns a progress bar.
+        seed (int): of the starts and of the batches.
         **trainer_kwargs: passed to :class:`ResumableTrainer` (``logger``, ``save_dir``, ...).
 
     Attributes:

@@ -59,54 +59,44 @@ class HMCTSTrainer(OffPolicyTrainer):
             (``batch_locked=False``), e.g. ``partial(WaterworldMazeEnv, observation=False)``.
         loss_module (LossModule): of the skills, e.g. ``DIAYNTrainer.make_loss(...)``; the
             dissertation's N_policies is its number of skills.
-        rounds (int): T, with the initial samples, as in the dissertation. Default ``200``.
-        num_init_samples (int): N_init, options executed before the first round. Default ``64``.
-        retrain_interval (int): N_retrain, rounds between two trainings. Default ``4``.
-        option_steps (int): N_worker_samples, base steps of an option at most. Default ``25``, which
-            needs fewer simulated steps in Waterworld than the dissertation's 100.
-        c_p (float): constant of UCT. Default ``1.0``.
+        rounds (int): T, with the initial samples.
+        num_init_samples (int): N_init, options executed before the first round.
+        retrain_interval (int): N_retrain, rounds between two trainings.
+        option_steps (int): N_worker_samples, base steps of an option at most. 25 needs fewer
+            simulated steps in Waterworld than the dissertation's 100.
+        c_p (float): constant of UCT.
         dataset (ReplayBuffer, TensorDict or path, optional): D, transitions ``[n]`` with the
-            loss's ``in_keys``, e.g. recorded by an :class:`OptionRecorder`; see
-            :func:`load_dataset`. Default ``None``: empty.
-        dataset_fraction (float, optional): share of each batch that is drawn from D. Default
-            ``None``: uniformly from the union, so the share of D falls as S grows.
+            loss's ``in_keys``, e.g. recorded by an :class:`OptionRecorder`; a path is a folder of
+            ``replay_buffer.dumps`` or ``tensordict.memmap``.
+        dataset_fraction (float, optional): share of each batch that is drawn from D. Default:
+            uniformly from the union, so the share of D falls as S grows.
         make_options (callable): ``make_options(worker, num_skills, option_steps,
-            trajectory_keys=...)`` builds the ``OptionTransform``. Default: the class itself; pass a
-            ``functools.partial`` of it for a discount or a termination.
-        make_recorder (callable): ``make_recorder(keys)`` builds the two recorders. Default: the
-            class itself; pass a ``functools.partial`` of it for another ``position_key``.
-        make_planner (callable): ``make_planner(simulator, tree_policy=UCT(c_p), seed=...)`` builds
-            the planner, e.g. ``partial(MCTSPlanner, novelty=..., budget=...)``. Bound its budget:
+            trajectory_keys=...)`` builds the ``OptionTransform``.
+        make_recorder (callable): ``make_recorder(keys)`` builds the two recorders.
+        make_planner, make_test_planner (callable): ``make_planner(simulator, tree_policy=UCT(c_p),
+            seed=...)``, e.g. ``partial(MCTSPlanner, novelty=..., budget=...)``. Bound its budget:
             an untrained worker finds few plans. Default: :class:`MCTSPlanner` with 50 expansions.
         worker, test_worker (TensorDictModule, optional): execute options in training and in test
             rounds. Default: :class:`SkillPolicy` over the loss's actor, sampling and greedy.
-        make_test_env (callable, optional): as ``make_env``, with held-out episodes. Default
-            ``None``: no test rounds.
-        make_test_planner (callable, optional): as ``make_planner``. Default: ``make_planner``.
-        test_rounds (int): episodes of a test, the same in each. Default ``32``.
-        test_interval (int): trainings between two tests. Default ``1``. There is one before the
-            first round and one after the last as well.
-        updates_per_step (float): updates of a training per base step that S has gained. Default
-            ``3 / 64``, that of :class:`DIAYNTrainer`.
+        make_test_env (callable, optional): as ``make_env``, with held-out episodes. Default: no
+            test rounds.
+        test_rounds (int): episodes of a test, the same in each.
+        test_interval (int): trainings between two tests; there is one before the first round and
+            one after the last as well.
+        updates_per_step (float): updates of a training per base step that S has gained.
         pretrain_updates (int, optional): updates on D. Default: ``updates_per_step`` for each
             transition of D.
-        batch_size (int): transitions per update. Default ``256``.
-        buffer_size (int): transitions of S that are kept. Default ``20_000``.
+        batch_size, buffer_size (int): transitions per update, and those of S that are kept.
         optimizer (Optimizer, optional): Default: ``make_skill_optimizer(loss_module)``.
         reward (Transform, optional): writes the reward of the sampled transitions. Default: the
             intrinsic reward of the loss.
-        target_tau (float): share of the critics moved into their targets per update. Default
-            ``0.05``.
-        clip_norm (float): bound of the gradient's norm. Default ``10.0``.
-        total_frames (int, optional): base steps of S after which no more rounds are played; those
-            of the last ``retrain_interval`` rounds may go beyond. Default ``None``: no limit.
-        save_dir (path, optional): folder of the checkpoints, one after every training. Default
-            ``None``: none.
-        progress (callable, optional): ``progress(total=...)`` returns a progress bar, e.g.
-            ``tqdm.tqdm``, over ``total_frames`` if they are given, else over rounds. Default
-            ``None``: quiet.
+        target_tau (float): share of the critics moved into their targets per update.
+        clip_norm (float): bound of the gradient's norm.
+        total_frames (int, optional): base steps of S after which no more rounds are played.
+        save_dir (path, optional): folder of the checkpoints, one after every training.
+        progress (callable, optional): ``progress(total=...)`` returns a progress bar over
+            ``total_frames`` if they are given, else over rounds.
         seed (int): all random numbers of a round or training are a function of it and of t.
-            Default ``0``.
         **trainer_kwargs: passed to :class:`ResumableTrainer` (``logger``, ``keep_last``, ...).
 
     Raises:

@@ -21,12 +21,6 @@ class ManagerNet(nn.Module):
     .. math:: l, v = f\bigl((x - \mu) / \sigma\bigr)
 
     Letters: F numbers of the entries side by side, A options.
-
-    Args:
-        mean, std: ``[F]``, of the states.
-        num_options: A.
-        bounded: whether values lie in (0, 1), as where there is one reward at the end.
-        hidden: widths of the hidden layers.
     """
 
     def __init__(
@@ -36,7 +30,6 @@ class ManagerNet(nn.Module):
         num_options: int,
         *,
         bounded: bool = True,
-        hidden: Sequence[int] = (128, 128),
     ) -> None:
         super().__init__()
         self.num_options, self.bounded = num_options, bounded
@@ -44,7 +37,7 @@ class ManagerNet(nn.Module):
         self.std: Tensor
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float().clamp_min(1e-6))
-        self.mlp = MLP(len(mean), num_options + 1, num_cells=list(hidden))
+        self.mlp = MLP(len(mean), num_options + 1, num_cells=[128, 128])
 
     def forward(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
         """Return logits ``[*B, A]`` and values ``[*B, 1]``."""
@@ -57,16 +50,7 @@ class ManagerNet(nn.Module):
 def make_manager(
     planner: MCTSPlanner, keys: Sequence[NestedKey], *, bounded: bool
 ) -> TensorDictModule:
-    """Build a manager network for a planner's states; :func:`scale_by` sets what it is scaled by.
-
-    Args:
-        planner: over the options.
-        keys: entries of its states that the network reads, each ``[F_i]``.
-        bounded: see :class:`ManagerNet`.
-
-    Returns:
-        A module that writes ``"logits"`` and ``"state_value"``.
-    """
+    """Build a manager network for a planner's states, of the entries ``keys``."""
     planner.simulator.keep(list(keys))
     spec = planner.simulator.env.full_observation_spec_unbatched
     size = sum(spec[key].shape.numel() for key in keys)
@@ -75,13 +59,7 @@ def make_manager(
 
 
 def scale_by(network: TensorDictModule, planner: MCTSPlanner, starts: TensorDictBase) -> None:
-    """Scale a manager network by the states that searches meet.
-
-    Args:
-        network: of :func:`make_manager`; changed in place.
-        planner: that searches.
-        starts: to search from, ``[M]``.
-    """
+    """Scale a manager network by the states that searches meet."""
     tree = planner.search(starts).tree
     assert tree.states is not None
     states = tree.states[torch.arange(tree.capacity) < torch.from_numpy(tree.num_nodes)[:, None]]
@@ -92,29 +70,18 @@ def scale_by(network: TensorDictModule, planner: MCTSPlanner, starts: TensorDict
 
 
 class ManagerPolicy(TensorDictModuleBase):
-    """Takes the option of the highest logit, without a search.
+    """Takes the option of the highest logit, without a search."""
 
-    Args:
-        network: writes ``"logits"``.
-        option_key: entry that the option is written to.
-        mask_key: options that may be taken, where there is such an entry.
-    """
-
-    def __init__(
-        self,
-        network: TensorDictModuleBase,
-        option_key: NestedKey = "option",
-        mask_key: NestedKey = "action_mask",
-    ) -> None:
+    def __init__(self, network: TensorDictModuleBase) -> None:
         super().__init__()
-        self.network, self.option_key, self.mask_key = network, option_key, mask_key
-        self.in_keys, self.out_keys = list(network.in_keys), [option_key]
+        self.network = network
+        self.in_keys, self.out_keys = list(network.in_keys), ["option"]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the option of each row."""
         logits = self.network(tensordict.select(*self.in_keys))["logits"]
-        mask: Any = tensordict.get(self.mask_key, None)
+        mask: Any = tensordict.get("action_mask", None)
         if mask is not None:
             logits = logits.masked_fill(~mask, -torch.inf)
-        return tensordict.set(self.option_key, logits.argmax(-1))
+        return tensordict.set("option", logits.argmax(-1))

@@ -39,26 +39,7 @@ def made_by(
 
 
 class OffPolicyTrainer(ResumableTrainer):
-    """A :class:`ResumableTrainer` with a replay buffer, target networks and a progress bar.
-
-    Args:
-        make_collector (callable): called without arguments, once the others have been checked.
-        loss_module (LossModule): whose losses are minimised.
-        optimizer (Optimizer): over its parameters.
-        total_frames (int): at which training ends.
-        batch_size (int): transitions per update.
-        buffer_size (int): transitions kept.
-        buffer_options (mapping): of the ``ReplayBuffer``, e.g. its ``transform``.
-        clip_norm (float): bound of the gradient's norm, over all parameters.
-        target_tau (float, optional): share of the networks moved into their targets per update.
-            Default ``None``: there are no targets.
-        sample (callable, optional): ``sample(buffer)`` returns a batch. Default: from the buffer.
-        settings (mapping): further values that a run must keep when it is resumed.
-        progress (callable, optional): called with ``total=`` it returns a progress bar, e.g.
-            ``tqdm.tqdm``. Default: quiet.
-        progress_total (int): where the bar ends.
-        **trainer_kwargs: passed to :class:`ResumableTrainer`.
-    """
+    """A :class:`ResumableTrainer` with a replay buffer, target networks and a progress bar."""
 
     def __init__(
         self,

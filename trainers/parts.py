@@ -17,17 +17,6 @@ def build(_component_: str, **keywords: Any) -> Any:
     default is a class or function, e.g. ``activation="torch.nn.Tanh"``. A dict with
     ``"_component_"`` becomes that component. A loss that calls its critic ``qvalue_network`` also
     takes it as ``critic_network``, as TorchRL's trainer configs pass it.
-
-    Args:
-        _component_: path of its class, e.g. ``"torchrl_hmcts.planners.UCT"``.
-        **keywords: of the class.
-
-    Returns:
-        The component.
-
-    Example:
-        >>> build("torchrl_hmcts.planners.UCT", c=0.5)
-        UCT(c=0.5)
     """
     component = named(_component_)
     parameters = keywords_of(component)
@@ -41,25 +30,13 @@ def build(_component_: str, **keywords: Any) -> Any:
 
 
 def named(path: str) -> Any:
-    """Return what a dotted path names.
-
-    Args:
-        path: e.g. ``"torch.nn.ReLU"``.
-
-    Example:
-        >>> named("torch.nn.ReLU").__name__
-        'ReLU'
-    """
+    """Return what a dotted path names."""
     module, _, name = path.rpartition(".")
     return getattr(importlib.import_module(module), name)
 
 
 def constructors(component: type) -> Iterator[Any]:
-    """Yield the constructor of a class, and where it takes ``**keywords`` those they are for.
-
-    Args:
-        component: a class.
-    """
+    """Yield the constructor of a class, and where it takes ``**keywords`` those they are for."""
     for cls in component.__mro__:
         init = vars(cls).get("__init__")
         if init is None:
@@ -73,16 +50,7 @@ def constructors(component: type) -> Iterator[Any]:
 
 
 def keywords_of(component: type) -> dict[str, inspect.Parameter]:
-    """Return the parameters of a constructor that have a name of their own.
-
-    Args:
-        component: a class.
-
-    Example:
-        >>> from torchrl_hmcts.planners import UCT
-        >>> keywords_of(UCT)["c"].default
-        1.0
-    """
+    """Return the parameters of a constructor that have a name of their own."""
     variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     found: dict[str, inspect.Parameter] = {}
     for init in constructors(component):
@@ -93,16 +61,7 @@ def keywords_of(component: type) -> dict[str, inspect.Parameter]:
 
 
 def merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a component with changes; another ``"_component_"`` replaces all.
-
-    Args:
-        own: entries by keyword, nested ones as dicts.
-        changes: entries that differ.
-
-    Example:
-        >>> merged({"c": 1.0, "novelty": {"radius": 1.0}}, {"novelty": {"radius": 0.5}})
-        {'c': 1.0, 'novelty': {'radius': 0.5}}
-    """
+    """Return the entries of a component with changes; another ``"_component_"`` replaces all."""
     if changes.get("_component_", own.get("_component_")) != own.get("_component_"):
         return dict(changes)
     out = dict(own)
@@ -113,16 +72,7 @@ def merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]
 
 
 def differences(own: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the changes with which :func:`merged` makes the second of the first.
-
-    Args:
-        own: entries by keyword, nested ones as dicts.
-        other: the same entries with other values.
-
-    Example:
-        >>> differences({"c": 1.0, "seed": 0}, {"c": 2.0, "seed": 0})
-        {'c': 2.0}
-    """
+    """Return the changes with which :func:`merged` makes the second of the first."""
     if own.get("_component_") != other.get("_component_"):
         return dict(other)
     out: dict[str, Any] = {}

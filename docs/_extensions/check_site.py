@@ -1,8 +1,7 @@
 """Checks the built site: ``python docs/_extensions/check_site.py docs/_build/html``.
 
-Links inside the site lead somewhere, and a page leads to each public name. In a real browser, where
-one is installed: no page of 390 or 1,280 pixels scrolls sideways, no console error, and equations
-render without a network.
+Links lead somewhere, public names are linked; in a browser, where one is installed: no sideways
+scrolling, no console error, equations without a network.
 """
 
 from __future__ import annotations

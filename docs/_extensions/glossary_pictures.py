@@ -21,37 +21,35 @@ MAZE = "\n".join(("P....", ".###.", "...#.", ".#.#.", ".#..T"))
 NAMES = ("up", "down", "left", "right")
 
 
-def make_env(max_steps: int = 20) -> TransformedEnv:
-    """Waterworld with one maze; option ``z`` holds thrust in direction ``z``."""
-    maze = maze_from_text(MAZE)[0]
+def make_env(maze: torch.Tensor | None = None) -> TransformedEnv:
+    """Waterworld, perhaps with one maze; option ``z`` holds thrust in direction ``z``."""
     worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-    options = OptionTransform(worker, 4, max_steps, trajectory_keys=["position"])
-    return TransformedEnv(WaterworldMazeEnv(maze[None], observation=False, seed=0), options)
+    options = OptionTransform(worker, 4, 20, trajectory_keys=["position"])
+    mazes = () if maze is None else (maze[None],)
+    return TransformedEnv(WaterworldMazeEnv(*mazes, observation=False, seed=0), options)
 
 
-def start(env: TransformedEnv) -> Any:
-    """The state at rest in the upper left corner."""
-    return env.base_env.make_state(0, torch.tensor([0.5, 0.5]), torch.tensor([4.5, 4.5]))
-
-
-def follow(env: TransformedEnv, td: Any, option: int) -> tuple[Any, Any]:
-    """Take an option; return the places of its base steps and the next state."""
-    after = env.step(td.clone().set("option", torch.tensor(option)))["next"]
-    steps = after["trajectory"]
-    return steps["position"][steps["mask"]], after.exclude("trajectory", "reward")
-
-
-def panel() -> tuple[Figure, Any]:
+def scene() -> tuple[TransformedEnv, Any, Figure, Any]:
+    """The maze with the player at rest in the upper left corner: env, state, figure, axes."""
+    env = make_env(maze_from_text(MAZE)[0])
+    td = env.base_env.make_state(0, torch.tensor([0.5, 0.5]), torch.tensor([4.5, 4.5]))
     figure = Figure(figsize=(3.2, 3.2), layout="constrained")
-    return figure, figure.subplots()
+    axes = figure.subplots()
+    axes.set_aspect("equal")
+    env.base_env.draw_map(axes, td)
+    return env, td, figure, axes
+
+
+def take(env: TransformedEnv, td: Any, option: int) -> Any:
+    """Take an option; return the places of its base steps."""
+    steps = env.step(td.clone().set("option", torch.tensor(option)))["next", "trajectory"]
+    return steps["position"][steps["mask"]]
 
 
 def draw_option() -> Figure:
     """One option: a way of 20 base steps, a dot each."""
-    env, (figure, axes) = make_env(), panel()
-    td = start(env)
-    env.base_env.draw_map(axes, td)
-    way, _ = follow(env, td, 3)
+    env, td, figure, axes = scene()
+    way = take(env, td, 3)
     axes.plot(*way.T, "o-", color=option_color(3), markersize=3)
     axes.plot(*td["position"], "o", color="black")
     axes.annotate("right", way[-1], color=option_color(3), weight="bold", xytext=(3, 8),
@@ -61,15 +59,11 @@ def draw_option() -> Figure:
 
 def draw_macro_steps() -> Figure:
     """Four macro-steps: each option one arrow."""
-    env, (figure, axes) = make_env(), panel()
-    td = start(env)
-    env.base_env.draw_map(axes, td)
+    env, td, figure, axes = scene()
     for option in range(4):
-        here = td["position"]
-        _, after = follow(env, td, option)
-        end = after["position"]
+        end = take(env, td, option)[-1]
         style = {"arrowstyle": "->", "color": option_color(option), "linewidth": 2.5}
-        axes.annotate("", end, here, arrowprops=style)
+        axes.annotate("", end, td["position"], arrowprops=style)
         axes.annotate(NAMES[option], end, color=option_color(option), weight="bold")
     axes.plot(*td["position"], "o", color="black")
     return figure
@@ -77,11 +71,9 @@ def draw_macro_steps() -> Figure:
 
 def draw_plan() -> Figure:
     """The search and its plan, with a letter on each segment."""
-    env, (figure, axes) = make_env(), panel()
+    env, td, figure, axes = scene()
     planner = MCTSPlanner(env, novelty=RadiusNovelty("position", 0.5), seed=0)
-    plan = planner.plan(start(env))
-    axes.set_aspect("equal")
-    env.base_env.draw_map(axes, start(env))
+    plan = planner.plan(td)
     planner.last_search.tree.plot_positions(ax=axes, option_names=NAMES, legend=False)
     places = plan.states["position"]
     for i, option in enumerate(plan.options.tolist()):
@@ -92,13 +84,11 @@ def draw_plan() -> Figure:
 
 def draw_radius() -> Figure:
     """The radius around places that the search has kept."""
-    env, (figure, axes) = make_env(), panel()
+    env, td, figure, axes = scene()
     budget = SearchBudget(expansions=6, until_plan=False)
     planner = MCTSPlanner(env, novelty=RadiusNovelty("position", 0.5), budget=budget, seed=0)
-    view = planner.search(start(env)).tree.view()
-    env.base_env.draw_map(axes, start(env))
-    count = int(view.num_nodes[0])
-    for node in range(count):
+    view = planner.search(td).tree.view()
+    for node in range(int(view.num_nodes[0])):
         place, refused = view.states["position"][0, node], bool(int(view.flags[0, node]) & 8)
         if refused:
             axes.plot(*place, "x", color="0.45", markersize=6)
@@ -109,19 +99,14 @@ def draw_radius() -> Figure:
 
 
 def main() -> None:
-    for name, draw in {
-        "option": draw_option,
-        "macro_step": draw_macro_steps,
-        "plan": draw_plan,
-        "novelty_radius": draw_radius,
-    }.items():
+    pictures = {"option": draw_option, "macro_step": draw_macro_steps, "plan": draw_plan}
+    for name, draw in {**pictures, "novelty_radius": draw_radius}.items():
         draw().savefig(OUT / f"glossary_{name}.png", dpi=90)
-    worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
-    env = TransformedEnv(WaterworldMazeEnv(seed=0), OptionTransform(worker, 4, max_steps=20))
+    env = make_env()
     planner = MCTSPlanner(env, novelty=RadiusNovelty("position", 0.6))
     planner.plan(env.reset(TensorDict()))
-    figure, axes = panel()
-    tree = planner.last_search.tree
+    figure = Figure(figsize=(3.2, 3.2), layout="constrained")
+    tree, axes = planner.last_search.tree, figure.subplots()
     env.base_env.draw_map(axes, tree.states[0, 0])
     tree.plot_positions(ax=axes, legend=False)
     figure.savefig(OUT / "first_search.png", dpi=110)

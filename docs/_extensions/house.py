@@ -1,15 +1,11 @@
 """Draws docs/_static/house.svg from the imports: the rooms of the code, and who uses whom.
 
-    python docs/_extensions/house.py
-
-A room stands above every room that it imports. An arrow is left out where a longer way of arrows
-says the same.
+A room stands above every room that it imports; arrows that a longer way repeats are left out.
 """
 
 from __future__ import annotations
 
 import ast
-import math
 import re
 from collections import Counter
 from functools import cache
@@ -112,40 +108,30 @@ def draw(path: Path) -> None:
     """Draw the house as an SVG file."""
     lines, uses = read_house()
     height = floors(uses)
-    top = max(height.values())
-    by_floor = [[r for r in sorted(uses) if height[r] == floor] for floor in range(top + 1)]
+    by_floor = [
+        [r for r in sorted(uses) if height[r] == f] for f in range(max(height.values()) + 1)
+    ]
     figure, axes = plt.subplots(figsize=(10, 1.25 * len(by_floor)))
     place: dict[str, tuple[float, float]] = {}
     for floor, rooms in enumerate(by_floor):  # each above the middle of what it uses
-        middle = {
-            room: sum(place[o][0] for o in uses[room]) / max(len(uses[room]), 1) for room in rooms
-        }
+        middle = {r: sum(place[o][0] for o in uses[r]) / max(len(uses[r]), 1) for r in rooms}
         for i, room in enumerate(sorted(rooms, key=lambda room: (middle[room], room))):
             place[room] = ((i + 0.5) / len(rooms), float(floor))
-    for room, others in uses.items():
-        direct = {o for o in others if not any(o in uses[p] for p in others if p != o)}
-        for other in direct:
-            axes.annotate(
-                "",
-                xy=(place[other][0], place[other][1] + 0.24),
-                xytext=(place[room][0], place[room][1] - 0.24),
-                zorder=1,
-                arrowprops={"arrowstyle": "-|>", "color": "#8a8f98", "linewidth": 0.8},
-            )
+    arrow = {
+        "arrowstyle": "-|>",
+        "color": "#8a8f98",
+        "linewidth": 0.8,
+        "shrinkA": 22,
+        "shrinkB": 22,
+    }
     for room, (x, y) in place.items():
-        width = 0.1 + 0.0014 * math.sqrt(lines[room])
+        for other in uses[room]:
+            if not any(other in uses[p] for p in uses[room] if p != other):
+                axes.annotate("", place[other], (x, y), zorder=1, arrowprops=arrow)
         name = {"torchrl_hmcts": "base", "envs": "ids, stateless"}.get(room, room.split("/")[-1])
-        box = plt.Rectangle(
-            (x - width / 2, y - 0.24),
-            width,
-            0.48,
-            facecolor=COLORS[room.split("/")[0]],
-            edgecolor="#444b55",
-            linewidth=0.8,
-            zorder=2,
-        )
-        axes.add_patch(box)
-        axes.text(x, y, f"{name}\n{lines[room]:,} lines", ha="center", va="center", zorder=3)
+        box = {"facecolor": COLORS[room.split("/")[0]], "edgecolor": "#444b55", "linewidth": 0.8}
+        text = f"{name}\n{lines[room]:,} lines"
+        axes.text(x, y, text, ha="center", va="center", zorder=3, bbox={"pad": 6.0, **box})
     handles = [plt.Rectangle((0, 0), 1, 1, facecolor=color) for color in COLORS.values()]
     axes.legend(handles, COLORS, loc="upper left", frameon=False, ncols=3)
     axes.set(xlim=(0, 1), ylim=(-0.4, len(by_floor) - 0.2))

@@ -1,8 +1,7 @@
 """Lets a docstring name anything public by its short name, and shows how classes are made.
 
-Public names are exported once in the whole project, so a short name is never ambiguous. Classes of
-TorchRL and tensordict have metaclasses that take any arguments; what counts is ``__init__``. Those
-of a TensorClass lose their docstrings, which are read from the source.
+A short name is never ambiguous; signatures that metaclasses hide and docstrings that TensorClass
+replaces are read from the source.
 """
 
 from __future__ import annotations

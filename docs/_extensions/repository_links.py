@@ -1,19 +1,15 @@
 """Makes links that are right in the repository right on the site as well.
 
-Pages link to folders and files of the repository, which are shown there by GitHub and the like. On
-the site a folder of results means the page of results, and a file at the top the page made of it.
+A folder of results means the page of results, a file at the top the page made of it.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import posixpath
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -45,43 +41,10 @@ def site_target(page: str, target: str) -> str:
 
 
 def repository(root: Path) -> str:
-    """Return the public address of the repository, or "" where none is known.
-
-    Args:
-        root: with pyproject.toml, whose ``[project.urls] Repository`` is taken; where there is
-            none, the address of git's remote ``origin``.
-    """
+    """Return the public address of the repository in pyproject.toml, or "" where none is known."""
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    named = project.get("urls", {}).get("Repository", "")
-    if named:
-        return public_address(named)
-    command = ["git", "-C", str(root), "remote", "get-url", "origin"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True)
-    except OSError:  # no git
-        return ""
-    return public_address(done.stdout.strip()) if done.returncode == 0 else ""
-
-
-def public_address(address: str) -> str:
-    """Return an address that everybody can open, or "".
-
-    Example:
-        >>> public_address("https://github.com/somebody/torchrl_hmcts.git")
-        'https://github.com/somebody/torchrl_hmcts'
-        >>> public_address("git@github.com:somebody/torchrl_hmcts.git")
-        ''
-    """
-    parts = urlsplit(address)
-    host = parts.hostname or ""
-    hidden = parts.username is not None or parts.port is not None or "." not in host
-    if parts.scheme != "https" or hidden or host.endswith((".local", ".internal", ".localhost")):
-        return ""
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return address.removesuffix("/").removesuffix(".git")
-    return ""
+    address: str = project.get("urls", {}).get("Repository", "")
+    return address
 
 
 def _rewrite(app: Sphinx, docname: str, source: list[str]) -> None:

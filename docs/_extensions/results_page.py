@@ -1,7 +1,6 @@
 """Writes the page of results from the data in docs/results, when the site is built.
 
-Every number on it comes from a file there, with the command that made it: the entry ``command`` of
-the file, or its row in docs/results/README.md.
+How a file was made: its entry ``command``, or its row in docs/results/README.md.
 """
 
 from __future__ import annotations
@@ -12,9 +11,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from results_atari import ATARI, atari, best, learned, sticky
-from results_reliability import RELIABILITY
-from results_tables import SECTIONS, Section, table
+from results_tables import SECTIONS, Section
 
 if TYPE_CHECKING:  # the tests read this module where Sphinx is not installed
     from sphinx.application import Sphinx
@@ -26,11 +23,8 @@ _HEAD = """# Results
 Every number here is read from the files in `docs/results` when this page is built. Below each table
 stand the file it is made of and the command that made that file. Times are of two shared CPU cores
 and vary with what else they do; counts of steps and mazes do not.
-[Commands and data](../results/README.md) lists all of them in one place.
-
-## Beside the dissertation
-
-What the dissertation reports in numbers or plain words, and what was measured here.
+[Commands and data](../results/README.md) lists all of them in one place, and sets them beside the
+dissertation's.
 
 """
 
@@ -63,15 +57,6 @@ def commands(readme: str) -> dict[str, str]:
     return found
 
 
-_ATARI = {
-    "Atari": (
-        Section("Seven games", "atari/runs.json", atari),
-        Section("Learned workers", "atari/learned.json", learned),
-        Section("Sticky actions, whole episodes", "atari/sticky.json", sticky),
-    )
-}
-
-
 def command_of(name: str, data: Any, listed: dict[str, str]) -> str:
     """Return how a file was made, as Markdown; empty if nothing says so."""
     if isinstance(data, dict) and "command" in data:
@@ -89,22 +74,17 @@ def command_of(name: str, data: Any, listed: dict[str, str]) -> str:
 
 
 def page(results: Path = RESULTS, curves: dict[str, dict[str, str]] | None = None) -> str:
-    """Return the page, in Markdown; pictures are named relative to docs/auto_results.
-
-    Args:
-        results: folder of the data.
-        curves: pictures drawn for this page with their captions, by the file whose data they show.
-    """
+    """Return the page, in Markdown; pictures are named relative to docs/auto_results."""
     listed = commands((results / "README.md").read_text())
-    parts, shown = [_HEAD, beside_the_source(results)], set()
-    for heading, sections in {**SECTIONS, **_ATARI, "Reliability": RELIABILITY}.items():
+    parts, shown = [_HEAD], set()
+    for heading, sections in SECTIONS.items():
         present = [section for section in sections if (results / section.data).exists()]
         if not present:
             continue
         parts.append(f"## {heading}\n")
         for section in present:
             parts.append(_section(section, results, listed, (curves or {}).get(section.data, {})))
-            shown |= {section.data, *section.also, *(name for name, _ in section.pictures)}
+            shown |= {section.data, *section.also, *section.pictures}
     left = [name for name in data_files(results) if name not in shown]
     if left:
         parts.append("## Further data\n")
@@ -130,17 +110,17 @@ def _section(
 ) -> str:
     data = load(results / section.data)
     try:
-        text = section.write(data)
+        text = section.text(data)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(
-            f"docs/results/{section.data} is not what results_tables.{section.write.__name__} "
-            f"reads ({error!r}). Change the function to the file's new form."
+            f"docs/results/{section.data} is not what its section in results_tables.py reads "
+            f"({error!r}). Change the section to the file's new form."
         ) from error
     made = command_of(section.data, data, listed)
-    lines = [f"{'#' * section.level} {section.title}\n", text]
+    lines = [f"### {section.title}\n", text]
     lines.append(f"[{section.data}](../results/{section.data}): {made}\n")
     pictures = dict(curves)
-    for name, caption in section.pictures:
+    for name, caption in section.pictures.items():
         if (results / name).exists():
             pictures[f"../results/{name}"] = caption
     for name, caption in pictures.items():
@@ -149,60 +129,20 @@ def _section(
     return "\n".join(lines)
 
 
-def beside_the_source(results: Path = RESULTS) -> str:
-    """Return the table that sets our figures beside those of the dissertation."""
-    rows = []
-    goals, lab = results / "goals/goal_agent.json", results / "lab/labmaze.json"
-    if goals.exists():
-        runs = load(goals)["agents"]["goal-based agent"]
-        tests = [run["test"] for run in runs]
-        rows.append(
-            [
-                "goal-based agent in Waterworld's mazes (figure 3.6)",
-                "solves them consistently and quickly",
-                ", ".join(str(test["solved"]) for test in tests)
-                + f" of {tests[0]['mazes']} unseen mazes, "
-                + ", ".join(f"{test['base_steps_mean']:.0f}" for test in tests)
-                + " base steps",
-                len(runs),
-            ]
-        )
-    if lab.exists():
-        found = {
-            k: v for k, v in load(lab)["results"].items() if re.fullmatch(r"diayn \d+ size 9", k)
-        }
-        frames = [v for k, v in load(lab)["results"].items() if k.endswith("training")]
-        rows.append(
-            [
-                "DeepMind Lab's random maze, 9 x 9 (figure 4.10)",
-                "every maze at the first trial after about 40,000 training steps",
-                ", ".join(f"{v['solved']} of {v['mazes']}" for v in found.values())
-                + f" at the first trial after {frames[0]['frames']:,} frames",
-                len(found),
-            ]
-        )
-    text = table(["experiment", "dissertation", "here", "seeds here"], rows)
-    path = results / "atari/runs.json"
-    runs = load(path) if path.exists() else []
-    games = [[*row[:2], row[4], f"{row[2]} x {row[3]}", best(runs, row[0])] for row in ATARI]
-    return (
-        text
-        + "\nAtari (table 5.1: highest score in 10 million time steps, 6 seeds; table A.1: best "
-        + "mean of seven algorithms of OpenAI Baselines):\n\n"
-        + table(
-            ["game", "dissertation", "best of Baselines", "its options x base steps", "here, best"],
-            games,
-        )
-    )
+def draw_games(folder: Path) -> dict[str, str]:
+    """Write the dissertation's figures 5.1 to 5.7 into a folder; return captions by file."""
+    from torchrl_hmcts.trainers.experiments.dissertation_figures import draw_figure
+
+    drawn = [draw_figure(f"5.{number}", [], RESULTS, folder) for number in range(1, 8)]
+    return {path.name: f"Figure 5.{n}. {caption}" for n, (path, caption) in enumerate(drawn, 1)}
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
     def write(app: Sphinx) -> None:
-        from results_curves import draw_curves
-
         folder = Path(app.srcdir, "auto_results")
         folder.mkdir(exist_ok=True)
-        (folder / "index.md").write_text(page(RESULTS, draw_curves(RESULTS, folder)))
+        drawn = {"atari/runs.json": draw_games(folder)}
+        (folder / "index.md").write_text(page(RESULTS, drawn))
 
     app.connect("builder-inited", write)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

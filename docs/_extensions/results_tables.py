@@ -1,36 +1,94 @@
-"""The tables of the results page, each made from one file of docs/results.
+"""The tables of the results page: which file of docs/results each shows, and which entries of it.
 
-A section is a function of the file's content that returns Markdown. `SECTIONS` says which file it
-reads; files without a section of their own are listed at the end of the page.
+Files without a section of their own are listed at the end of the page.
 """
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
-
-Rows = Iterable[Sequence[Any]]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page: its heading, the file it is made of, pictures, and how it is written."""
+    """A part of the page: a table of one file of data, and pictures.
+
+    ``columns`` are entries of a row (``mazes.solved``; ``solved/mazes`` is the first of the second;
+    ``*.says`` joins those of all names; ``name`` is the name of the row). Rows are below the entry
+    ``rows``, in which ``*`` stands for each name, and are left out where they lack the last column.
+    With ``group``, rows that agree in the first column are one line, with a value for each.
+    """
 
     title: str
     data: str
-    write: Callable[[Any], str]
-    pictures: tuple[tuple[str, str], ...] = ()
+    columns: str = ""
+    rows: str = ""
+    group: bool = False
+    note: str = ""
+    pictures: Mapping[str, str] = field(default_factory=dict)  # captions by file
     also: tuple[str, ...] = ()  # further files of the same measurement
-    level: int = 3
+    write: Callable[[Any], str] | None = None  # what is no table of rows
+
+    def text(self, data: Any) -> str:
+        """Return the table, in Markdown."""
+        if self.write is not None:
+            return self.write(data)
+        columns = self.columns.split()
+        rows = [row for row in records(data, self.rows) if _entry(row, columns[-1]) is not None]
+        if not rows:
+            raise ValueError(f"no row has {columns[-1]}")
+        lines: dict[Any, list[Any]] = {}
+        for i, row in enumerate(rows):
+            lines.setdefault(_entry(row, columns[0]) if self.group else i, []).append(row)
+        cells = [
+            [_cell(runs[: 1 if i == 0 else None], column) for i, column in enumerate(columns)]
+            for runs in lines.values()
+        ]
+        note = f"\n{self.note}\n" if self.note else ""
+        return table([_head(column) for column in columns], cells) + note
 
 
-def table(head: Sequence[str], rows: Rows) -> str:
+def records(data: Any, path: str) -> list[dict[str, Any]]:
+    """Return the rows below an entry, each with its name where it has one."""
+    nodes = [data]
+    for name in filter(None, path.split(".")):
+        nodes = [v for node in nodes for v in (node.values() if name == "*" else [node[name]])]
+    rows: list[dict[str, Any]] = []
+    for node in nodes:
+        for key, value in node.items() if isinstance(node, dict) else [("", node)]:
+            several = value if isinstance(value, list) else [value]
+            rows += [{"name": key, **row} for row in several if isinstance(row, dict)]
+    return rows
+
+
+def _head(column: str) -> str:
+    words = column.partition("/")[0].replace(".", " ").replace("_", " ")
+    return words.replace("p95", "95 %")
+
+
+def _cell(rows: Sequence[Any], column: str) -> str:
+    first, _, whole = column.partition("/")
+    values = [number(_entry(row, first)) for row in rows]
+    shown = " / ".join(values) if _is_figure(values[0]) else values[0]
+    return f"{shown} of {number(_entry(rows[0], whole))}" if whole else shown
+
+
+def _entry(row: Any, path: str) -> Any:
+    for name in path.partition("/")[0].split("."):
+        if name == "*":
+            rest = path.partition("*.")[2]
+            values = (_entry(value, rest) for value in row.values() if isinstance(value, dict))
+            return " ".join(dict.fromkeys(value[:450] for value in values if value))
+        row = row.get(name) if isinstance(row, dict) else None
+    return row
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Return a table in Markdown; columns of figures stand to the right."""
     cells = [[number(cell) for cell in row] for row in rows]
     columns = [[row[i] for row in cells] for i in range(len(head))]
-    right = [i > 0 and all(_is_figure(cell) for cell in col) for i, col in enumerate(columns)]
+    right = [i > 0 and all(map(_is_figure, column)) for i, column in enumerate(columns)]
     rule = "|".join("---:" if r else "---" for r in right)
     lines = ["| " + " | ".join(head) + " |", f"|{rule}|"]
     lines += ["| " + " | ".join(row) + " |" for row in cells]
@@ -42,229 +100,20 @@ def _is_figure(cell: str) -> bool:
 
 
 def number(value: Any) -> str:
-    """Return a number as people write it.
-
-    Example:
-        >>> number(40000), number(0.25), number(1598.0), number("a"), number(float("nan"))
-        ('40,000', '0.25', '1,598', 'a', '')
-    """
+    """Return a number as people write it."""
+    if isinstance(value, list):  # of scores: their mean
+        value = sum(value) / len(value) if value else None
     if value is None or value != value:
         return ""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return str(value)
+    if isinstance(value, str) and value.replace(".", "", 1).isdigit():  # of a CSV file
+        value = float(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, (int, float)):
+        return str(value).replace("|", "/")
     if isinstance(value, int) or value == int(value) or abs(value) >= 1000:
         return f"{value:,.0f}"
     return f"{value:.3g}" if abs(value) < 10 else f"{value:,.1f}"
-
-
-def by_seed(values: Iterable[Any]) -> str:
-    return " / ".join(number(value) for value in values)
-
-
-Columns = Mapping[str, str | Callable[[Any], Any]]
-"""Columns of a table by their heads: an entry (``mazes.solved``), two (``solved/mazes``: the first
-of the second), or a function of the row, or of the runs in it."""
-
-
-def of_rows(rows: Iterable[Any], columns: Columns) -> str:
-    """Return a table with a line for each row of data."""
-    return table(list(columns), [[_cell(row, c) for c in columns.values()] for row in rows])
-
-
-def of_groups(rows: Sequence[Any], key: str, columns: Columns) -> str:
-    """Return a table with a line for each value of ``key``, whose cells have a value a seed."""
-    lines = []
-    for name in dict.fromkeys(row[key] for row in rows):
-        runs = [row for row in rows if row[key] == name]
-        lines.append([name, *(_cells(runs, column) for column in [*columns.values()][1:])])
-    return table(list(columns), lines)
-
-
-def rounded(entry: str) -> Callable[[Any], str]:
-    """Return a column of a table of groups: an entry, rounded."""
-    return lambda runs: by_seed(round(_entry(run, entry)) for run in runs)
-
-
-def _cell(row: Any, column: str | Callable[[Any], Any]) -> Any:
-    if callable(column):
-        return column(row)
-    first, _, whole = column.partition("/")
-    value = _entry(row, first)
-    return f"{value} of {_entry(row, whole)}" if whole else value
-
-
-def _cells(runs: Sequence[Any], column: str | Callable[[Any], Any]) -> Any:
-    if callable(column):
-        return column(runs)
-    first, _, whole = column.partition("/")
-    shown = by_seed(_entry(run, first) for run in runs)
-    return f"{shown} of {_entry(runs[0], whole)}" if whole else shown
-
-
-def _entry(row: Any, path: str) -> Any:
-    for name in path.split("."):
-        row = row[name]
-    return row
-
-
-# ------------------------------------------------------------------------------ sections
-
-
-def demo(rows: list[dict[str, str]]) -> str:
-    figures = [{key: float(value) for key, value in row.items()} for row in rows]
-    lines = [
-        ("test mazes solved at the first trial", "solved", "mazes"),
-        ("worker training, base steps", "train_base_steps", None),
-        ("worker training, seconds", "train_seconds", None),
-        ("planning one maze, median seconds", "plan_seconds_median", None),
-        ("simulated base steps per plan, median", "plan_base_steps_median", None),
-        ("nodes expanded per plan, median", "expansions_median", None),
-        ("base steps of an episode, median", "episode_base_steps_median", None),
-        ("base steps per tile of the shortest path", "episode_base_steps_over_shortest", None),
-        ("whole demo, seconds", "seconds", None),
-    ]
-    return table(
-        ["", *(f"seed {row['seed']}" for row in rows)],
-        [
-            [name, *(number(f[key]) + (f" of {number(f[of])}" if of else "") for f in figures)]
-            for name, key, of in lines
-        ],
-    )
-
-
-def goal_agent(data: dict[str, Any]) -> str:
-    rows = [{**run, "agent": name} for name, runs in data["agents"].items() for run in runs]
-    columns: Columns = {
-        "agent": "agent",
-        "seed": "seed",
-        "training base steps": lambda run: run.get("train_base_steps", 0),
-        "solved": "test.solved/test.mazes",
-        "base steps, mean": "test.base_steps_mean",
-        "median": "test.base_steps_median",
-    }
-    return of_rows(rows, columns) + (
-        "\nThe dissertation's Figure 3.6 has no numbers in its text: with goals the mazes are "
-        "solved consistently and quickly, by plain A3C they are not.\n"
-    )
-
-
-def labmaze(data: dict[str, Any]) -> str:
-    def named(name: str, row: dict[str, Any]) -> dict[str, Any]:
-        learner, seed = name.replace(",", "").split()[:2]
-        return {**row, "worker": f"{learner}, seed {seed}"}
-
-    rows = {name: named(name, row) for name, row in data["results"].items()}
-    sizes: Columns = {
-        "test mazes": lambda row: f"{row['size']} x {row['size']}",
-        "worker": "worker",
-        "solved": "solved/mazes",
-        "frames": "frames.mean",
-        "over the script's": "frames_over_script",
-        "simulated frames": "simulated_frames.mean",
-    }
-    real: Columns = {
-        "real env": lambda row: f"{row['fps']} frames a second, friction {row['friction']}",
-        "worker": "worker",
-        "solved": "solved/mazes",
-        "by the first plan": "solved_by_the_first_plan",
-        "plans": "num_plans.mean",
-    }
-    wrong = [row for row in rows.values() if "fps" in row]
-    text = of_rows([row for name, row in rows.items() if name.split()[2] == "size"], sizes)
-    if wrong:
-        text += "\nThe real env's clock and friction differ from the model's (60, 6.0); a new plan "
-        text += "after every option:\n\n" + of_rows(wrong, real)
-    return text + (
-        "\nThe dissertation (Figure 4.10): the time to solve falls until about 40,000 training "
-        "steps; after that every random maze is solved at the first trial.\n"
-    )
-
-
-def worker(data: dict[str, Any]) -> str:
-    def accuracy(row: dict[str, Any]) -> str:
-        return " / ".join(f"{row['sampled'][k]['accuracy']:.2f}" for k in ("25", "50", "100"))
-
-    columns: Columns = {
-        "training base steps": "train_base_steps",
-        "seed": "seed",
-        "solved": "mazes.solved/mazes.starts",
-        "simulated base steps": "mazes.simulated_steps.median",
-        "(95 %)": "mazes.simulated_steps.p95",
-        "episode": "mazes.episode_steps.median",
-        "accuracy at 25 / 50 / 100": accuracy,
-        "smallest angle": "greedy.25.angle",
-    }
-    note = "\nMedians; the accuracy is of the discriminator, worker sampling.\n"
-    return of_rows(data["rows"], columns) + note
-
-
-def objectives(data: list[dict[str, Any]]) -> str:
-    columns: Columns = {
-        "objective": "objective",
-        "seeds": "seed",
-        "solved": "solved/starts",
-        "simulated base steps, median": rounded("simulated_steps.median"),
-        "smallest angle": "smallest_angle",
-        "training, s": lambda runs: round(statistics.mean(run["train_seconds"] for run in runs)),
-    }
-    return of_groups(data, "objective", columns)
-
-
-def learned_manager(data: dict[str, Any]) -> str:
-    seeds = data["seeds"].values()
-    rows = [{**row, "planner": name} for run in seeds for name, row in run["planners"].items()]
-    columns: Columns = {
-        "planner": "planner",
-        "solved of 342": "solved",
-        "simulated base steps, median": rounded("simulated_steps.median"),
-        "mean": rounded("simulated_steps.mean"),
-    }
-    note = f"\nSeeds {', '.join(data['seeds'])}; iterations are counted from 0.\n"
-    return of_groups(rows, "planner", columns) + note
-
-
-def option_model(data: dict[str, Any]) -> str:
-    columns: Columns = {
-        "planned in": "name",
-        "seeds": "seed",
-        "solved": "solved/mazes",
-        "base steps of an episode, median": "episode_steps.median",
-    }
-    return of_groups(data["rows"], "name", columns)
-
-
-def growing(data: dict[str, Any]) -> str:
-    columns: Columns = {
-        "skills": "skills",
-        "seeds": "seed",
-        "at the end": "skills_at_the_end",
-        "solved": "mazes.solved/mazes.starts",
-        "simulated base steps, mean": rounded("mazes.simulated_steps.mean"),
-    }
-    return of_groups(data["rows"], "skills", columns)
-
-
-def rounds(data: dict[str, Any]) -> str:
-    rows = [{**run, "worker": name} for name, runs in data["runs"].items() for run in runs]
-    columns: Columns = {
-        "worker": "worker",
-        "seed": "seed",
-        "base steps of its rounds": "training_base_steps",
-        "rounds": "rounds",
-        "solved": "final.solved/final.starts",
-        "simulated": "final.simulated_steps.median",
-        "episode": "final.episode_steps.median",
-    }
-    return of_rows(rows, columns) + "\nBase steps, medians.\n"
-
-
-def training_speed(data: dict[str, Any]) -> str:
-    rows = [
-        [name, by_seed(round(run["steps_per_second"][name]) for run in data["runs"])]
-        for name in data["runs"][0]["steps_per_second"]
-    ]
-    seeds = by_seed(run["seed"] for run in data["runs"])
-    return table(["base steps per CPU second", f"seeds {seeds}"], rows)
 
 
 def peers(data: dict[str, Any]) -> str:
@@ -305,169 +154,221 @@ def speed(data: dict[str, Any]) -> str:
     )
 
 
-def waterworld_plans(data: dict[str, Any]) -> str:
-    rows = [
-        {**row, "search": name.replace("_", " ")}
-        for name, row in data.items()
-        if isinstance(row, dict) and "solved" in row
-    ]
-    columns: Columns = {
-        "search": "search",
-        "solved": "solved/mazes",
-        "simulated base steps, median": "simulated_base_steps.median",
-        "(95 %)": "simulated_base_steps.p95",
-        "plan, median": "first_plan_base_steps.median",
-    }
-    long = data["long_search"]
-    return of_rows(rows, columns) + (
-        f"\nOne worker, seed {data['arguments']['seed']}. First plans are "
-        f"{number(long['first_plan_over_best']['median'])} times (95 %: "
-        f"{number(long['first_plan_over_best']['p95'])}) the best plan that a search of "
-        f"{number(long['expansions'])} expansions found, improved ones "
-        f"{number(long['improved_plan_over_best']['p95'])} times (95 %).\n"
-    )
+def sticky_means(data: dict[str, Any]) -> str:
+    """Return interquartile means of human-normalised scores, beside Dopamine's training curves."""
+    checkpoints = data["dopamine"]["frames"]
+    ours = {line["frames"]: line for line in data["summary"] if len(line["games"]) == 7}
+    rows = [[name, *values] for name, values in data["dopamine"]["interquartile_mean"].items()]
+    means = [ours[at]["interquartile_mean"] if at in ours else None for at in checkpoints]
+    rows.append(["ours, seven games", *means])
+    return table(["agent", *(f"{at:,} frames" for at in checkpoints)], rows)
 
 
-def planner_costs(data: dict[str, Any]) -> str:
-    columns: Columns = {
-        "simulator": "simulator",
-        "ms per expansion": "ms_per_expansion",
-        "of it the planner's": "planner_ms_per_expansion",
-        "share": lambda row: f"{100 * row['planner_share']:.1f} %",
-    }
-    names = [name for name in ("waterworld", "atari") if name in data]
-    return of_rows([{**data[name], "simulator": name} for name in names], columns)
-
-
-def a3c(data: dict[str, Any]) -> str:
-    columns: Columns = {
-        "CartPole-v1, seed": "seed",
-        "solved": lambda run: "yes" if run["solved"] else "no",
-        "frames": "frames",
-        "mean return": "mean_return",
-    }
-    text = of_rows(data["cartpole"], columns)
-    if speeds := data.get("asynchrony"):
-        text += (
-            f"\nTwo learners make {speeds['ratio']} times the base steps per second of one "
-            f"(median of {len(speeds['ratios'])} pairs of runs: {by_seed(speeds['ratios'])}).\n"
-        )
-    return text
-
-
-def lab_speed(data: list[dict[str, Any]]) -> str:
-    names = {"frames per step": "num_steps", "frames per second": "frames_per_second"}
-    return of_rows(data, {"how": "how", "writes": "writes", **names})
-
-
-def atari_speed(data: dict[str, Any]) -> str:
-    columns: Columns = {
-        "game": "game",
-        "agent, frames per second": "agent.frames_per_second",
-        "bare emulators, as many": "bare.frames_per_second",
-        "ratio": "ratio.frames_per_second",
-        "agent, frames per CPU second": "agent.frames_per_cpu_second",
-        "bare": "bare.frames_per_cpu_second",
-        "ratio of these": "ratio.frames_per_cpu_second",
-    }
-    return of_rows(data["games"], columns)
-
-
-def atari_waves(data: dict[str, Any]) -> str:
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for run in data["runs"]:
-        key = (run["game"], run["leaves_per_wave"], run["waves_in_flight"])
-        groups.setdefault(key, []).append(run)
-    rows = [
-        [
-            *key,
-            ", ".join(f"{run['score']:g}" for run in runs),
-            round(statistics.mean(run["simulated_per_real_step"] for run in runs)),
-        ]
-        for key, runs in groups.items()
-    ]
-    heads = ["game", "leaves per wave", "waves in flight", "scores of seeds 0, 1, 2"]
-    return table([*heads, "simulated base steps per real one"], rows)
-
+_SPEED = "agent.frames_per_second bare.frames_per_second ratio.frames_per_cpu_second"
+_OBJECTIVES = "objective seed train_seconds solved/starts simulated_steps.median"
 
 SECTIONS: dict[str, tuple[Section, ...]] = {
     "Planning over learned skills": (
         Section(
             "The demo",
             "demo/seeds.csv",
-            demo,
-            (
-                ("demo/episode.gif", "A test maze, the plan, and the worker that executes it"),
-                ("demo/search.png", "The search for that plan: where options led, and the tree"),
-                ("demo/skills.png", "Ten mini-episodes of each skill"),
-                (
-                    "demo/losses.png",
-                    "Figures 4.6 to 4.9: training of the worker",
-                ),
-            ),
-            ("demo/metrics.json",),
+            "seed solved/mazes train_base_steps train_seconds plan_seconds_median "
+            "plan_base_steps_median expansions_median episode_base_steps_median "
+            "episode_base_steps_over_shortest seconds",
+            pictures={
+                "demo/episode.gif": "A test maze, the plan, and the worker that executes it",
+                "demo/search.png": "The search for that plan: where options led, and the tree",
+                "demo/skills.png": "Ten mini-episodes of each skill",
+                "demo/losses.png": "Figures 4.6 to 4.9: training of the worker",
+            },
+            also=("demo/metrics.json",),
         ),
-        Section("How much training the worker needs", "skills/worker.json", worker),
-        Section("Skill objectives", "skills/skill_objectives.json", objectives),
-        Section("Skills that are vectors", "skills/skill_vectors.json", objectives),
+        Section(
+            "How much training the worker needs",
+            "skills/worker.json",
+            "train_base_steps seed mazes.solved/mazes.starts mazes.simulated_steps.median "
+            "mazes.simulated_steps.p95 mazes.episode_steps.median sampled.100.accuracy "
+            "greedy.25.angle",
+            rows="rows",
+            note="The accuracy is of the discriminator after 100 base steps, worker sampling.",
+        ),
+        Section("Skill objectives", "skills/skill_objectives.json", _OBJECTIVES, group=True),
+        Section("Skills that are vectors", "skills/skill_vectors.json", _OBJECTIVES, group=True),
         Section(
             "Algorithm 3: learning from the searches",
             "skills/hmcts_rounds.json",
-            rounds,
-            (("skills/hmcts_rounds.png", "Base steps to solve a maze against training"),),
+            "name seed training_base_steps rounds final.solved/final.starts "
+            "final.simulated_steps.median final.episode_steps.median",
+            rows="runs",
+            pictures={"skills/hmcts_rounds.png": "Base steps to solve a maze against training"},
         ),
-        Section("Skills added as needed", "skills/growing_skills.json", growing),
-        Section("A manager that learns", "skills/learned_manager.json", learned_manager),
-        Section("Planning in a learned model", "skills/option_model.json", option_model),
+        Section(
+            "Skills added as needed",
+            "skills/growing_skills.json",
+            "skills seed skills_at_the_end mazes.solved/mazes.starts mazes.simulated_steps.mean",
+            rows="rows",
+            group=True,
+        ),
+        Section(
+            "A manager that learns",
+            "skills/learned_manager.json",
+            "name solved simulated_steps.median simulated_steps.mean",
+            rows="seeds.*.planners",
+            group=True,
+            note="Solved of 342 mazes, a value for each seed; iterations are counted from 0.",
+        ),
+        Section(
+            "Planning in a learned model",
+            "skills/option_model.json",
+            "name seed solved/mazes episode_steps.median",
+            rows="rows",
+            group=True,
+        ),
         Section(
             "Plans in 342 test mazes",
             "planner/waterworld_plans.json",
-            waterworld_plans,
-            (("planner/tree.png", "A search tree"),),
+            "name solved/mazes simulated_base_steps.median simulated_base_steps.p95 "
+            "first_plan_base_steps.median",
+            pictures={"planner/tree.png": "A search tree"},
         ),
     ),
     "Chapter 3: the goal-based agent": (
         Section(
             "Random mazes of Waterworld",
             "goals/goal_agent.json",
-            goal_agent,
-            (
-                (
-                    "goals/goal_agent.png",
-                    "Figure 3.6: test mazes while it learns",
-                ),
-                ("goals/episode.png", "Figure 3.5: goals over the maze"),
-                ("goals/search.png", "Figure 3.4: the search over tiles"),
-                ("goals/macro_env.png", "Figure 3.2: the macro environment"),
-                ("goals/episode.gif", "An episode"),
-            ),
+            "name seed train_base_steps test.solved/test.mazes test.base_steps_median "
+            "test.base_steps_mean",
+            rows="agents",
+            note="The dissertation's Figure 3.6 has no numbers in its text: with goals the mazes "
+            "are solved consistently and quickly, by plain A3C they are not.",
+            pictures={
+                "goals/goal_agent.png": "Figure 3.6: test mazes while it learns",
+                "goals/episode.png": "Figure 3.5: goals over the maze",
+                "goals/search.png": "Figure 3.4: the search over tiles",
+                "goals/macro_env.png": "Figure 3.2: the macro environment",
+                "goals/episode.gif": "An episode",
+            },
         ),
-        Section("A3C", "a3c/a3c_figures.json", a3c),
+        Section(
+            "A3C in CartPole-v1",
+            "a3c/a3c_figures.json",
+            "seed solved frames mean_return",
+            rows="cartpole",
+        ),
     ),
     "Chapter 4: DeepMind Lab's random maze": (
         Section(
             "Test mazes",
             "lab/labmaze.json",
-            labmaze,
-            (
-                ("lab/episode.gif", "A test maze: the plan, the player, and what it sees"),
-                (
-                    "lab/skills.png",
-                    "Figure 4.5: ten mini-episodes of each skill",
-                ),
-                ("lab/search.png", "Figure 4.4: the search"),
-                ("lab/mazes.png", "Figure 4.3: random mazes"),
-            ),
+            "name solved/mazes frames.mean frames_over_script simulated_frames.mean",
+            rows="results",
+            note="The dissertation (Figure 4.10): the time to solve falls until about 40,000 "
+            "training steps; after that every random maze is solved at the first trial.",
+            pictures={
+                "lab/labmaze_diayn.png": "Figure 4.10: frames to solve a maze while the worker "
+                "learns",
+                "lab/episode.gif": "A test maze: the plan, the player, and what it sees",
+                "lab/skills.png": "Figure 4.5: ten mini-episodes of each skill",
+                "lab/search.png": "Figure 4.4: the search",
+                "lab/mazes.png": "Figure 4.3: random mazes",
+            },
+        ),
+        Section(
+            "A real env with another clock and friction, a plan after every option",
+            "lab/labmaze.json",
+            "name solved/mazes solved_by_the_first_plan num_plans.mean fps friction",
+            rows="results",
         ),
     ),
     "Speed": (
-        Section("Search beside other libraries: 128 simulations", "planner/peers_128.json", peers),
-        Section("32 simulations", "planner/peers_32.json", peers),
-        Section("512 simulations", "planner/peers_512.json", peers),
-        Section("What the planner costs", "planner/planner_figures.json", planner_costs),
-        Section("Training", "skills/training_speed.json", training_speed),
-        Section("LabMazeEnv", "lab_speed.json", lab_speed),
-        Section("Atari: search beside bare emulation", "atari/speed.json", atari_speed),
-        Section("Atari: leaves that are simulated together", "atari/waves.json", atari_waves),
+        Section(
+            "Search beside other libraries: 128 simulations", "planner/peers_128.json", write=peers
+        ),
+        Section("32 simulations", "planner/peers_32.json", write=peers),
+        Section("512 simulations", "planner/peers_512.json", write=peers),
+        Section(
+            "What the planner costs",
+            "planner/planner_figures.json",
+            "name ms_per_expansion planner_ms_per_expansion planner_share",
+        ),
+        Section(
+            "Training, base steps per CPU second",
+            "skills/training_speed.json",
+            "seed ratio steps_per_second.DIAYNTrainer",
+            rows="runs",
+            note="The ratio is to a loop in plain torch.",
+        ),
+        Section("LabMazeEnv", "lab_speed.json", "how writes num_steps frames_per_second"),
+        Section(
+            "Atari: search beside bare emulation",
+            "atari/speed.json",
+            f"game {_SPEED}",
+            rows="games",
+        ),
+        Section(
+            "Atari: leaves that are simulated together",
+            "atari/waves.json",
+            "game leaves_per_wave waves_in_flight seed score simulated_per_real_step",
+            rows="runs",
+        ),
+    ),
+    "Atari": (
+        Section(
+            "Seven games",
+            "atari/runs.json",
+            "game protocol score_mean score_max frames source option_steps seed",
+            note="The dissertation reports the highest score within 10 million time steps of an "
+            "agent whose worker is a learned network. Here rules act, which trials chose on starts "
+            "that are scored, too (the old rule); all emulated frames count.",
+        ),
+        Section(
+            "Learned workers",
+            "atari/learned.json",
+            "game source acts seed score_mean score_min score_max simulated_per_real base_steps",
+            rows="rows",
+            note="Ten test episodes for each seed, cut short; no setting was chosen by a score.",
+        ),
+        Section(
+            "Sticky actions, whole episodes",
+            "atari/sticky.json",
+            "game seed score_at.2000000 score_at.5000000 score_at.10000000 score_at.40000000 "
+            "reactive_sticky reactive_deterministic frames_before_first_episode frames",
+            rows="rows",
+            note="A score is the mean of the last ten planned episodes that were over at that many "
+            "emulated frames, all kinds; reactive is without search. **The simulator is set** to "
+            "plan; Dopamine's agents never set theirs.",
+        ),
+        Section("Interquartile means, human-normalised", "atari/sticky.json", write=sticky_means),
+    ),
+    "Reliability": (
+        Section(
+            "Runs that are killed",
+            "reliability/kills.json",
+            "name by_SIGKILL by_SIGTERM by_child not_continued went_back damaged same_figures "
+            "kills",
+            rows="runs",
+            note="Forks of the first two are all killed. A3C promises no figures of the same bits.",
+        ),
+        Section(
+            "Machines that lack something",
+            "reliability/environments.json",
+            "name import.result plan.result demo.result a3c.result pool.result *.says",
+            rows="situations",
+        ),
+        Section("Faults, resumed and repeated runs", "reliability/tests.json", "name passed"),
+        Section("TorchRL's contracts", "reliability/contracts.json", "name skipped passed"),
+        Section("Memory", "reliability/leaks.json", "name number growth_mib growth_objects"),
+        Section(
+            "Lines that the tests reach",
+            "reliability/coverage.json",
+            "name lines reached share",
+            rows="folders",
+        ),
+        Section(
+            "The wheel on several Pythons",
+            "pythons.json",
+            "python torch torchrl test_files skipped passed",
+            rows="pythons",
+        ),
     ),
 }

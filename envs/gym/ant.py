@@ -1,10 +1,7 @@
 """The ant of the ant mazes: what its worker sees and does, and the symmetry of its legs.
 
-The plane has no north: an option sees the world from the heading that the ant had when it began. A
-quarter turn of the body renames its legs: what one skill has learned can be taken in four
-directions.
-
-Letters: *B batch, q a number of quarter turns.
+The plane has no north, and a quarter turn of the body renames its legs. Letters: *B batch, q a
+number of quarter turns.
 """
 
 from __future__ import annotations
@@ -19,7 +16,7 @@ import torch
 from gymnasium import spaces
 
 from torchrl_hmcts.envs.gym.mujoco import find_physics
-from torchrl_hmcts.envs.gym.mujoco_tasks import task_of
+from torchrl_hmcts.envs.gym.mujoco_batch import task_of
 from torchrl_hmcts.envs.gym.skill_worker import SkillWorker
 from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 from torchrl_hmcts.modules import SkillActor

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from torchrl_hmcts.checks import instance, whole_number
-from torchrl_hmcts.envs.gym.grid_features import STEPS, check_minigrid, is_thing
+from torchrl_hmcts.envs.gym.features import STEPS, check_minigrid, is_thing
 
 _LEFT, _RIGHT, _FORWARD = range(3)
 _TURNS = (_FORWARD, _RIGHT, _RIGHT, _LEFT)  # by quarters that are missing

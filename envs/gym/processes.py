@@ -1,9 +1,7 @@
-"""Processes that run options, an env in each, fed through shared memory.
+"""Processes that run options, an env in each: jobs are slots of shared memory, pipes carry numbers.
 
-Jobs are slots of a shared array: a state, an option and a seed go in, the outcome comes back in the
-same slot. What goes through pipes are the numbers of slots, up to 32 in a message: all processes
-read from one pipe, so that whoever is free takes the next. The messages of a batch get shorter
-towards its end, so that all processes end at about the same time.
+All processes read up to 32 slots from one pipe, fewer towards the end of a batch, so that all end
+at about the same time.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from torchrl_hmcts.envs.gym.mujoco import find_physics
-from torchrl_hmcts.envs.gym.mujoco_tasks import OGBenchPointMaze, RoboticsPointMaze, task_of
+from torchrl_hmcts.envs.gym.mujoco_batch import OGBenchPointMaze, RoboticsPointMaze, task_of
 from torchrl_hmcts.envs.gym.settable import PrivateRandom
 from torchrl_hmcts.envs.gym.snapshots import SnapshotError
 from torchrl_hmcts.envs.gym.task import TaskEnv

@@ -1,9 +1,8 @@
 """The movement of DeepMind Lab's player on the ground, compiled; units are world units and seconds.
 
-Letters: n players, M mazes, R rows and C columns of cells (row 0 is the south), K apples.
-
-All reals are float32, as in the engine: a velocity is rounded to integers after every frame, so
-that a difference in the last digit grows to a unit.
+Letters: n players, M mazes, R rows and C columns of cells (row 0 is the south), K apples. All reals
+are float32, as in the engine: a velocity is rounded to integers after every frame, so that a
+difference in the last digit grows to a unit.
 """
 
 # No annotations: numba infers the types of its arguments.

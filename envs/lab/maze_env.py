@@ -358,11 +358,6 @@ class LabMazeEnv(MazeEnv):
 
         Raises:
             ValueError: if a value is not finite, out of range or inside a wall.
-
-        Example:
-            >>> env = LabMazeEnv(maze_seeds=[1])
-            >>> env.make_state(0, [[150.0, 150.0], [250.0, 150.0]], heading=90.0).batch_size
-            torch.Size([2])
         """
         place, moving = (torch.as_tensor(x, dtype=torch.float32) for x in (position, velocity))
         maze, gone = (torch.as_tensor(x, dtype=torch.int64) for x in (maze_index, frame))
@@ -403,13 +398,6 @@ class LabMazeEnv(MazeEnv):
 
         Returns:
             TensorDict ``[*B]``: the state, and what ``read_outs`` names.
-
-        Example:
-            >>> env = LabMazeEnv(maze_seeds=[1])
-            >>> td = env.make_state(0, (150.0, 150.0))
-            >>> td["position"] += 100.0
-            >>> env.read_state(td)["tile_position"].tolist()
-            [2.5, 2.5]
         """
         shape = tensordict.batch_size
         return self._write_state([_array(tensordict, key, shape).copy() for key in STATE], shape)
@@ -450,12 +438,7 @@ class LabMazeEnv(MazeEnv):
         )
 
     def to_picture(self, position: Tensor) -> Tensor:
-        """Return positions ``[..., 2]`` in cells of the picture, y to the south.
-
-        Example:
-            >>> LabMazeEnv(maze_seeds=[1]).to_picture(torch.tensor([150.0, 850.0])).tolist()
-            [1.5, 0.5]
-        """
+        """Return positions ``[..., 2]`` in cells of the picture, y to the south."""
         x, y = (position.detach().cpu().double() / self.CELL).unbind(-1)
         return torch.stack((x, self.layout.rows - y), -1)
 

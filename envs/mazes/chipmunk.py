@@ -1,9 +1,4 @@
-"""Many copies of a disc in many mazes, advanced by one Chipmunk space.
-
-Every maze lies in the same :class:`pymunk.Space`, each in a cell of its own on a wide grid (the
-cell depends only on the maze's index, so that a maze's arithmetic does not depend on what else is
-simulated). The discs do not collide with each other. One C call therefore moves any number of
-copies in any number of mazes, and states go in and out as arrays through :mod:`pymunk.batch`.
+"""Many copies of a disc in many mazes, each in a cell of its own of one Chipmunk space.
 
 Letters: ``M`` mazes, ``H, W`` tiles of a maze, ``n`` discs moved by a call.
 """

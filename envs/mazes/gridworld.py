@@ -193,12 +193,6 @@ class GridworldMazeEnv(TileMazeEnv):
 
         Raises:
             ValueError: if an index is out of range or a tile is a wall.
-
-        Example:
-            >>> env = GridworldMazeEnv(torch.zeros(1, 3, 3, dtype=torch.bool))
-            >>> td = env.make_state(0, player=[[0, 0], [2, 1]], target=(1, 1))
-            >>> td["position"].tolist(), td.batch_size
-            ([[0.5, 0.5], [1.5, 2.5]], torch.Size([2]))
         """
         maze, steps = (torch.as_tensor(x, device=self.device) for x in (maze_index, step_count))
         size = torch.tensor([self.height, self.width], device=self.device)
@@ -247,11 +241,6 @@ class GridworldMazeEnv(TileMazeEnv):
 
         Reference:
             Dissertation, section 3.1.2: the macro environment is made from the Waterworld state.
-
-        Example:
-            >>> env = GridworldMazeEnv(torch.zeros(1, 3, 3, dtype=torch.bool))
-            >>> env.state_from_positions(0, (0.31, 2.74), (1.5, 0.5))["position"].tolist()
-            [0.5, 2.5]
         """
         size = torch.tensor([self.width, self.height], device=self.device)
         tiles = []

@@ -1,9 +1,8 @@
 """Random tile mazes: generation, the fixed pool, text form and shortest paths.
 
-Letters: M mazes, H rows, W columns, K walls and F free tiles per maze, L tiles on a path. A maze is
-a bool tensor ``[H, W]``, True where a tile is a wall, row 0 at the top; everything outside the grid
-is solid. Tile ``(row, col)`` covers ``x in [col, col + 1)`` and ``y in [row, row + 1)`` (x to the
-right, y downwards, both in tiles), so its centre is ``(col + 0.5, row + 0.5)``.
+Letters: M mazes, H rows, W columns, K walls and F free tiles per maze. A maze is a bool tensor
+``[H, W]``, True where a tile is a wall, row 0 at the top; all outside is solid. Tile ``(row, col)``
+has its centre at ``(col + 0.5, row + 0.5)``, x to the right and y downwards, in tiles.
 """
 
 from __future__ import annotations

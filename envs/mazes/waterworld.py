@@ -342,11 +342,6 @@ class WaterworldMazeEnv(TileMazeEnv):
         Raises:
             ValueError: if a value is not finite, out of range or inside a wall, or the disc
                 overlaps one.
-
-        Example:
-            >>> env = WaterworldMazeEnv(torch.zeros(1, 3, 3, dtype=torch.bool))
-            >>> env.make_state(0, position=[[0.5, 0.5], [1.2, 2.5]], target=(1.5, 1.5)).batch_size
-            torch.Size([2])
         """
         device = self.device
         maze, steps = (torch.as_tensor(x, device=device) for x in (maze_index, step_count))

@@ -254,9 +254,6 @@ def find_jumps(places: Tensor, ends: Tensor, jump_factor: float = 10.0) -> Tenso
     Returns:
         bool ``[T]``.
 
-    Reference:
-        This project's.
-
     Example:
         >>> places = torch.tensor([[0.0], [1.0], [2.0], [30.0]])
         >>> find_jumps(places, torch.zeros(4, dtype=torch.bool))
@@ -328,12 +325,6 @@ class LandmarkEnv(EnvBase):
         gamma (float): discount per base step; the planner takes it over. Default 0.99.
         seed (int, optional): of the draws. Default: from torch's global generator.
 
-    Raises:
-        ValueError: if ``gamma`` is out of range.
-
-    Reference:
-        This project's.
-
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner
         >>> places = torch.arange(0.0, 10.0, 0.1)[:, None]
@@ -371,7 +362,7 @@ class LandmarkEnv(EnvBase):
             terminated=Binary(1, shape=one, dtype=torch.bool),
         )
         self._generator = torch.Generator()
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(seed)
 
     def _shown(self, landmark: Tensor, goal: Tensor, duration: Tensor) -> TensorDict:
         model = self.model
@@ -406,7 +397,5 @@ class LandmarkEnv(EnvBase):
         return out.update({"reward": reached.float(), "done": reached, "terminated": reached})
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is None:
-            self._generator.seed()
-        else:
-            self._generator.manual_seed(seed)
+        drawn = torch.empty((), dtype=torch.int64).random_() if seed is None else seed
+        self._generator.manual_seed(int(drawn))

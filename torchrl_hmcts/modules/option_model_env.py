@@ -125,7 +125,7 @@ class OptionModelEnv(ModelBasedEnvBase):
         self._check_entries(type(env.base_env if hasattr(env, "base_env") else env).__name__)
         self.starts = None if starts is None else starts.reshape(-1).to(self.device)
         self._generator = torch.Generator()
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(seed)
 
     @property
     def model(self) -> OptionModel:
@@ -267,10 +267,8 @@ class OptionModelEnv(ModelBasedEnvBase):
         return drawn.update(zero.select(*counted))
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is None:
-            self._generator.seed()
-        else:
-            self._generator.manual_seed(seed)
+        drawn = torch.empty((), dtype=torch.int64).random_() if seed is None else seed
+        self._generator.manual_seed(int(drawn))
 
 
 def _bounds(spec: TensorSpec) -> tuple[Tensor, Tensor] | None:

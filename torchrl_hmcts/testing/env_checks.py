@@ -54,9 +54,6 @@ def check_env(
         redrawn_keys (sequence of NestedKey): entries that may change between a step and the next
             root, e.g. the ``"skill"`` of a ``SkillTransform``. Default none.
 
-    Raises:
-        ContractError: if it does not.
-
     Examples:
         >>> from torchrl_hmcts.testing import ChainEnv, check_env
         >>> check_env(ChainEnv(length=4))
@@ -114,9 +111,6 @@ def check_macro_env(
         redrawn_keys (sequence of NestedKey): as in :func:`check_env`.
         tolerance (float): difference that is allowed, relative and absolute, e.g. 1e-6 where a
             network runs on batches of several sizes. Default 0.
-
-    Raises:
-        ContractError: if it is not.
 
     Examples:
         >>> from torchrl_hmcts.testing import ChainEnv, check_macro_env
@@ -189,9 +183,6 @@ def check_parallel_env(
         num_workers (int): processes. Default 2.
         num_steps (int): steps of the rollouts. Default 4.
         seed (int): of the envs. Default 0.
-
-    Raises:
-        ContractError: if it does not.
 
     Examples:
         >>> from torchrl_hmcts.testing import ChainEnv, check_parallel_env

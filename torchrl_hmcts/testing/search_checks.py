@@ -44,9 +44,6 @@ def check_tree_policy(tree_policy: TreePolicy) -> None:
         tree_policy: :class:`~torchrl_hmcts.planners.UCT` and its like, or a callable over
             :class:`~torchrl_hmcts.planners.NodeStatistics`.
 
-    Raises:
-        ContractError: if it cannot.
-
     Examples:
         >>> from torchrl_hmcts.testing import check_tree_policy
         >>> check_tree_policy(lambda nodes: nodes.option_values + 1 / (1 + nodes.option_visits))
@@ -134,9 +131,6 @@ def check_evaluator(evaluator: Callable[[TensorDictBase], Tensor], states: Tenso
         evaluator (callable): ``evaluator(td) -> values [m]`` or ``[m, 1]``.
         states (TensorDictBase): states ``[m]``.
 
-    Raises:
-        ContractError: if it cannot.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -159,9 +153,6 @@ def check_option_prior(
         option_prior (callable): ``option_prior(td) -> probabilities [m, A]``.
         states (TensorDictBase): states ``[m]``.
         num_options (int): A.
-
-    Raises:
-        ContractError: if it cannot.
 
     Examples:
         >>> import torch
@@ -224,9 +215,6 @@ def check_planner(planner: TensorDictModuleBase, env: EnvBase) -> None:
         env (EnvBase): the env to act in. If it is stateless (``batch_locked`` is False), batches
             are tried.
 
-    Raises:
-        ContractError: if it cannot.
-
     Examples:
         >>> from torchrl_hmcts.planners import MCTSPlanner
         >>> from torchrl_hmcts.testing import ChainEnv, check_planner
@@ -268,7 +256,6 @@ def check_novelty(novelty: NoveltyTest, states: TensorDictBase) -> None:
         states (TensorDictBase): states ``[m]`` with its ``in_keys``, at least two that differ.
 
     Raises:
-        ContractError: if it cannot.
         ValueError: if there are not two states.
 
     Examples:

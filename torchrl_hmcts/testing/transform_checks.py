@@ -115,7 +115,6 @@ def check_transform(
             processes and take longest.
 
     Raises:
-        ContractError: if one of them fails; the message names it.
         ValueError: if there is no check of a name.
 
     Examples:

@@ -19,7 +19,6 @@ from torchrl.envs import CatFrames, GymLikeEnv, Transform
 from torchrl_hmcts.carried_state import CarriedFrames
 from torchrl_hmcts.direct_calls import has_hooks, is_plain, put
 from torchrl_hmcts.nesting import complete_done, flat_transforms, parts, set_states, step_states
-from torchrl_hmcts.transforms.base_masks import BaseMasks
 from torchrl_hmcts.transforms.option_checks import (
     check_env,
     duration_key,
@@ -29,7 +28,7 @@ from torchrl_hmcts.transforms.option_checks import (
     try_worker,
     with_constant_specs,
 )
-from torchrl_hmcts.transforms.trajectory import OptionTrajectory
+from torchrl_hmcts.transforms.trajectory import BaseMasks, OptionTrajectory
 
 
 class OptionRollout:

@@ -52,7 +52,7 @@ class SkillTransform(EnvTransform):
             Default: torch's global generator.
 
     Raises:
-        ValueError: if the prior is no distribution over the skills.
+        ValueError: if a prior is given for vectors, or is no distribution over the skills.
 
     Reference:
         Eysenbach et al., "Diversity is All You Need", 2018, arXiv 1802.06070; Bartley 2023, ch. 4

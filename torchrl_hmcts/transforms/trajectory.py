@@ -1,4 +1,4 @@
-"""The base transitions inside an option, as a padded block.
+"""Entries of an option: its base transitions as a padded block, and masks of base actions.
 
 Letters: *B batch of the tensordict, T base steps an option can take at most.
 """
@@ -13,6 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
+
+from torchrl_hmcts.nesting import parts
 
 
 class OptionTrajectory:
@@ -85,3 +87,48 @@ class OptionTrajectory:
                 value = value[rows]
             self.data.get(key).select(lead, taken)[index] = value
         self.data.get(self.MASK_KEY).select(lead, taken)[index] = True
+
+
+_CONVENTION = "action_mask"  # TorchRL's name
+
+
+class BaseMasks:
+    """Renames the masks of an env's actions, ``"action_mask"`` to ``"base_action_mask"``.
+
+    Above an OptionTransform the action is the option, and ``"action_mask"`` is the mask of the
+    options. Below it, worker, termination and env read the base env's mask.
+    """
+
+    def __init__(self, env: EnvBase) -> None:
+        shown = list(map(unravel_key, env.full_observation_spec.keys(True, True)))
+        self.renamed: dict[NestedKey, NestedKey] = {}
+        for key in shown:
+            *path, last = parts(key)
+            if last == _CONVENTION:
+                while (new := unravel_key((*path, f"base_{last}"))) in shown:
+                    last = f"base_{last}"
+                self.renamed[key] = new
+
+    def hide(self, td: TensorDictBase) -> TensorDictBase:
+        """Rename the base masks in the env's output, for the parts above; in place."""
+        for key, new in self.renamed.items():
+            mask = td.pop(key, None)
+            if mask is not None:
+                td.set(new, mask)
+        return td
+
+    def show(self, td: TensorDictBase) -> TensorDictBase:
+        """Write them under their own name too, for the env and the worker; in place."""
+        for key, new in self.renamed.items():
+            mask = td.get(new, None)
+            if mask is not None:
+                td.set(key, mask)
+        return td
+
+    def hide_specs(self, spec: Composite) -> Composite:
+        """Rename them in a spec; in place."""
+        for key, new in self.renamed.items():
+            if key in spec.keys(True, True):
+                spec[new] = spec[key]
+                del spec[key]
+        return spec

@@ -79,9 +79,6 @@ class LearnerProcesses:
         """Wait until a learner ends or the time is over; return whether all ended as they should.
 
         With ``enough`` frames done, a learner that does not answer is given up.
-
-        Raises:
-            LearnerError: if one has ended otherwise.
         """
         alive = [process.sentinel for process, _ in self.running if process.exitcode is None]
         if alive:

@@ -23,19 +23,6 @@ def share_optimizer(optimizer: Optimizer) -> Optimizer:
     torch builds the state at the first step, so that each process would get one of its own. Here
     parameters and state stay what they were, but every process that receives the optimiser changes
     the same numbers when it steps. Learning rates and other settings stay each process's own.
-
-    Raises:
-        TypeError: if it is a kind whose state cannot be built beforehand.
-        ValueError: if a parameter is not on the CPU.
-        OSError: if there is too little shared memory.
-
-    Example:
-        >>> weight = torch.nn.Parameter(torch.ones(2))
-        >>> optimizer = share_optimizer(torch.optim.SGD([weight], lr=0.1, momentum=0.9))
-        >>> weight.is_shared(), optimizer.state[weight]["momentum_buffer"].is_shared()
-        (True, True)
-        >>> weight.tolist()
-        [1.0, 1.0]
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     elsewhere = {str(p.device) for p in parameters if p.device.type != "cpu"}
@@ -88,11 +75,10 @@ class SharedRMSprop(Optimizer):
 
     Args:
         params (iterable): parameters, or groups of them; moved to shared memory.
-        lr (float): :math:`\eta`. Default 7e-4.
-        alpha (float): memory of the mean, in ``[0, 1)``. Default 0.99, the paper's.
-        eps (float): :math:`\epsilon > 0`, in units of squared gradients. Default 1e-5; the paper's
-            0.1 goes with gradients summed over a segment.
-        weight_decay (float): added to the gradient times the parameter. Default 0.
+        lr, alpha (float): :math:`\eta`, and the memory of the mean, in ``[0, 1)``, the paper's.
+        eps (float): :math:`\epsilon > 0`, in units of squared gradients; the paper's 0.1 goes with
+            gradients summed over a segment.
+        weight_decay (float): added to the gradient times the parameter.
 
     Raises:
         TypeError: if ``params`` is no list of parameters, or a setting is no number.
@@ -138,11 +124,7 @@ class SharedRMSprop(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Changes the parameters by their gradients.
-
-        Args:
-            closure (callable, optional): computes the loss again, with gradients, and returns it.
-        """
+        """Changes the parameters by their gradients."""
         loss = None
         if closure is not None:
             with torch.enable_grad():

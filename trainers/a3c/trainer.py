@@ -6,7 +6,6 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from types import NoneType
@@ -26,23 +25,21 @@ from torchrl_hmcts.checks import instance, real_number, whole_number
 from torchrl_hmcts.processes import share
 from torchrl_hmcts.trainers.a3c.actor_learner import (
     ActorLearner,
+    LearnerLog,
     LearnerSettings,
     SharedMemory,
     actor_of,
     board_columns,
     trained_parameters,
 )
-from torchrl_hmcts.trainers.a3c.learner_log import LearnerLog
 from torchrl_hmcts.trainers.a3c.learner_processes import LearnerProcesses
 from torchrl_hmcts.trainers.a3c.shared_optimizers import OptimizerState, SharedRMSprop, share_over
 from torchrl_hmcts.trainers.off_policy import made_by
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
-    check_settings,
-    newest_checkpoint,
     plain_checkpoint,
+    to_continue,
 )
-from torchrl_hmcts.trainers.saving.locking import folder_locked
 from torchrl_hmcts.trainers.saving.resume import FIRST_SAVE_SECONDS, SAVE_SECONDS
 from torchrl_hmcts.trainers.saving.run_state import HistoryState
 from torchrl_hmcts.trainers.saving.stopping import patient, raise_if_asked, unbroken
@@ -70,91 +67,54 @@ class A3CTrainer:
     without any lock. This process logs, evaluates, saves and watches meanwhile. T may pass
     ``total_frames`` by a segment of each learner.
 
-    Logged every ``log_interval`` frames, to ``history`` and the ``logger``, as means since the last
-    time:
+    Logged every ``log_interval`` frames, as means since the last time: ``frames`` (T), ``seconds``,
+    ``frames_per_second``, ``episodes``, ``episode_return``, ``episode_length`` (NaN without one),
+    ``updates``, ``grad_norm`` before clipping, ``lr``, ``learner_i_frames``, the entries of the
+    loss, and ``eval_frames`` and ``eval_x`` of what ``evaluate`` returned.
 
-    ======================  =======================================================  ============
-    name                    value                                                    unit
-    ======================  =======================================================  ============
-    ``frames``              T, steps of all environments so far                      frames
-    ``seconds``             time in ``train()`` so far, evaluations included         s
-    ``frames_per_second``   of all learners                                          1/s
-    ``episodes``            finished so far
-    ``episode_return``      sum of rewards of a finished episode, nan without one    reward
-    ``episode_length``      its length, nan without one                              frames
-    ``updates``             so far
-    ``grad_norm``           norm of the gradient before clipping
-    ``lr``                  learning rate of the first group, at T
-    ``learner_i_frames``    frames of learner i in this run                          frames
-    ``loss_objective``,     entries of the loss, per update (entropy in nats)
-    ``loss_critic``, ...
-    ``eval_frames``,        T and what ``evaluate`` returned
-    ``eval_x``
-    ======================  =======================================================  ============
-
-    A learner's exception, its death by a signal, ``step_seconds`` without a step (a process that
-    is stopped, an env that hangs) or a gradient that is not finite ends the run: the others stop, a
-    checkpoint is written, and :class:`LearnerError` names the learner and carries its traceback. If
-    T has been reached, a learner that does not answer is ended after 10 s, and the run ends well.
-    Ctrl-C or SIGTERM stops all, writes a checkpoint, prints the command that continues the run, and
-    raises ``KeyboardInterrupt``; a second one does not interrupt that. If this process is killed,
-    the learners notice and end.
+    A learner's exception, its death, ``step_seconds`` without a step or a gradient that is not
+    finite ends the run: the others stop, a checkpoint is written, and :class:`LearnerError` names
+    the learner and carries its traceback. Ctrl-C and SIGTERM stop all, write a checkpoint and raise
+    ``KeyboardInterrupt``. If this process is killed, the learners notice and end.
 
     A run continues from its newest checkpoint with ``load(save_dir)``: parameters, optimiser state,
-    T, the learning rate's schedule and the curves are as they were. Not exact, and not meant to be:
-    new episodes begin, with other random numbers, and checkpoints are read while learners
-    write, so that single weights may be an update older than others. How learners interleave
-    differs from run to run; with one learner a run is a function of its seed.
-
-    The networks live in the CPU's memory. Buffers of theirs that change in training (e.g. of batch
-    normalisation) would stay each learner's own; use layers without.
+    T, schedule and curves are as they were. Not exactly: new episodes begin, and checkpoints are
+    read while learners write. With one learner a run is a function of its seed. Buffers of networks
+    that change in training (batch normalisation) would stay each learner's own.
 
     Args:
-        make_env (callable): ``make_env() -> EnvBase`` of any batch shape, ``[]`` or ``[*B]`` for
-            copies that each learner plays at once. Called in each learner; a lambda will do.
+        make_env (callable): ``make_env() -> EnvBase`` of any batch shape, ``[]`` or ``[*B]``;
+            called in each learner, a lambda will do.
         loss_module (LossModule): :class:`~torchrl_hmcts.objectives.A3CLoss`, or any other with an
-            ``actor_network`` that trains on segments ``[*B, T]``, as TorchRL's ``A2CLoss`` does.
-            Its parameters are moved to shared memory and trained in place.
-        total_frames (int): :math:`T_{max}`, steps of all environments of all learners. On a macro
-            env these are macro-steps.
+            ``actor_network`` that trains on segments ``[*B, T]``. Its parameters are moved to
+            shared memory and trained in place.
+        total_frames (int): :math:`T_{max}`, steps of all environments of all learners.
         segment_steps (int): :math:`t_{max}`, steps of each environment between two updates.
-            Default 20.
-        num_learners (int): processes. Default 2. With 0 one learner runs in this process, as
-            ``num_workers=0`` of a ``DataLoader``: to debug, and for tests.
-        optimizer (str, callable or Optimizer): ``"rmsprop"`` (default; :class:`SharedRMSprop`),
-            ``"adam"``, ``optimizer(parameters) -> Optimizer``, or an optimiser over the loss's
-            parameters: :class:`SharedRMSprop`, or torch's ``Adagrad``, ``Adam``, ``Adamax``,
-            ``AdamW``, ``RMSprop`` or ``SGD``.
-        lr (float): learning rate at the start, of a named optimiser. Default 7e-4.
-        lr_schedule (str or callable): ``"linear"`` (default): it falls to 0 at ``total_frames``, as
-            in the paper; ``"constant"``; or factor of the share of frames done, 0 to 1.
-        clip_norm (float, optional): bound of the gradient's norm. Default 0.5; ``None``: none.
+        num_learners (int): processes. With 0 one learner runs in this process: to debug.
+        optimizer (str, callable or Optimizer): ``"rmsprop"`` (:class:`SharedRMSprop`), ``"adam"``,
+            ``optimizer(parameters) -> Optimizer``, or an optimiser over the loss's parameters.
+        lr (float): learning rate at the start, of a named optimiser.
+        lr_schedule (str or callable): ``"linear"`` falls to 0 at ``total_frames``, ``"constant"``,
+            or a factor by the share of frames done, 0 to 1.
+        clip_norm (float, optional): bound of the gradient's norm; ``None``: none.
         configure_learner (callable, optional): ``configure_learner(loss_module, i)``, called in
-            learner i with its own copy, for exploration that differs between learners, e.g.
-            ``lambda loss, i: loss.entropy_coeff.fill_((0.01, 0.003)[i])``.
+            learner i with its own copy, for exploration that differs between learners.
         evaluate (callable, optional): ``evaluate(policy) -> dict`` of floats, with a copy of the
-            policy as it is now, without gradients. Called in this process while the learners act.
-        eval_interval (int, optional): frames between evaluations, besides the one at the end.
-            Default: a tenth of ``total_frames``.
+            policy, in this process while the learners act.
+        eval_interval, save_interval (int, optional): frames between evaluations and between
+            checkpoints, besides those at the end. Default: a tenth of ``total_frames``.
         stop_when (callable, optional): ``stop_when(metrics) -> bool``, called with what
             ``evaluate`` returned; true ends the run with the parameters that were evaluated.
         logger (Logger, optional): of TorchRL; gets every value at its T.
-        log_interval (int): frames. Default 10,000.
-        save_dir (path, optional): folder of the checkpoints, which hold no pickle. Default: none.
-        save_interval (int, optional): frames between checkpoints, besides the one after 5 seconds
-            of training, one a minute at least and the one at the end. Default: a tenth of
-            ``total_frames``.
-        keep_last (int): checkpoints kept. Default 2.
-        overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
-            once this run has written one. Default False: ``train()`` refuses such a folder.
+        log_interval (int): frames.
+        save_dir (path, optional): folder of the checkpoints.
+        keep_last, overwrite: see :class:`DurableRotation`.
         progress (callable, optional): called with ``total=total_frames`` it returns a progress bar,
-            e.g. ``tqdm.tqdm``. Default: quiet.
-        seed (int): learner i is seeded by (seed, i, T at its start). Default 0.
-        start_method (str): ``"spawn"`` (default) starts each learner as a new interpreter, which
-            takes some seconds; ``"forkserver"`` imports once for all, and keeps that process for
-            the next run; ``"fork"`` is immediate, but unsafe once this process has threads.
-        step_seconds (float): longest time for one step of a learner's env, seconds; a learner that
-            neither steps nor uses the processor for so long does not answer. Default 60.
+            e.g. ``tqdm.tqdm``.
+        seed (int): learner i is seeded by (seed, i, T at its start).
+        start_method (str): ``"spawn"`` starts each learner as a new interpreter, which takes some
+            seconds; ``"forkserver"`` imports once for all; ``"fork"`` is unsafe with threads.
+        step_seconds (float): longest time for one step of a learner's env, seconds.
 
     Raises:
         ValueError: if a number is out of range, or the loss does not reduce to one number.
@@ -290,21 +250,8 @@ class A3CTrainer:
         return cloudpickle.loads(cloudpickle.dumps(self.loss_module))
 
     def train(self) -> dict[str, list[float]]:
-        """Trains until T reaches ``total_frames`` or ``stop_when`` is true.
-
-        Returns:
-            dict: the ``history``.
-
-        Raises:
-            LearnerError: if a learner ended before its time; a checkpoint has been written.
-            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
-            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
-                unless ``overwrite`` is true.
-            FolderInUse: if another run writes to ``save_dir``.
-        """
-        if self.rotation is not None:
-            self.rotation.begin()
-        with folder_locked(self.rotation.directory) if self.rotation else nullcontext(), patient():
+        """Trains until T reaches ``total_frames`` or ``stop_when`` is true; returns the history."""
+        with self.rotation.taken() if self.rotation else patient():
             return self._train()
 
     def _train(self) -> dict[str, list[float]]:
@@ -350,25 +297,9 @@ class A3CTrainer:
         """Continues from a checkpoint; call it before ``train()``.
 
         The optimiser's settings are the checkpoint's, the learning rate at the start included; the
-        schedule and all else are this trainer's.
-
-        Args:
-            path (path): a checkpoint, or a folder of checkpoints (``save_dir``), of which the
-                newest is taken.
-
-        Returns:
-            A3CTrainer: itself.
-
-        Raises:
-            FileNotFoundError: if there is no checkpoint.
-            CheckpointError: if it is damaged, of a newer version or another loss, or does not fit,
-                e.g. other networks or optimiser.
+        schedule and all else are this trainer's. ``path`` may be a folder of checkpoints.
         """
-        found = newest_checkpoint(path)
-        check_settings(found, self.run_settings)
-        self._checkpoint.load(found)
-        if self.rotation is not None:
-            self.rotation.continue_from(found)
+        self._checkpoint.load(to_continue(path, self.run_settings, self.rotation))
         return self
 
     # Running learners

@@ -24,12 +24,7 @@ _EXTRAS = {"ray": "scale", "optuna": "scale", "ale_py": "atari", "wandb": "wandb
 
 
 class Failure(Exception):
-    """A command has failed; the message is all that its user sees.
-
-    Args:
-        message: a line.
-        status: exit status of the command.
-    """
+    """A command has failed; the message is all that its user sees."""
 
     def __init__(self, message: str, status: int = 1) -> None:
         super().__init__(message)
@@ -38,13 +33,7 @@ class Failure(Exception):
 
 @contextlib.contextmanager
 def told(command: str, *wrong: type[Exception], resume: Sequence[str] = ()) -> Iterator[None]:
-    """Turn errors that a user can do something about into a :class:`Failure`.
-
-    Args:
-        command: as users type it, e.g. ``"train experiment=labmaze"``.
-        *wrong: errors that wrong words cause, e.g. ``WRONG_WORDS``; exit status 2.
-        resume: holds the command that continues the run, once there is one.
-    """
+    """Turn errors that a user can do something about into a :class:`Failure`."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -72,16 +61,7 @@ def told(command: str, *wrong: type[Exception], resume: Sequence[str] = ()) -> I
 
 
 def with_advice(text: str, resume: str = "") -> str:
-    """Return what an OSError says, and another folder where that helps.
-
-    Args:
-        text: of the error; that the system lacks memory or files, no folder can help.
-        resume: command that continues the run.
-
-    Example:
-        >>> with_advice("No space left on device")
-        'No space left on device. Choose another folder with out=DIR.'
-    """
+    """Return what an OSError says, and another folder where that helps."""
     text = text.rstrip(".")
     if any(word in text for word in ("/dev/shm", "ulimit", "TMPDIR")):
         return f"{text}."
@@ -99,17 +79,7 @@ def run_experiment(
     fresh: bool = False,
     parts: Sequence[str] = (),
 ) -> int:
-    """Run an experiment, with ``run.json`` in its folder; return the exit status.
-
-    Args:
-        name: the command as users type it, e.g. ``"train experiment=labmaze"``.
-        experiment: what to run.
-        config: its configuration.
-        words: the whole command line, for the record.
-        log_level: how much is printed.
-        fresh: no folder was named: take the first of ``out``, ``out_2``, ... that holds nothing.
-        parts: words that change the parts, which are read after the first lines: they load torch.
-    """
+    """Run an experiment, with ``run.json`` in its folder; return the exit status."""
     resume: list[str] = []  # how to continue, once there is a run
     try:
         with told(name, resume=resume), printing(log_level), signals_handled():
@@ -164,11 +134,7 @@ def _saved(out: str) -> str:
 
 @contextlib.contextmanager
 def printing(log_level: str) -> Iterator[None]:
-    """Print as much as the level allows in the context; warnings and errors always come.
-
-    Args:
-        log_level: one of ``LOG_LEVELS``.
-    """
+    """Print as much as the level allows in the context; warnings and errors always come."""
     # TorchRL's own messages (a collector that shuts down, ...) are for those who ask for them.
     os.environ.setdefault("RL_LOGGING_LEVEL", {"info": "WARNING"}.get(log_level, log_level.upper()))
     logging.getLogger("torchrl").setLevel(os.environ["RL_LOGGING_LEVEL"])

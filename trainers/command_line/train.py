@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import shlex
 from collections.abc import Sequence
-from glob import escape, glob
-from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.command_line.running import (
@@ -30,7 +28,7 @@ from torchrl_hmcts.trainers.experiments.registry import (
     load_config,
 )
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, home
-from torchrl_hmcts.trainers.runs.run import next_free, resume_command, run_files
+from torchrl_hmcts.trainers.runs.run import next_free
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 
 
@@ -92,36 +90,11 @@ def _new(name: str, experiment: Experiment, words: Sequence[str], line: Sequence
         config, parts = parse_keys(experiment, rest, others=["log_level"])
         fresh = False
         if not any(word.removeprefix("env.").startswith("out=") for word in rest):
-            config, fresh = _default_folder(config)
+            fresh = not (config.overwrite or config.resume)
+            if config.toy:
+                config = dataclasses.replace(config, out=f"{config.out}_toy")
     level = own.get("log_level", "info")
     return run_experiment(name, experiment, config, line, level, fresh=fresh, parts=parts)
-
-
-def _default_folder(config: Any) -> tuple[Any, bool]:
-    """The configuration with the default folder, and whether the next free one may be taken."""
-    if config.toy:
-        config = dataclasses.replace(config, out=f"{config.out}_toy")
-    if config.overwrite:
-        return config, False
-    if not config.resume:
-        return config, True
-    there = [config.out, *sorted(glob(f"{escape(config.out)}_[0-9]*"))]
-    there = [out for out in there if run_files(Path(out))]
-    there = [out for out in there if _fits(out, config)] or there
-    if len(there) > 1:
-        raise ValueError(
-            f"say which run to continue: {', '.join(resume_command(out) for out in there)}."
-        )
-    return dataclasses.replace(config, out=there[0]) if there else config, False
-
-
-def _fits(out: str, config: Any) -> bool:
-    """Whether a folder holds a run that these keys may continue, e.g. of the same game."""
-    try:
-        saved = read_run(out).config
-    except ValueError:
-        return False
-    return all(saved.get(key, getattr(config, key)) == getattr(config, key) for key in config.KEPT)
 
 
 def _continued(folder: str, words: Sequence[str]) -> tuple[str, Experiment, Any]:

@@ -25,21 +25,6 @@ def parse_config(
     """Return the configuration of an experiment; its parts are composed with Hydra.
 
     It is :func:`with_parts` of :func:`parse_keys`.
-
-    Args:
-        experiment: whose keys they are.
-        words: ``key=value``; ``objective=metra``, ``planner/tree_policy=puct`` and
-            ``planner.novelty.radius=0.5`` change the parts of an agent over a kit.
-        base: configuration whose values hold where no word says otherwise. Default: the defaults.
-        others: keys of the same command that belong to no configuration, to be suggested as well.
-
-    Raises:
-        ValueError: if a key or name is unknown (the nearest ones are named), or a value is wrong.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.experiments.registry import DEMO
-        >>> parse_config(DEMO, ["seed=3"]).seed
-        3
     """
     return with_parts(*parse_keys(experiment, words, base, others))
 
@@ -47,11 +32,7 @@ def parse_config(
 def parse_keys(
     experiment: Experiment, words: Sequence[str], base: Any = None, others: Sequence[str] = ()
 ) -> tuple[Any, list[str]]:
-    """Return the configuration without its parts, and the words that change these; load no torch.
-
-    Args:
-        experiment, words, base, others: as of :func:`parse_config`.
-    """
+    """Return the configuration without its parts, and the words for these; load no torch."""
     kinds = key_kinds(experiment.config_class)
     names = {name for name, kind in kinds.items() if kind == "dict"}
     chosen = [w for w in words if w.partition("=")[0].replace("/", ".").split(".")[0] in names]
@@ -68,11 +49,7 @@ def parse_keys(
 
 
 def with_parts(config: Any, chosen: Sequence[str]) -> Any:
-    """Return a configuration whose parts are changed by words.
-
-    Args:
-        config, chosen: of :func:`parse_keys`.
-    """
+    """Return a configuration whose parts are changed by words."""
     if not chosen:
         return config
     first = [word for word in chosen if word.startswith("objective")]
@@ -115,15 +92,7 @@ def with_parts(config: Any, chosen: Sequence[str]) -> Any:
 
 
 def expand(words: Sequence[str]) -> list[list[str]]:
-    """Return the words of each run of ``-m``: all combinations of values with commas.
-
-    Args:
-        words: ``key=a,b`` takes both values, ``key=[a,b]`` and ``key="a,b"`` are one.
-
-    Example:
-        >>> expand(["seed=0,1", "toy=true"])
-        [['seed=0', 'toy=true'], ['seed=1', 'toy=true']]
-    """
+    """Return the words of each run of ``-m``: all combinations of values with commas."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     values = []
@@ -136,22 +105,7 @@ def expand(words: Sequence[str]) -> list[list[str]]:
 
 
 def split_words(words: Sequence[str], own: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Take the keys of the command out of its words.
-
-    Args:
-        words: of the command line, without the verb.
-        own: keys of the command; ``log_level`` always is one.
-
-    Returns:
-        The values of these keys, and all other words.
-
-    Raises:
-        ValueError: if one of the keys is given twice, or has no value.
-
-    Example:
-        >>> split_words(["experiment=labmaze", "seed=1"], ["experiment"])
-        ({'experiment': 'labmaze'}, ['seed=1'])
-    """
+    """Take the keys of the command out of its words."""
     found: dict[str, str] = {}
     rest = []
     for word in words:
@@ -171,24 +125,7 @@ def split_words(words: Sequence[str], own: Sequence[str]) -> tuple[dict[str, str
 
 
 def only_words(words: Sequence[str], own: Sequence[str]) -> dict[str, str]:
-    """Read the words of a command that has no keys but its own.
-
-    Args:
-        words: of the command line, without the verb.
-        own: keys of the command, the one that must be given first; ``log_level`` always is one.
-
-    Returns:
-        The values of the keys.
-
-    Raises:
-        ValueError: if there is another word, or one of the keys is given twice, or has no value.
-
-    Example:
-        >>> only_words(["run=runs/gym", "sede=1"], ["run", "seed"])
-        Traceback (most recent call last):
-        ...
-        ValueError: Unknown key 'sede'. Did you mean: seed?
-    """
+    """Read the words of a command that has no keys but its own."""
     found, rest = split_words(words, own)
     no_bare_words(rest, own[0])
     if rest:
@@ -197,21 +134,7 @@ def only_words(words: Sequence[str], own: Sequence[str]) -> dict[str, str]:
 
 
 def no_bare_words(words: Sequence[str], folder: str = "") -> None:
-    """Refuse a word that lacks its key, and say with which key to write it.
-
-    Args:
-        words: of a command.
-        folder: key of a folder, e.g. ``"run"``.
-
-    Raises:
-        ValueError: if a word is the name of an experiment, of a kit, or a folder.
-
-    Example:
-        >>> no_bare_words(["labmaze"])
-        Traceback (most recent call last):
-        ...
-        ValueError: 'labmaze' is no key=value. Write experiment=labmaze.
-    """
+    """Refuse a word that lacks its key, and say with which key to write it."""
     for word in words:
         if "=" in word:
             continue
@@ -224,20 +147,3 @@ def no_bare_words(words: Sequence[str], folder: str = "") -> None:
         if near:
             key = "experiment" if near[0] in EXPERIMENTS else "kit"
             raise ValueError(f"{word!r} is no key=value. Did you mean {key}={near[0]}?")
-
-
-def folders_of(words: Sequence[str], own: Sequence[str]) -> list[str]:
-    """Return words as folders, none of which may be a key.
-
-    Args:
-        words: left over by :func:`split_words`.
-        own: keys of the command, for the message.
-
-    Raises:
-        ValueError: if a word is a key that the command does not have.
-    """
-    for word in words:
-        key, separator, _ = word.partition("=")
-        if separator and not os.path.isdir(home(word)):
-            raise ValueError(unknown_key(key, [*own, "log_level"]))
-    return [home(word) for word in words]

@@ -14,7 +14,6 @@ class GymConfig(SkillsConfig):
     """Keys of ``hmcts train kit=gym env.id=NAME``: the agent over the kit ``gym``."""
 
     out: str = "runs/gym"
-    """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     id: str = ""
     """Id of the Gymnasium env, e.g. env.id=PointMaze_Large-v3."""
     make: dict[str, Any] = field(default_factory=dict)
@@ -29,7 +28,6 @@ class GymConfig(SkillsConfig):
     mazes: int = 20
     """Starts to act from."""
     num_skills: int = 8
-    """Skills of the worker, the options of the manager."""
     option_steps: int = 0  # type: ignore[misc]
     """Base steps of an option; 0: found by a short look at the env."""
     skill_steps: int = 0  # type: ignore[misc]
@@ -91,7 +89,6 @@ class AntConfig(GymConfig):
     """
 
     out: str = "runs/ant"
-    """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     num_skills: int = 3
     """Skills of the worker; each is taken as it is and after half a turn of the body."""
     option_steps: int = 25  # type: ignore[misc]
@@ -114,11 +111,9 @@ class AntConfig(GymConfig):
     train_base_steps: int = 51_200
     """Actions of worker training."""
     updates_per_step: float = 0.25
-    """Updates of the networks per action."""
     expansions: int = 1_000
     """Nodes that a search may expand before it gives up."""
     leaves_per_wave: int = 8
-    """Leaves of the tree whose options are simulated together; more are faster, less selective."""
 
     EXPERIMENT, KIT = "ant", "ant"
     TOY = {"train_base_steps": 256, "mazes": 2, "expansions": 20, "search_steps": 200}

@@ -169,8 +169,6 @@ class DemoConfig(SkillsConfig):
     """
 
     out: str = "runs/demo"
-    """Folder that receives metrics, pictures, checkpoints and the page; made if absent. Default:
-    runs/demo (runs/demo_toy with toy=true), or the next of runs/demo_2, ... that holds no run."""
     mazes: int = 100
     """Test mazes to solve, at most the 342 of the test split."""
     task: str = "maze"
@@ -245,7 +243,6 @@ class LabMazeConfig(SkillsConfig):
     """
 
     out: str = "runs/labmaze"
-    """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     task: str = "maze"
     """Task: "maze" (find the goal), "turn" (the same without steps sideways or back)
     or "apples" (collect apples, 1 each, before max_frames are over; the goal pays 1 and ends
@@ -267,7 +264,6 @@ class LabMazeConfig(SkillsConfig):
     """Frames of worker training at most, simulated ones included, in 256 mazes of 9 x 9; 0: 40,000,
     with task=turn 160,000."""
     updates_per_step: float = 0.1875
-    """Updates of the networks per base step."""
     skill_frames: int = 200
     """Frames of a mini-episode in DIAYN's training."""
     max_frames: int = 10_800  # type: ignore[misc]
@@ -301,16 +297,9 @@ class LabMazeConfig(SkillsConfig):
         "max_frames": 300,
     }
     KEPT = (
-        *SkillsConfig.KEPT,
-        *(
-            "task",
-            "option_frames",
-            "frames_per_step",
-            "updates_per_step",
-            "skill_frames",
-            "init_options",
-        ),
-        *("retrain_interval", "round_expansions", "novelty_radius", "gamma"),
+        *(*SkillsConfig.KEPT, "task", "option_frames", "frames_per_step", "updates_per_step"),
+        *("skill_frames", "init_options", "retrain_interval", "round_expansions"),
+        *("novelty_radius", "gamma"),
     )
     LEAST = {**SkillsConfig.LEAST, "improve_expansions": 0, "stall_steps": 0, "search_frames": 0}
     CHOICES = {**SkillsConfig.CHOICES, "task": ("maze", "turn", "apples")}
@@ -365,7 +354,6 @@ class WaterworldA3CConfig(RunConfig):
     """Keys of ``hmcts train experiment=waterworld_a3c``."""
 
     out: str = "runs/waterworld_a3c"
-    """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
     total_frames: int = 2_000_000
     """Base steps of training, all learners together (the dissertation's T_max)."""
     num_learners: int = 2
@@ -429,7 +417,6 @@ class WaterworldGoalsConfig(WaterworldA3CConfig):
     """Keys of ``hmcts train experiment=waterworld_goals``."""
 
     out: str = "runs/waterworld_goals"
-    """Folder that receives metrics, curves, pictures, checkpoints and the page; made if absent."""
     num_goals: int = 3
     """Goals that the worker sees."""
     goal_met_threshold: float = 0.5

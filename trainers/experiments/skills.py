@@ -28,7 +28,7 @@ from torchrl_hmcts.modules import (
 from torchrl_hmcts.objectives import SkillObjective
 from torchrl_hmcts.planners import MCTSPlanner
 from torchrl_hmcts.trainers.collectors import make_ray_collector
-from torchrl_hmcts.trainers.diayn import DIAYNTrainer
+from torchrl_hmcts.trainers.diayn import Curves, DIAYNTrainer
 from torchrl_hmcts.trainers.evaluation import Results
 from torchrl_hmcts.trainers.experiments.curve_tests import CurveTests
 from torchrl_hmcts.trainers.experiments.kits import (
@@ -52,7 +52,6 @@ from torchrl_hmcts.trainers.runs.loggers import make_logger
 from torchrl_hmcts.trainers.runs.run import Run, open_run
 from torchrl_hmcts.trainers.saving.run_folder import read_run
 from torchrl_hmcts.trainers.saving.worker_file import load_networks, save_worker
-from torchrl_hmcts.trainers.skills.curves import Curves
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords
 from torchrl_hmcts.transforms import OptionRecorder, OptionTransform, SkillReward
 

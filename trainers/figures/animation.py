@@ -10,19 +10,13 @@ import numpy as np
 
 from torchrl_hmcts.trainers.saving.files import left_out, replacing
 
+STEPS_PER_FRAME = 2  # base steps from one picture of an episode to the next
 _VIDEO_SECONDS = 300  # after which ffmpeg is given up
 
 
-def steps_to_show(last: int, every: int) -> list[int]:
-    """Return the base steps of an episode of which there is a picture.
-
-    Example:
-        >>> steps_to_show(5, 2)
-        [0, 2, 4, 5]
-    """
-    if every < 1:
-        raise ValueError(f"a GIF needs steps_per_frame >= 1; got {every}.")
-    return [*range(0, last, every), last]
+def steps_to_show(last: int) -> list[int]:
+    """Return the base steps of an episode of which there is a picture."""
+    return [*range(0, last, STEPS_PER_FRAME), last]
 
 
 def write_gif(
@@ -35,14 +29,6 @@ def write_gif(
     """Write pictures as an endless GIF, and as a video beside it (``.mp4``, H.264).
 
     A video that cannot be written, e.g. without ffmpeg, is left out; a line on stderr says so.
-
-    Args:
-        frames: uint8 ``[height, width, 3]`` each. Where several in a row are the same, one is
-            written into the GIF that is shown as long as all of them.
-        path: GIF to write; the video has the same name.
-        milliseconds: for which a frame is shown.
-        last: milliseconds for which the last one is shown. Default: a second and a half; ``None``:
-            as long as the others.
     """
     kept, durations = [frames[0]], [0.0]
     for frame in frames:

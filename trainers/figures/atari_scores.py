@@ -1,11 +1,6 @@
 """Chapter 5: scores in seven games beside the dissertation's (Tables 5.1 and A.1).
 
-Runs of the experiment ``atari`` have in ``metrics.json`` the entries ``game``, ``protocol``
-(``"deterministic"`` or ``"sticky"``), ``seed``, ``score_max``, ``score_final`` and ``frames``, and
-in ``curves.csv`` the curves ``score`` and ``score_max`` against emulated steps. Files in
-``docs/results/atari`` are lists of such summaries, with an entry ``curves`` for the figures:
-``{"score": {"step": [...], "value": [...]}, "score_max": {...}}``, and RUNNING, the score of the
-episode being played at every 1,000th base step.
+Files in ``docs/results/atari`` are lists of the ``metrics.json`` of runs, with an entry ``curves``.
 """
 
 from __future__ import annotations
@@ -89,12 +84,7 @@ TABLE_A_1 = {
 
 
 def best_baseline(game: str) -> tuple[str, float]:
-    """Return the best algorithm of Table A.1 in a game, and its mean score.
-
-    Example:
-        >>> best_baseline("Breakout")
-        ('deepq', 131.46)
-    """
+    """Return the best algorithm of Table A.1 in a game, and its mean score."""
     return max(((name, row[game]) for name, row in TABLE_A_1.items()), key=lambda pair: pair[1])
 
 
@@ -130,10 +120,6 @@ def human_normalised(row: Row, key: str) -> float:
 
     Reference:
         Mnih et al., "Human-level control through deep reinforcement learning", 2015.
-
-    Example:
-        >>> human_normalised({"game": "Pong", "score_max": 14.6}, "score_max")
-        1.0
     """
     human, random = HUMAN_AND_RANDOM[row["game"]]
     return float((row[key] - random) / (human - random))
@@ -148,12 +134,6 @@ def aggregate(scores: Sequence[Sequence[float]]) -> tuple[float, float, float]:
     Reference:
         Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
         2021, arXiv 2108.13264.
-
-    Example:
-        >>> aggregate([[1.0], [2.0], [3.0], [10.0]])
-        (2.5, 2.5, 2.5)
-        >>> aggregate([[1.0, 1.0, 1.0], [2.0], [3.0], [10.0]])
-        (2.5, 2.5, 2.5)
     """
     generator = np.random.default_rng(0)
     often = math.lcm(*map(len, scores))
@@ -169,13 +149,7 @@ def aggregate(scores: Sequence[Sequence[float]]) -> tuple[float, float, float]:
 
 
 def best_source(rows: Sequence[Row]) -> list[Row]:
-    """Return the runs of the source of options with the highest mean score of a run of a game.
-
-    Example:
-        >>> rows = [{"source": "goals", "score_mean": 3.0}, {"source": "repeat", "score_mean": 7.0}]
-        >>> best_source(rows) == rows[1:]
-        True
-    """
+    """Return the runs of the source of options with the highest mean score of a run of a game."""
     if not rows:
         return []
     winner = max(rows, key=lambda row: float(row.get("score_mean", float("-inf"))))
@@ -290,7 +264,7 @@ def write_table(rows: Sequence[Row], path: Path) -> str:
     }
     head = ["game", "dissertation: highest", "its skills, steps", "best of Table A.1"]
     for protocol in protocols:
-        head += [f"ours, {protocol}: mean", "least to largest", "who acts", "seeds"]
+        head += [f"ours, {protocol}: mean", "least to largest", "who acts", "seeds", "frames"]
     cells = []
     for game, source in TABLE_5_1.items():
         algorithm, baseline = best_baseline(game)
@@ -302,20 +276,19 @@ def write_table(rows: Sequence[Row], path: Path) -> str:
             line.append(_interval(means))
             line.append(_range(runs))
             line.append(", ".join(sorted({str(r.get("acts", "rules")) for r in runs})) or "-")
-            line.append(len(runs))
+            frames = [row["frames"] for row in runs if "frames" in row]
+            line += [len(runs), round(sum(frames) / len(frames)) if frames else "-"]
         cells.append(line)
     normalised = [
         [protocol, key.replace("score_", ""), *_aggregated(ours, protocol, key)]
         for protocol in protocols
         for key in ("score_mean", "score_max")
     ]
-    took = [[*names, *what_it_took(runs)] for names, runs in ours.items() if runs]
     baselines = [[name, *(row[game] for game in TABLE_5_1)] for name, row in TABLE_A_1.items()]
     table = Table(cells, head)
     words = ["protocol", "score", "interquartile mean", "95 % interval", "games"]
     sections = [
         Section(words=[_NOTE], tables=[table]),
-        Section("What they took", tables=[Table(took, _TOOK)]),
         Section("Human-normalised scores of all games", tables=[Table(normalised, words)]),
         Section(
             "Table A.1: means of OpenAI Baselines, as the dissertation gives them",
@@ -337,28 +310,6 @@ _NOTE = (
     "interval; beside it the least and the largest score of any episode, and whether rules or a "
     "network act."
 )
-_TOOK = (
-    "game", "protocol", "options from", "options, steps", "frames, all kinds",
-    "frames per decision", "seconds",
-)  # fmt: skip
-
-
-def what_it_took(runs: Sequence[Row]) -> list[Any]:
-    """Return what the runs of a game took, means over the seeds, in the order of the table."""
-    first = runs[0]
-
-    def mean(key: str) -> Any:
-        values = [float(row[key]) for row in runs if row.get(key) is not None]
-        return round(sum(values) / len(values)) if values else "-"
-
-    per_decision = mean("frames_per_decision")
-    if per_decision == "-" and first.get("episodes"):  # a run of before it was written
-        decisions = sum(int(e["decisions"]) for row in runs for e in row["episodes"])
-        spent = ("frames_finding_options", "frames_tuning")
-        frames = sum(row["frames"] - sum(row.get(key, 0) for key in spent) for row in runs)
-        per_decision = round(frames / max(1, decisions))
-    found = f"{len(first.get('options', []))}, {first.get('option_steps', '-')}"
-    return [first.get("source", "-"), found, mean("frames"), per_decision, mean("seconds")]
 
 
 def _aggregated(ours: Mapping[tuple[str, str], list[Row]], protocol: str, key: str) -> list[Any]:

@@ -30,10 +30,6 @@ def common_steps(curves: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
     """Bring curves to common steps, as far as all of them go.
 
     Returns the steps ``[G]`` of the curve that ends first, and values ``[S, G]`` at them.
-
-    Example:
-        >>> common_steps([([0, 10, 20], [0, 1, 2]), ([0, 20], [1, 3])])[1].mean(0).tolist()
-        [0.5, 1.5, 2.5]
     """
     if not curves:
         raise ValueError("common_steps needs the curve of one seed or more; got none.")
@@ -44,12 +40,7 @@ def common_steps(curves: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def says_something(steps: Sequence[float], values: Sequence[float]) -> bool:
-    """Return whether a curve is worth a panel: it is neither constant nor a straight line.
-
-    Example:
-        >>> says_something([0, 1, 2], [5.0, 5.0, 5.0]), says_something([0, 1, 2], [0.0, 2.0, 1.0])
-        (False, True)
-    """
+    """Return whether a curve is worth a panel: it is neither constant nor a straight line."""
     x, y = np.asarray(steps, float), np.asarray(values, float)
     if len(x) < 2:
         return False
@@ -62,15 +53,7 @@ def says_something(steps: Sequence[float], values: Sequence[float]) -> bool:
 def draw_band(
     axes: Axes, curves: Sequence[Points], *, color: str, smooth: bool = False, **line: Any
 ) -> None:
-    """Draw the mean of several seeds' curves, and the band from the least to the largest.
-
-    Args:
-        axes: to draw in.
-        curves: one per seed.
-        color: of line and band.
-        smooth: draw the mean pale, and moving averages over a fortieth of its points above it.
-        **line: of ``axes.plot``.
-    """
+    """Draw the mean of several seeds' curves, and the band from the least to the largest."""
     steps, values = common_steps(curves)
     if smooth:
         axes.plot(steps, values.mean(0), color=_PALE, linewidth=0.8)
@@ -102,12 +85,7 @@ def legend_of_all(figure: Figure, *, ncols: int) -> None:
 
 
 def panel(name: str, groups: Sequence[Sequence[Points]], x_label: str = "steps") -> str:
-    """Draw one logged value of several groups of runs, small enough for a phone.
-
-    Example:
-        >>> panel("entropy", [[([0, 1], [2, 1])]])[:5]
-        '<?xml'
-    """
+    """Draw one logged value of several groups of runs, small enough for a phone."""
     figure = Figure(figsize=(4.3, 2.7), layout="constrained")
     axes = figure.subplots()
     for i, curves in enumerate(groups):
@@ -154,14 +132,6 @@ def plot_training(
     x_label: str = "training base steps",
 ) -> None:
     """Draw test curves of agents while they learn; bands go from the least to the largest seed.
-
-    Args:
-        runs: for each agent, the curves of its seeds: ``"training_steps"`` ascending, and the
-            entries of the panels, ``[P]`` each.
-        panels: from left to right.
-        path: PNG to write.
-        title: heading of the picture.
-        x_label: below each panel.
 
     Reference:
         Dissertation, figures 3.6 and 4.10.

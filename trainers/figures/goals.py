@@ -15,7 +15,7 @@ from torchrl_hmcts.envs import WaterworldMazeEnv
 from torchrl_hmcts.envs.mazes.rendering import PLAYER_COLOR, TARGET_COLOR, draw_walls
 from torchrl_hmcts.planners import Search
 from torchrl_hmcts.planners.drawing import option_color
-from torchrl_hmcts.trainers.figures.animation import steps_to_show, write_gif
+from torchrl_hmcts.trainers.figures.animation import STEPS_PER_FRAME, steps_to_show, write_gif
 from torchrl_hmcts.trainers.figures.maps import legend_below
 from torchrl_hmcts.trainers.figures.pictures import save_figure
 
@@ -63,17 +63,7 @@ def draw_goals(
 
 
 def plot_goals(env: WaterworldMazeEnv, start: TensorDictBase, track: Any, path: Path) -> None:
-    """Draw an episode at its start, half way and at its end.
-
-    Args:
-        env: draws the maze.
-        start: first state of the episode, without batch dimensions.
-        track: the episode.
-        path: PNG to write.
-
-    Reference:
-        Dissertation, figure 3.5.
-    """
+    """Draw an episode at its start, half way and at its end (figure 3.5)."""
     last = len(track.positions) - 1
     captions = {
         0: f"the plan: {len(track.plan_at(0))} goals",
@@ -87,29 +77,11 @@ def plot_goals(env: WaterworldMazeEnv, start: TensorDictBase, track: Any, path: 
     save_figure(figure, path)
 
 
-def write_goal_gif(
-    env: WaterworldMazeEnv,
-    start: TensorDictBase,
-    track: Any,
-    path: Path,
-    *,
-    steps_per_frame: int = 2,
-) -> None:
-    """Write an episode as a GIF at twice its real speed; goals vanish as they are met.
-
-    Args:
-        env: draws the frames.
-        start: first state of the episode, without batch dimensions.
-        track: the episode.
-        path: file to write.
-        steps_per_frame: base steps from one frame to the next.
-
-    Raises:
-        ValueError: if ``steps_per_frame`` is below 1.
-    """
-    steps = steps_to_show(len(track.positions) - 1, steps_per_frame)
+def write_goal_gif(env: WaterworldMazeEnv, start: TensorDictBase, track: Any, path: Path) -> None:
+    """Write an episode as a GIF at twice its real speed; goals vanish as they are met."""
+    steps = steps_to_show(len(track.positions) - 1)
     frames = [draw_goals(env, start, track, step) for step in steps]
-    write_gif(frames, path, milliseconds=500.0 * env.TIME_STEP * steps_per_frame)
+    write_gif(frames, path, milliseconds=500.0 * env.TIME_STEP * STEPS_PER_FRAME)
 
 
 def plot_macro_env(env: WaterworldMazeEnv, state: TensorDictBase, path: Path) -> None:

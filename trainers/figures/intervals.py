@@ -17,10 +17,6 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
     Reference:
         Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
         2021, arXiv 2108.13264.
-
-    Example:
-        >>> float(interquartile_mean(np.array([0.0, 2.0, 4.0, 100.0])))
-        3.0
     """
     cut = values.shape[-1] // 4
     middle: np.ndarray = np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(-1)
@@ -37,10 +33,6 @@ def bootstrap(
 
     Reference:
         Efron, "Bootstrap methods: another look at the jackknife", 1979.
-
-    Example:
-        >>> bootstrap([3.0])
-        (3.0, 3.0, 3.0)
     """
     sample = np.asarray(values, dtype=float)
     draws = np.random.default_rng(0).integers(len(sample), size=(_RESAMPLES, len(sample)))
@@ -54,16 +46,8 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     .. math:: \frac{1}{1 + z^2 / n} \left(\hat p + \frac{z^2}{2n}
         \pm z \sqrt{\frac{\hat p (1 - \hat p)}{n} + \frac{z^2}{4n^2}}\right), \qquad z = 1.96
 
-    Args:
-        successes: of the trials.
-        trials: n, 1 or more.
-
     Reference:
         Wilson, "Probable inference, the law of succession, and statistical inference", 1927.
-
-    Example:
-        >>> wilson(50, 50)
-        (0.9287, 1.0)
     """
     z, share = 1.959964, successes / trials
     middle = share + z**2 / (2 * trials)

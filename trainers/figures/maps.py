@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
@@ -23,11 +24,13 @@ from torchrl.envs import EnvBase
 
 from torchrl_hmcts.envs import LabMazeEnv, WaterworldMazeEnv, draw_first_person
 from torchrl_hmcts.envs.mazes.rendering import draw_goal, draw_walls
+from torchrl_hmcts.modules import EffectModel, LandmarkModel
 from torchrl_hmcts.planners import Plan, Search
 from torchrl_hmcts.planners.drawing import OPTION_COLORS, option_color
-from torchrl_hmcts.trainers.figures.animation import steps_to_show, write_gif
-from torchrl_hmcts.trainers.figures.pictures import save_figure
+from torchrl_hmcts.trainers.figures.animation import STEPS_PER_FRAME, steps_to_show, write_gif
+from torchrl_hmcts.trainers.figures.pictures import COLORS, save_figure
 
+_GREY, _PALE = "#71717a", "#d4d8e0"
 _MAX_NODES = 600  # of a tree in a picture
 
 Path2D = tuple[np.ndarray, np.ndarray]
@@ -35,23 +38,13 @@ Path2D = tuple[np.ndarray, np.ndarray]
 
 
 class MapDrawing(Protocol):
-    """Draws the states of an environment; what the pictures of a kit need of it.
-
-    Attributes:
-        env: whose states are drawn.
-        milliseconds: for which a base step is shown in a GIF.
-    """
+    """Draws the states of an environment; what the pictures of a kit need of it."""
 
     env: EnvBase
     milliseconds: float
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
-        """Draw what lies below the states of an episode, e.g. walls and goal.
-
-        Args:
-            axes: to draw in.
-            state: of the episode, without batch dimensions.
-        """
+        """Draw what lies below the states of an episode, e.g. walls and goal."""
 
     def points(self, states: TensorDictBase) -> Tensor:
         """Return where states ``[N]`` lie in such axes, ``[N, 2]``."""
@@ -73,16 +66,13 @@ class WaterworldMap:
         self.milliseconds = 500.0 * self.env.TIME_STEP  # twice real time
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
-        """Draw walls, and the target if the state has one."""
         self.env.draw_map(axes, state)
 
     def points(self, states: TensorDictBase) -> Tensor:
-        """Return the positions."""
         position: Tensor = states["position"]
         return position
 
     def picture(self, state: TensorDictBase, paths: Sequence[Path2D]) -> np.ndarray:
-        """Return the maze from above."""
         image: np.ndarray = self.env.render(state, paths=paths)
         return image
 
@@ -119,19 +109,16 @@ class LabMap:
         self.milliseconds = 1000.0 * self.env.num_steps / 60.0
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
-        """Draw walls and goal."""
         layout, maze = self.env.layout, int(state["maze_index"])
         draw_walls(axes, layout.walls[maze], north_up=True)
         if layout.goal[maze, 0] >= 0:
             draw_goal(axes, layout.goal[maze] / self.env.CELL)
 
     def points(self, states: TensorDictBase) -> Tensor:
-        """Return the positions, in cells."""
         position: Tensor = states["position"] / self.env.CELL
         return position
 
     def picture(self, state: TensorDictBase, paths: Sequence[Path2D]) -> np.ndarray:
-        """Return the maze from above, and beside it what the player sees."""
         shown = [
             (self.env.to_picture(torch.as_tensor(points) * self.env.CELL).numpy(), colors)
             for points, colors in paths
@@ -172,18 +159,7 @@ _ROOMS = ("in an open room", "in a test maze")
 
 @dataclass
 class FeatureMap:
-    """Draws the states of an environment without a map: two of its features against each other.
-
-    Args:
-        env: whose states are drawn.
-        key: entry of the states with the features.
-        features: which two.
-        limits: ``(least, largest)`` of each, for the pictures of a GIF. Default: those of its
-            paths.
-        names: of the features.
-        is_place: whether both are lengths, drawn to one scale.
-        milliseconds: for which a base step is shown in a GIF.
-    """
+    """Draws the states of an environment without a map: two of its features against each other."""
 
     env: EnvBase
     key: Any = "observation"
@@ -194,7 +170,6 @@ class FeatureMap:
     milliseconds: float = 40.0
 
     def background(self, axes: Axes, state: TensorDictBase) -> None:
-        """Draw a grid with the names of the features."""
         if self.is_place:
             axes.set_aspect("equal")
         axes.set(xlabel=self.names[0], ylabel=self.names[1])
@@ -203,12 +178,10 @@ class FeatureMap:
             axes.set(xlim=self.limits[0], ylim=self.limits[1])
 
     def points(self, states: TensorDictBase) -> Tensor:
-        """Return the two features."""
         found: Tensor = states[self.key][..., list(self.features)]
         return found
 
     def picture(self, state: TensorDictBase, paths: Sequence[Path2D]) -> np.ndarray:
-        """Return the paths, and the state as a dot."""
         figure = Figure(figsize=(4.0, 4.0), dpi=80, layout="constrained")
         canvas, axes = FigureCanvasAgg(figure), figure.subplots()
         self.background(axes, state)
@@ -235,14 +208,6 @@ def plot_skill_fan(
 ) -> None:
     """Draw the trajectories of each skill, one colour each, in a panel for each room.
 
-    Args:
-        policy: reads ``"skill"`` and what else it needs of the state, writes ``"action"``.
-        rooms: for each title a drawing, whose env is stepped, and the states in one place that the
-            mini-episodes begin in, as many for each skill, e.g. ``WaterworldMap(env).rooms(40)``.
-        path: PNG to write.
-        num_skills: Z.
-        steps: base steps of a mini-episode.
-
     Reference:
         Dissertation, figure 4.5: 10 mini-episodes of 100 frames for each policy.
     """
@@ -265,30 +230,21 @@ def plot_skill_fan(
     save_figure(figure, path)
 
 
-def plot_search(
-    drawing: MapDrawing, search: Search, path: str | Path, *, root: int = 0, option: str = "skill"
-) -> None:
+def plot_search(drawing: MapDrawing, search: Search, path: str | Path) -> None:
     """Draw where the options of a search led on the map, and the tree; the plan stands out.
-
-    Args:
-        drawing: of the env that was searched.
-        search: a finished search that has kept its states.
-        path: PNG to write.
-        root: which of the search's roots.
-        option: what an option is called in the legend.
 
     Reference:
         Dissertation, figure 3.4.
     """
     tree = search.tree
     assert tree.states is not None
-    names = [f"{option} {number}" for number in range(tree.num_options)]
+    names = [f"skill {number}" for number in range(tree.num_options)]
     figure = Figure(figsize=(12.0, 5.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.15))
-    drawing.background(left, tree.states[root, 0])
-    tree.plot_positions(root, drawing.points, ax=left, option_names=names, legend=False)
+    drawing.background(left, tree.states[0, 0])
+    tree.plot_positions(0, drawing.points, ax=left, option_names=names, legend=False)
     left.set_title("where the options led", fontsize=10, loc="left")
-    tree.plot(root, ax=right, max_nodes=_MAX_NODES, option_names=names)
+    tree.plot(0, ax=right, max_nodes=_MAX_NODES, option_names=names)
     legend_below(figure, right.get_legend(), ncols=6)  # one for both
     save_figure(figure, path)
 
@@ -299,19 +255,8 @@ def write_episode_gif(
     options: Sequence[int],
     plan: Plan,
     path: str | Path,
-    *,
-    steps_per_frame: int = 2,
 ) -> None:
-    """Write an episode as a GIF: the plan pale, the way so far in the colours of its options.
-
-    Args:
-        drawing: of the env.
-        states: the first, and that after each base step, ``[T + 1]``, without batch dimensions.
-        options: executed in each base step, ``[T]``.
-        plan: without batch dimensions.
-        path: file to write.
-        steps_per_frame: base steps from one picture to the next.
-    """
+    """Write an episode as a GIF: the plan pale, the way so far in the colours of its options."""
     length = int(plan.lengths)
     colors = _colors(plan.options[:length].tolist())
     planned = drawing.points(plan.states[: length + 1]).numpy()
@@ -319,22 +264,22 @@ def write_episode_gif(
     trail = torch.stack([drawing.points(state) for state in states]).numpy()
     taken = _colors(options)
     pictures = []
-    for step in steps_to_show(len(states) - 1, steps_per_frame):
+    for step in steps_to_show(len(states) - 1):
         walked = [(trail[: step + 1], taken[:step])] if step else []
         pictures.append(drawing.picture(states[step], [*paths, *walked]))
-    write_gif(pictures, path, milliseconds=drawing.milliseconds * steps_per_frame)
+    write_gif(pictures, path, milliseconds=drawing.milliseconds * STEPS_PER_FRAME)
 
 
-def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 1, 2, 3)) -> None:
-    """Draw mazes as text, goal "G" and walls "*", and below as they look from above.
+def plot_mazes(env: LabMazeEnv, path: str | Path) -> None:
+    """Draw four mazes as text, goal "G" and walls "*", and below as they look from above.
 
     Reference:
         Dissertation, figure 4.4.
     """
-    figure = Figure(figsize=(2.6 * len(mazes), 5.4), layout="constrained")
-    grid = figure.subplots(2, len(mazes), squeeze=False)
+    figure = Figure(figsize=(10.4, 5.4), layout="constrained")
+    grid = figure.subplots(2, 4)
     size = 108.0 / env.layout.rows
-    for maze, above, below in zip(mazes, *grid, strict=True):
+    for maze, (above, below) in enumerate(grid.T):
         rows = (" ".join(row) for row in env.layout.text[maze])  # about as wide as high
         text = "\n".join(rows).replace("P", " ").replace("A", " ")
         above.text(
@@ -343,6 +288,34 @@ def plot_mazes(env: LabMazeEnv, path: str | Path, *, mazes: Sequence[int] = (0, 
         )  # fmt: skip
         above.set_axis_off()
         LabMap(env).background(below, TensorDict({"maze_index": torch.tensor(maze)}))
+    save_figure(figure, path)
+
+
+def plot_ways(model: LandmarkModel | EffectModel, ways: Sequence[np.ndarray], path: Path) -> None:
+    """Draw where options lead, and a way for each task."""
+    places, longest = model.places.numpy()[:, :2], float("inf")
+    jumps = np.zeros(len(places), np.bool_)
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    axes = figure.add_subplot()
+    if isinstance(model, LandmarkModel):
+        starts, options = np.nonzero(model.targets.numpy() >= 0)
+        lines = places[np.stack([starts, model.targets.numpy()[starts, options]], 1)]
+        axes.add_collection(LineCollection(list(lines), colors=_PALE, linewidths=0.5, zorder=0))
+        jumps, longest = model.is_jump.numpy(), float(model.jump)
+    size = 6 if isinstance(model, LandmarkModel) else 90
+    axes.scatter(places[~jumps, 0], places[~jumps, 1], s=size, color=_GREY, zorder=1)
+    axes.scatter(places[jumps, 0], places[jumps, 1], s=90, color="black", marker="*", zorder=3)
+    for task, (way, color) in enumerate(zip(ways, COLORS, strict=False), 1):
+        way = way[:, :2]
+        broken = np.linalg.norm(np.diff(way, axis=0), axis=1) > longest
+        shown = np.insert(way, np.flatnonzero(broken) + 1, np.nan, axis=0)
+        axes.plot(*shown.T, color=color, linewidth=1.8, zorder=2)
+        axes.annotate(f"{task}", way[0], color=color, fontsize=13, fontweight="bold", zorder=4)
+        axes.scatter(way[-1, 0], way[-1, 1], s=40, color=color, marker="s", zorder=4)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x")
+    axes.set_ylabel("y")
+    axes.set_title("Number: where a task begins; square: where its episode ended", fontsize=10)
     save_figure(figure, path)
 
 

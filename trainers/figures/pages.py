@@ -111,12 +111,7 @@ def write_sections(path: str | Path, title: str, sections: Sequence[Section]) ->
 
 
 def plain(value: Any) -> str:
-    """Return a value as people read it: four digits, thousands apart.
-
-    Example:
-        >>> plain([1, 2.5, True]), plain(1234567.8)
-        ('1, 2.5, yes', '1,234,568')
-    """
+    """Return a value as people read it: four digits, thousands apart."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
     if isinstance(value, bool):

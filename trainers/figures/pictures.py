@@ -28,24 +28,7 @@ _MARKS = (
 
 
 class Pictures:
-    """The pictures of a run's page.
-
-    Args:
-        folder: of the run.
-
-    Attributes:
-        captions: of the pictures that were drawn, by file.
-
-    Example:
-        >>> from pathlib import Path
-        >>> pictures = Pictures(Path())
-        >>> with pictures.one("search.png", "The tree.") as path:
-        ...     _ = path.write_bytes(b"...")
-        >>> with pictures.one("episode.gif", "An episode.") as path:
-        ...     raise ImportError("No module named 'imageio'")  # printed on stderr
-        >>> pictures.captions
-        {'search.png': 'The tree.'}
-    """
+    """The pictures of a run's page."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -56,10 +39,6 @@ class Pictures:
         """Hand out the path of a picture; after an error in the block it is not on the page.
 
         Import what draws it in the block: a library that does not load costs the picture too.
-
-        Args:
-            name: of the file.
-            caption: on the page.
         """
         with left_out(name):
             yield self.folder / name
@@ -73,11 +52,7 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: int = 110) -> None:
 
 
 def refuse_foreign(file: str | Path) -> None:
-    """Refuse to replace a file that this package did not write.
-
-    Example:
-        >>> refuse_foreign("nothing_there.html")
-    """
+    """Refuse to replace a file that this package did not write."""
     file = Path(file)
     if file.is_dir():
         raise ValueError(f"{file} is a folder. Name a file with out=.")

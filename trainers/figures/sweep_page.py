@@ -64,19 +64,7 @@ def write_sweep_page(
 
 
 def best_words(rows: Sequence[Mapping[str, Any]], objective: str) -> str:
-    """Say which trials of a sweep were best; several that are equal are all named.
-
-    Args:
-        rows: the trials, the best first.
-        objective: by which.
-
-    Example:
-        >>> rows = [{"trial": i, "value": v, "params": {"x": i}} for i, v in ((2, 9.0), (0, 9.0))]
-        >>> print(best_words(rows, "solved"))
-        Best of 2 trials: solved = 9, reached by 2 trials:
-          trial 2: x=2
-          trial 0: x=0
-    """
+    """Say which trials of a sweep were best; several that are equal are all named."""
     best = [row for row in rows if row["value"] == rows[0]["value"]]
     values = [" ".join(f"{key}={v}" for key, v in row["params"].items()) for row in best]
     lead = f"Best of {len(rows)} trials: {objective.removeprefix('-')} = {rows[0]['value']:.6g}"

@@ -36,15 +36,6 @@ class RunConfig:
 
     Whole numbers may be NumPy's, paths may be ``Path`` objects, and a ``~`` at the start of a path
     is the home folder, once and for all.
-
-    Raises:
-        TypeError: if a value is not of its field's type.
-        ValueError: if ``seed`` is not between 0 and 2**32 - 1, a number is not finite or out of its
-            range, or ``out`` is empty.
-
-    Example:
-        >>> RunConfig(seed=3).seed
-        3
     """
 
     seed: int = 0
@@ -95,11 +86,7 @@ class RunConfig:
                 )
 
     def check_inputs(self) -> None:
-        """Check what the run needs from outside, before anything is written.
-
-        Raises:
-            ModuleNotFoundError: if the package of the logger is not installed.
-        """
+        """Check what the run needs from outside, before anything is written."""
         logger = getattr(self, "logger", "csv")
         if logger != "csv":
             need_package(logger)
@@ -136,18 +123,7 @@ def _checked(name: str, kind: str, value: Any) -> Any:
 
 
 def home(path: str) -> str:
-    """Return a path as it was typed, with a ``~`` at its start replaced by the home folder.
-
-    Args:
-        path: as typed by a user.
-
-    Raises:
-        ValueError: if the home folder is unknown.
-
-    Example:
-        >>> home("runs/~x"), home("~").startswith("~")
-        ('runs/~x', False)
-    """
+    """Return a path as it was typed, with a ``~`` at its start replaced by the home folder."""
     expanded = os.path.expanduser(path)
     if path.partition("/")[0] == "~" and expanded == path:
         raise ValueError(f"{path!r} begins with ~, but no home folder is known; type the path out.")
@@ -155,17 +131,7 @@ def home(path: str) -> str:
 
 
 def need_package(name: str) -> None:
-    """Import an optional package, so that its absence is noticed before a run begins.
-
-    Args:
-        name: of the package.
-
-    Raises:
-        ModuleNotFoundError: if it is not installed; a mere folder of this name does not count.
-
-    Example:
-        >>> need_package("json")
-    """
+    """Import an optional package, so that its absence is noticed before a run begins."""
     module = importlib.import_module(name)
     if getattr(module, "__file__", None) is None:
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
@@ -182,23 +148,6 @@ def parse_overrides(
 
     Keys of an experiment have one level; those who know Hydra may write ``env.game=Pong`` all the
     same.
-
-    Args:
-        config_class: a dataclass whose fields all have defaults.
-        overrides: words of the command line.
-        base: configuration whose values hold where no word says otherwise. Default: the defaults.
-        others: keys of the same command that belong to no configuration, to be suggested as well.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        ValueError: if a word is no ``key=value``, a key is unknown (the nearest ones are named) or
-            a value has the wrong type.
-
-    Example:
-        >>> parse_overrides(RunConfig, ["seed=1", "out=runs/one"]).out
-        'runs/one'
     """
     types = key_kinds(config_class)
     given: dict[str, Any] = {}
@@ -218,14 +167,6 @@ def parse_overrides(
 
 def read_value(key: str, value: str, kind: str) -> Any:
     """Return a value of the command line as its type; a text is taken letter by letter.
-
-    Args:
-        key: of the configuration, for messages.
-        value: as typed.
-        kind: ``"int"``, ``"float"``, ``"bool"`` or ``"str"``.
-
-    Raises:
-        ValueError: if it is not of this type.
 
     Example:
         >>> read_value("mazes", "1_000", "int"), read_value("frames", "1e6", "int")
@@ -256,32 +197,14 @@ def read_value(key: str, value: str, kind: str) -> Any:
 
 
 def unknown_key(key: str, known: Iterable[str], what: str = "key") -> str:
-    """Return the sentence that refuses a word and names the nearest ones.
-
-    Args:
-        key: what was typed.
-        known: all keys.
-        what: the words are, e.g. ``"kit"``.
-
-    Example:
-        >>> unknown_key("sede", ["seed", "out"])
-        "Unknown key 'sede'. Did you mean: seed?"
-    """
+    """Return the sentence that refuses a word and names the nearest ones."""
     known = list(known)
     near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or known
     return f"Unknown {what} {key!r}. Did you mean: {', '.join(near)}?"
 
 
 def key_kinds(config_class: type) -> dict[str, str]:
-    """Return the types of a configuration's keys: int, float, bool, str or dict.
-
-    Args:
-        config_class: a dataclass.
-
-    Example:
-        >>> key_kinds(RunConfig)["seed"]
-        'int'
-    """
+    """Return the types of a configuration's keys: int, float, bool, str or dict."""
     kinds = {field.name: field.type for field in fields(config_class)}
     return {
         name: str(getattr(kind, "__name__", kind)).partition("[")[0] for name, kind in kinds.items()
@@ -289,15 +212,7 @@ def key_kinds(config_class: type) -> dict[str, str]:
 
 
 def config_keys(config_class: type) -> dict[str, tuple[Any, str]]:
-    """Return the default of each key of a configuration, and the sentence below it.
-
-    Args:
-        config_class: a dataclass; fields of its base classes are included.
-
-    Example:
-        >>> config_keys(RunConfig)["resume"]
-        (False, 'Continue the run in `out` from its newest checkpoint.')
-    """
+    """Return the default of each key of a configuration, and the sentence below it."""
     docs: dict[str, str] = {}
     for owner in reversed(config_class.__mro__[:-1]):
         tree = ast.parse(textwrap.dedent(inspect.getsource(owner)))

@@ -19,6 +19,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from torchrl_hmcts.trainers.saving.run_folder import flat
+
 INTERVAL = 9.0  # seconds between two signs of life; looked at every second
 WIDTH = 79
 _NAME_WIDTH = 46
@@ -26,7 +28,6 @@ _NAME_WIDTH = 46
 _BAR = (
     "{desc}: {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt}{unit} [{elapsed}<{remaining}{postfix}]"
 )
-_BAR_WIDTH = 12  # at least
 _LINE = "{desc}: {percentage:.0f} % ({n_fmt} of {total_fmt}{unit}) in {elapsed}{postfix}"
 
 
@@ -39,21 +40,7 @@ class _State:
 
 
 class Bar(tqdm):
-    """A progress bar; where stderr is no terminal, a line every ten seconds.
-
-    Args:
-        total: where it ends; None: unknown.
-        desc: what is done.
-        unit: what is counted, in the plural.
-        scale: units of a step, where steps are of something else.
-
-    Example:
-        >>> bar = Bar(10, desc="learn", unit="frames", scale=4)
-        >>> bar.update(5)
-        >>> bar.n, bar.total
-        (20, 40)
-        >>> bar.close()
-    """
+    """A progress bar; where stderr is no terminal, a line every ten seconds."""
 
     def __init__(
         self, total: int | None = None, *, desc: str = "", unit: str = "steps", scale: int = 1
@@ -84,14 +71,8 @@ class Bar(tqdm):
         return super().update(moved)
 
     def set_postfix(self, *_: Any, refresh: bool = True, **figures: Any) -> None:
-        """Show the first figures beside it, as many as fit; unknown numbers are left out."""
-        room = WIDTH - _BAR_WIDTH - len(f"{self.desc}{self.unit}: 100 %|| [00:00<00:00]")
-        room -= 2 * len(str(self.total)) + 2
-        shown = {}
-        for name, value in figures.items():
-            room -= len(f", {name}={value}")
-            if _is_known(value) and room >= 0:
-                shown[name] = value
+        """Show figures beside it; unknown numbers are left out."""
+        shown = {name: value for name, value in figures.items() if _is_known(value)}
         super().set_postfix(refresh=refresh, **shown)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
@@ -113,11 +94,7 @@ class Bar(tqdm):
 
 
 def counted(desc: str, unit: str) -> Callable[[Sequence[Any]], Iterator[Any]]:
-    """Return what goes through a sequence with a bar.
-
-    Args:
-        desc, unit: as of :class:`Bar`.
-    """
+    """Return what goes through a sequence with a bar."""
 
     def through(steps: Sequence[Any]) -> Iterator[Any]:
         bar = Bar(len(steps), desc=desc, unit=unit)
@@ -143,26 +120,14 @@ def _is_known(value: Any) -> bool:
 
 
 def say(words: str, **_: Any) -> None:
-    """Print what begins now; :func:`alive` repeats it while it lasts.
-
-    Args:
-        words: a sentence.
-
-    Example:
-        >>> say("Drawing ...")
-        Drawing ...
-    """
+    """Print what begins now; :func:`alive` repeats it while it lasts."""
     _State.phase, _State.begun = words, time.monotonic()
     _State.spoken = _State.begun
     print(words, flush=True)
 
 
 def note(words: str) -> None:
-    """Print what has happened, above a bar.
-
-    Args:
-        words: a line.
-    """
+    """Print what has happened, above a bar."""
     tqdm.write(words, file=sys.stdout)
 
 
@@ -196,12 +161,7 @@ def alive() -> Iterator[None]:
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:
-    """Return names and values as lines of two columns; a number of nothing, NaN, is a dash.
-
-    Example:
-        >>> print(table([("mazes solved", "99 of 100")]))
-          mazes solved                                     99 of 100
-    """
+    """Return names and values as lines of two columns; a number of nothing, NaN, is a dash."""
     shown = [
         (name[:_NAME_WIDTH], "-" if value.startswith("nan") else value) for name, value in rows
     ]
@@ -209,30 +169,12 @@ def table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def figures_table(figures: Mapping[str, Any]) -> str:
-    """Return the numbers of nested figures as a table; of a spread its mean, median and 95 %.
-
-    Example:
-        >>> print(figures_table({"test": {"solved": 2, "starts": 3, "steps": {"median": 7.0}}}))
-          test: solved                                              2
-          test: starts                                              3
-          test: steps, median                                       7
-    """
-    return table(list(_rows(figures, "")))
-
-
-def _rows(figures: Mapping[str, Any], before: str) -> Iterator[tuple[str, str]]:
-    for name, value in figures.items():
-        words = name.replace("_", " ").replace("p95", "95 %")
-        if isinstance(value, Mapping):
-            yield from _rows(value, f"{before}{words}: ")
-        elif isinstance(value, str):
-            yield f"{before}{words}", value
-        elif isinstance(value, numbers.Real) and math.isfinite(value):
-            number = float(value)
-            exact = isinstance(value, numbers.Integral) or abs(number) >= 1e4
-            shown = f"{number:,.0f}" if exact else f"{number:,.4g}"
-            if words in ("mean", "median", "95 %"):  # of a spread
-                words = f"{before.removesuffix(': ')}, {words}"
-            else:
-                words = before + words
-            yield words, shown
+    """Return the numbers of nested figures as a table."""
+    rows = []
+    for name, value in flat(figures):
+        if isinstance(value, numbers.Real) and math.isfinite(value):
+            exact = isinstance(value, numbers.Integral) or abs(value) >= 1e4
+            value = f"{float(value):,.0f}" if exact else f"{float(value):,.4g}"
+        if isinstance(value, str):
+            rows.append((name.replace(".", ": ").replace("_", " "), value))
+    return table(rows)

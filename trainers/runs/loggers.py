@@ -27,17 +27,6 @@ class ScalarLoggers(Logger):
     """Hands every value to several loggers, and to those who observe the run.
 
     A logger that fails, e.g. on a full disk, is left out from there on, and a line says so.
-
-    Args:
-        loggers: of TorchRL; an entry that one of them does not support is left out there.
-        observers: called with name, value and step.
-
-    Example:
-        >>> seen = []
-        >>> logger = ScalarLoggers([], [lambda name, value, step: seen.append((name, value, step))])
-        >>> logger.log_scalar("entropy", 1.25, step=64)
-        >>> seen
-        [('entropy', 1.25, 64)]
     """
 
     def __init__(self, loggers: Sequence[Logger], observers: Sequence[Observer] = ()) -> None:
@@ -48,13 +37,7 @@ class ScalarLoggers(Logger):
         return None
 
     def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
-        """Log a value; what is not finite is left out.
-
-        Args:
-            name: of the value.
-            value: a number.
-            step: at which it was taken.
-        """
+        """Log a value; what is not finite is left out."""
         if not math.isfinite(value):
             return
         self._each(lambda logger: logger.log_scalar(_grouped(logger, name), float(value), step))
@@ -66,12 +49,7 @@ class ScalarLoggers(Logger):
         self._each(lambda logger: logger.log_video(name, video, step=step, **kwargs))
 
     def log_pictures(self, folder: Path, captions: Mapping[str, str]) -> None:
-        """Log the pictures and films of a run's page where that is possible.
-
-        Args:
-            folder: of the run.
-            captions: by file, PNG or GIF.
-        """
+        """Log the pictures and films of a run's page where that is possible."""
         for name, caption in captions.items():
             path = folder / name
             if path.is_file():
@@ -104,11 +82,9 @@ class ScalarLoggers(Logger):
     def _each(self, act: Callable[[Logger], None]) -> None:
         """Do something with every logger; one that fails, e.g. on a full disk, gets no more."""
         for logger in list(self.loggers):
-            failed = True
-            with left_out(f"what {type(logger).__name__} still had to log"):
+            with left_out(f"what {type(logger).__name__} still had to log") as missing:
                 act(logger)
-                failed = False
-            if failed:
+            if missing:
                 self.loggers.remove(logger)
                 with contextlib.suppress(Exception):  # what it could not write, it cannot now
                     _close(logger)
@@ -156,16 +132,7 @@ def _close(logger: Logger) -> None:
 
 
 def make_logger(config: Any) -> ScalarLoggers:
-    """Build the loggers of an experiment; files of an older run in the folder are removed.
-
-    Args:
-        config: of the experiment; ``out`` says where, ``logger`` which (CSV always),
-            ``resume`` whether what is there is continued. Weights & Biases writes to
-            ``out/wandb`` and sends nothing, unless the variable ``WANDB_MODE`` is ``online``.
-
-    Raises:
-        ModuleNotFoundError: if its package is not installed.
-    """
+    """Build the loggers of an experiment; files of an older run in the folder are removed."""
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     if not config.resume:
@@ -191,16 +158,7 @@ def make_logger(config: Any) -> ScalarLoggers:
 
 @contextlib.contextmanager
 def observed(observer: Observer) -> Iterator[None]:
-    """Tell an observer every value that experiments log in the context.
-
-    Args:
-        observer: called with name, value and step; what it raises ends the run.
-
-    Example:
-        >>> with observed(lambda name, value, step: None):
-        ...     len(_OBSERVERS.get())
-        1
-    """
+    """Tell an observer every value that experiments log in the context."""
     token = _OBSERVERS.set((*_OBSERVERS.get(), observer))
     try:
         yield

@@ -7,22 +7,22 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from itertools import count, product
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from torchrl_hmcts.trainers.figures.pictures import Pictures
 from torchrl_hmcts.trainers.runs.config import BOOL_WORDS, ExperimentError, config_keys
-from torchrl_hmcts.trainers.saving.files import left_out, remove, write_csv
+from torchrl_hmcts.trainers.saving.files import left_out, remove, write_csv, write_json
 from torchrl_hmcts.trainers.saving.locking import FolderInUse, folder_locked
 from torchrl_hmcts.trainers.saving.run_folder import (
     RunFolder,
     end_record,
-    machine,
     read_run,
     start_record,
     versions,
@@ -38,9 +38,12 @@ _PICTURES = (
     *("episode.gif", "episode.mp4", "goals.png", "learning.png", "losses.png", "mazes.png"),
     *("scores.png", "search.png", "skills.png", "solving.png", "view.png"),
 )
-_PLAYED = ("play/index.html", "play/play.gif", "play/play.mp4", "play/search.png")
 _SWEEP = ("sweep.json", "journal.log", "importances.png", "trials.png")
-_IN_CHECKPOINTS = ("checkpoint-*", "worker-*", "run.pt*", "trials.json", ".*writing-*", ".lock")
+_IN_FOLDERS = (  # other files there stay
+    *("checkpoints/checkpoint-*", "checkpoints/run.pt*", "checkpoints/trials.json"),
+    *("checkpoints/.*writing-*", "checkpoints/.lock", "worker/worker-*", "worker/.*writing-*"),
+    *("play/index.html", "play/play.*", "play/search.png", "log", "tensorboard"),
+)
 
 
 class FolderRefused(ExperimentError):
@@ -49,18 +52,7 @@ class FolderRefused(ExperimentError):
 
 @dataclass
 class Run:
-    """A run that has its folder to itself.
-
-    Args:
-        config: of the experiment, with the folder in ``out``.
-        experiment: its name.
-        resumes: whether there is a checkpoint to continue from, and it was asked for.
-
-    Example:
-        >>> from torchrl_hmcts.trainers.runs.config import RunConfig
-        >>> Run(RunConfig(out="runs/my run"), "demo").resume_command
-        "hmcts train 'resume=runs/my run'"
-    """
+    """A run that has its folder to itself."""
 
     config: Any
     experiment: str
@@ -84,12 +76,7 @@ class Run:
     def write_curves(
         self, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], steps: str
     ) -> None:
-        """Write ``curves.csv``, a value a row: name, step, value.
-
-        Args:
-            curves: steps and values by name.
-            steps: name of the column of the steps, which tells their unit, e.g. ``"base_steps"``.
-        """
+        """Write ``curves.csv``, a value a row: name, step, value."""
         rows = [
             (name, int(step), value)
             for name, (x, y) in curves.items()
@@ -104,23 +91,26 @@ class Run:
     ) -> Iterator[Pictures]:
         """Write ``metrics.json``, note that the run is finished, then pictures and the page.
 
-        What cannot be drawn or written is left out, with a line on stderr.
-
-        Args:
-            metrics: its figures; the configuration and the versions are added to them.
-            config: as it was run. Default: that of the run.
-            title: heading of the page.
-
-        Yields:
-            The pictures to draw.
+        What cannot be drawn or written is left out, with a line on stderr; figures that cannot be
+        written, e.g. to a full disk, are printed. ``config`` is what was run, if not that of the
+        run.
         """
-        from torchrl_hmcts.trainers.figures.run_page import finish
-
         metrics.setdefault("config", dataclasses.asdict(self.config if config is None else config))
         metrics.setdefault("versions", versions())
-        with finish(self.path, title, metrics, config_keys(type(self.config))) as pictures:
+        with left_out("metrics.json") as missing:
+            write_json(self.path / "metrics.json", metrics)
+        if missing:
+            print(json.dumps(metrics, indent=1, default=str))
+        pictures = Pictures(self.path)
+        with left_out("what was still to be drawn"):
             end_record(self.path, "finished")
             yield pictures
+        with left_out("index.html"):
+            from torchrl_hmcts.trainers.figures.run_page import write_page
+
+            file, keys = self.path / "index.html", config_keys(type(self.config))
+            write_page(file, title=title, metrics=metrics, pictures=pictures.captions, keys=keys)
+            print(f"Pictures and figures: {file}")
 
 
 _current: ContextVar[Run | None] = ContextVar("run", default=None)
@@ -136,19 +126,6 @@ def open_run(
     missing, a folder in use, one that holds a run (unless ``config`` says ``resume`` or
     ``overwrite``), a run with other settings to resume. A run that is open already, with this very
     configuration, stays the same run: the command line opens it for the function of an experiment.
-
-    Args:
-        config: of the experiment; ``out`` is the folder.
-        experiment: its name. Default: that of the configuration's class.
-        command: words of the command line, for the record.
-        fresh: take the first of ``out``, ``out_2``, ``out_3``, ... that holds nothing.
-
-    Raises:
-        FolderRefused: if the folder holds what would be lost, or nothing to resume.
-        FolderInUse: if another process writes to it.
-        ModuleNotFoundError: if a package is missing.
-        ExperimentError: if an input is missing.
-        OSError: if the folder cannot be made or written to.
     """
     outer = _current.get()
     if outer is not None and outer.config is config:
@@ -161,7 +138,7 @@ def open_run(
         run = Run(config, name, config.resume and _has_checkpoint(config.out))
         if config.overwrite:
             _clear(run.path)
-        start_record(name, config, command, {"versions": versions(), "machine": machine()})
+        start_record(name, config, command)
         token = _current.set(run)
         stack.callback(_current.reset, token)
         stack.enter_context(signals_handled())
@@ -206,18 +183,11 @@ def _take(stack: contextlib.ExitStack, config: Any, experiment: str, fresh: bool
 
 
 def free_folder(config: Any, experiment: str) -> str:
-    """Return the first of ``out``, ``out_2``, ... in which a run loses nothing.
-
-    Args:
-        config: of the run.
-        experiment: its name.
-    """
+    """Return the first of ``out``, ``out_2``, ... in which a run loses nothing."""
     for out in _names(config.out):
-        try:
+        with contextlib.suppress(FolderRefused):
             check_folder(dataclasses.replace(config, out=out), experiment)
-        except FolderRefused:
-            continue
-        return out
+            return out
     raise AssertionError("names never end")
 
 
@@ -227,26 +197,13 @@ def _names(base: str) -> Iterator[str]:
 
 
 def next_free(out: str) -> str:
-    """Return the first of ``out``, ``out_2``, ``out_3``, ... that does not exist or is empty.
-
-    Args:
-        out: folder.
-
-    Example:
-        >>> next_free("runs/none_there")
-        'runs/none_there'
-    """
+    """Return the first of ``out``, ``out_2``, ``out_3``, ... that does not exist or is empty."""
     paths = map(Path, _names(out))
     return str(next(p for p in paths if not (p.is_file() or (p.is_dir() and any(p.iterdir())))))
 
 
 def check_folder(config: Any, experiment: str) -> None:
-    """Refuse a folder in which a run of this configuration would lose or mix up something.
-
-    Args:
-        config: of the run; its folder is ``out``.
-        experiment: its name.
-    """
+    """Refuse a folder in which a run of this configuration would lose or mix up something."""
     path = Path(config.out)
     if path.exists() and not path.is_dir():
         raise FolderRefused(
@@ -318,15 +275,7 @@ def _check_resumable(config: Any, experiment: str) -> None:
 
 
 def run_files(path: Path) -> list[str]:
-    """Return the names in a folder that a run or a sweep would write.
-
-    Args:
-        path: folder; need not exist.
-
-    Example:
-        >>> run_files(Path("nowhere"))
-        []
-    """
+    """Return the names in a folder that a run or a sweep would write."""
     if not path.is_dir():
         return []
     names = sorted(entry.name for entry in path.iterdir())
@@ -347,23 +296,14 @@ def _clear(path: Path) -> None:
         run = read_run(path)
     pictures = {name for name in run.pictures if Path(name).name == name}
     videos = {str(Path(name).with_suffix(".mp4")) for name in pictures if name.endswith(".gif")}
-    for name in {*_RECORDS, *_PICTURES, *pictures, *videos, *_PLAYED, "log", "tensorboard"}:
+    for name in {*_RECORDS, *_PICTURES, *pictures, *videos}:
         remove(path / name)
-    for folder, pattern in product(("checkpoints", "worker"), _IN_CHECKPOINTS):
-        for entry in (path / folder).glob(pattern):
-            remove(entry)
+    for entry in [entry for pattern in _IN_FOLDERS for entry in path.glob(pattern)]:
+        remove(entry)
 
 
 def resume_command(out: str | Path) -> str:
-    """Return the command that continues a run exactly, as it can be pasted into a shell.
-
-    Args:
-        out: folder of the run.
-
-    Example:
-        >>> resume_command("runs/one"), resume_command("true")
-        ('hmcts train resume=runs/one', 'hmcts train resume=./true')
-    """
+    """Return the command that continues a run exactly, as it can be pasted into a shell."""
     folder = str(out)
     return shlex.join(["hmcts", "train", f"resume={'./' * (folder.lower() in BOOL_WORDS)}{folder}"])
 

@@ -6,7 +6,10 @@ import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,25 +19,25 @@ import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution
 from optuna.distributions import FloatDistribution as Float
 from optuna.distributions import IntDistribution as Int
-from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages import BaseStorage, JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError
-from sqlalchemy.pool import NullPool  # Optuna depends on it
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError, OperationalError  # Optuna's
 
 from torchrl_hmcts.trainers.runs.config import (
     RunConfig,
-    home,
     key_kinds,
     parse_overrides,
     read_value,
 )
-from torchrl_hmcts.trainers.runs.journal import CheckedJournal
 from torchrl_hmcts.trainers.runs.loggers import observed
 from torchrl_hmcts.trainers.runs.run import next_free, open_run, run_files
-from torchrl_hmcts.trainers.saving.run_folder import read_run
+from torchrl_hmcts.trainers.saving.files import digest
+from torchrl_hmcts.trainers.saving.run_folder import flat, read_run
 
 Space = dict[str, BaseDistribution]
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+_CHECKSUM = "checksum"
 _SPACE = "space"  # attribute of a study
 _NOT_FIXED = ("out", "resume", "overwrite", "logger")  # may differ from one call to the next
 
@@ -46,24 +49,7 @@ class Pruned(optuna.TrialPruned):
 
 
 def parse_space(config_class: type, words: Sequence[str]) -> tuple[Space, list[str]]:
-    """Take the keys that are varied out of the words of a sweep.
-
-    Args:
-        config_class: of the experiment.
-        words: ``key=[a,b]``, ``key=low..high``, ``key=low..high:log``, ``key=low..high:step``, or
-            ``key=value``, which is the same in all trials.
-
-    Returns:
-        What is varied, as Optuna's distributions, and the words of the rest.
-
-    Raises:
-        ValueError: if a key is given twice, or its values are not of its type.
-
-    Example:
-        >>> space, fixed = parse_space(RunConfig, ["seed=[3,4]", "out=x"])
-        >>> space["seed"].choices, fixed
-        ((3, 4), ['out=x'])
-    """
+    """Take the keys that are varied out of the words of a sweep."""
     types = key_kinds(config_class)
     space: Space = {}
     fixed = []
@@ -99,39 +85,66 @@ def _range(key: str, value: str, kind: str) -> Int | Float:
             f"{key}={value} is no range of {kinds}, e.g. {key}=1..10, {key}=1..10:log or "
             f"{key}=1..10:2 (in steps of 2)."
         ) from None
-    if not (math.isfinite(low) and math.isfinite(high)):
-        raise ValueError(f"{key}={value} needs two finite ends.")
-    if not low < high:
-        raise ValueError(f"{key}={value} is an empty range.")
-    if how == "log" and not low > 0:
-        raise ValueError(f"{key}={value} needs a lower end above 0.")
-    if step is not None and not 0 < step <= high - low:
-        raise ValueError(f"{key}={value} cannot be walked in steps of {step}.")
+    if not (low < high and math.isfinite(high - low)) or (step is not None and step > high - low):
+        raise ValueError(f"{key}={value} leaves nothing to choose.")
     if key == "seed":
         RunConfig(seed=low), RunConfig(seed=high)  # raise
-    if kind == "int":
-        return Int(low, high, log=how == "log", step=step or 1)
-    return Float(low, high, log=how == "log", step=step)
+    try:
+        if kind == "int":
+            return Int(low, high, log=how == "log", step=1 if step is None else step)
+        return Float(low, high, log=how == "log", step=step)
+    except ValueError as error:  # of Optuna, e.g. a logarithm of 0
+        raise ValueError(f"{key}={value}: {error}") from None
+
+
+class CheckedJournal(JournalFileBackend):
+    """Optuna's journal file, from which a sweep continues, checked when it is opened.
+
+    A last line that is not whole is cut off, and a line on stderr says so; the journal as it was is
+    kept as ``journal.log.damaged``. Any other damage is refused.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__(str(path))
+        self._lock.acquire()
+        try:
+            _check(Path(path))
+        finally:
+            self._lock.release()
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        super().append_logs([{**log, _CHECKSUM: digest(log)} for log in logs])
+
+    def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:  # type: ignore[override]
+        for log in super().read_logs(log_number_from):
+            log.pop(_CHECKSUM, None)
+            yield log
+
+
+def _check(path: Path) -> None:
+    lines = path.read_bytes().splitlines(keepends=True)
+    for number, line in enumerate(lines, 1):
+        try:
+            log = json.loads(line)
+            if line.endswith(b"\n") and log.pop(_CHECKSUM, None) in (None, digest(log)):
+                continue
+            reason = "differs from its checksum"
+        except (ValueError, AttributeError, RecursionError) as error:
+            reason = f"cannot be read: {error}"
+        if number < len(lines):
+            raise ValueError(
+                f"{path} is damaged: line {number} {reason}. Restore it from a backup, or choose "
+                "another folder with out=DIR."
+            )
+        kept = Path(shutil.copy2(path, f"{path}.damaged"))
+        words = f"its last line is not whole and is left out; as it was: {kept.name}"
+        print(f"{path}: {words}.", file=sys.stderr)
+        os.truncate(path, sum(map(len, lines[:-1])))
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep: which experiment, what varies, what is improved, where it is kept.
-
-    Args:
-        name: of the experiment.
-        run: runs it with a configuration, and returns its figures.
-        config: values of the keys that do not vary; ``out`` is the folder of the sweep.
-        space: what varies.
-        objective: figure of ``metrics.json``, nested names joined by dots; with a minus before
-            it, less is better.
-        progress: logged value by which trials are given up. Default: none are.
-        storage: URL of an Optuna storage that several machines may share. Default: a journal file
-            in the folder.
-
-    Raises:
-        ValueError: if nothing varies.
-    """
+    """A sweep: which experiment, what varies, what is improved, where it is kept."""
 
     name: str
     run: Callable[[Any], Mapping[str, Any]]
@@ -153,12 +166,7 @@ class Sweep:
         return Path(self.config.out)
 
     def study(self) -> optuna.Study:
-        """Return the study, with the trials so far.
-
-        Raises:
-            ValueError: if the storage has a sweep of another space or objective under this name, or
-                the folder holds something else.
-        """
+        """Return the study, with the trials so far."""
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"out={self.folder} is a file; name a folder.")
         there = run_files(self.folder)
@@ -171,8 +179,6 @@ class Sweep:
         study = self._open()
         described = json.loads(json.dumps(self._description()))
         before = study.user_attrs.get(_SPACE, {})
-        if not isinstance(before.get(_SPACE, {}), dict):  # of an older version: another form
-            before = {key: value for key, value in before.items() if key != _SPACE}
         differing = [key for key in before if before[key] != described.get(key)]
         if differing:
             raise ValueError(
@@ -204,12 +210,7 @@ class Sweep:
     def _storage(self) -> BaseStorage:
         if self.storage is None:
             return JournalStorage(CheckedJournal(self.folder / "journal.log"))
-        if self.storage.startswith("redis"):
-            return optuna.storages.get_storage(self.storage)
-        scheme, slashes, place = self.storage.partition(":///")
-        url = f"{scheme}{slashes}{home(place)}"
-        # No pool: its connections would stay open until they are collected.
-        return RDBStorage(url, engine_kwargs={"poolclass": NullPool})
+        return optuna.storages.get_storage(self.storage)
 
     def _study_name(self, storage: BaseStorage) -> str:
         """The folder may have been renamed since its study was named after it."""
@@ -227,10 +228,6 @@ class Sweep:
         """Run trials until so many are finished, those of earlier calls included.
 
         A trial that was stopped, or whose process died, is continued first.
-
-        Args:
-            trials: finished ones in all.
-            ended: called after each trial.
         """
         study = self.study()
         self._take_up(study)
@@ -310,20 +307,12 @@ def _suggest(trial: optuna.Trial, key: str, space: BaseDistribution) -> Any:
 
 
 def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
-    """Return a figure of a run by name; not a number counts as the worst there is.
-
-    Args:
-        metrics: of the run.
-        objective: name, nested ones joined by dots, perhaps with a minus before it.
-
-    Raises:
-        ValueError: if there is none of that name.
-
-    Example:
-        >>> figure_of({"test": {"frames": {"mean": 261.0}}}, "-test.frames.mean")
-        261.0
-    """
-    numbers = dict(_numbers(metrics))
+    """Return a figure of a run by name; not a number counts as the worst there is."""
+    numbers = {
+        name: float(value)
+        for name, value in flat(metrics)
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
     value = numbers.get(objective.removeprefix("-"))
     if value is None:
         raise ValueError(
@@ -333,22 +322,8 @@ def figure_of(metrics: Mapping[str, Any], objective: str) -> float:
     return value if math.isfinite(value) else worst
 
 
-def _numbers(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, float]]:
-    rows: list[tuple[str, float]] = []
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            rows += _numbers(value, f"{prefix}{name}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            rows.append((prefix + name, float(value)))
-    return rows
-
-
 def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
-    """Return the trials of a study as plain values, the best first.
-
-    Args:
-        study: of a sweep.
-    """
+    """Return the trials of a study as plain values, the best first."""
     sign = -1.0 if study.direction == optuna.study.StudyDirection.MAXIMIZE else 1.0
     states = {TrialState.PRUNED: "given up", TrialState.RUNNING: "running or interrupted"}
     rows = []
@@ -371,9 +346,6 @@ def trial_rows(study: optuna.Study) -> list[dict[str, Any]]:
 
 def importances(study: optuna.Study) -> dict[str, float]:
     """Return how much of what sets the best trials apart lies in each key; they sum to 1.
-
-    Args:
-        study: of a sweep; empty with fewer than four trials, or if all gave the same.
 
     Reference:
         Watanabe et al., "PED-ANOVA", 2023, arXiv 2304.10255.

@@ -1,22 +1,20 @@
 """Checkpoints that a crash, a full disk or a damaged file cannot turn into a lost run.
 
-TorchRL's ``Checkpoint`` decides what is saved; here is how it reaches the disk. A checkpoint is one
-file: it is written under another name, sealed with a digest, flushed to the disk, and only then
-given its name. A file with that name is whole, whenever the process was killed; a digest that
-differs tells damage, and the newest whole checkpoint is taken. Inside are JSON and plain arrays:
-nothing in a checkpoint can be executed.
+TorchRL's ``Checkpoint`` decides what is saved. A checkpoint is one file of JSON and plain arrays,
+written under another name, sealed with a digest of all its bytes, and only then given its name.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
+import hashlib
 import json
 import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Collection, Mapping
+import zipfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,6 @@ import torch
 from torchrl.checkpoint import (
     Checkpoint,
     CheckpointError,
-    CheckpointOptions,
     CheckpointRotation,
     StateDictCheckpointAdapter,
 )
@@ -32,27 +29,18 @@ from torchrl.checkpoint._checkpoint import _encode_state_dict_value  # its forma
 
 from torchrl_hmcts import __version__
 from torchrl_hmcts.trainers.saving.files import remove, remove_leftovers, replacing
-from torchrl_hmcts.trainers.saving.sealing import (
-    CHECKPOINT_VERSION,
-    NewerCheckpointError,
-    check_lengths,
-    check_settings,
-    find_damage,
-    read_manifest,
-    seal,
-)
+from torchrl_hmcts.trainers.saving.locking import folder_locked
+from torchrl_hmcts.trainers.saving.stopping import patient
 
-__all__ = [
-    "DurableRotation",
-    "PlainStateAdapter",
-    "check_settings",
-    "find_damage",
-    "newest_checkpoint",
-    "plain_checkpoint",
-    "read_state",
-]
-
+CHECKPOINT_VERSION = 1
+"""Of what this package puts into a checkpoint; it rises when old ones no longer load."""
 _PREFIX = "checkpoint"
+_SEAL = b"torchrl_hmcts sha256 "  # before the digest, both in the comment of the zip file
+_HEX = 64  # digits of the digest
+
+
+class NewerCheckpointError(CheckpointError):
+    """A checkpoint is whole, but of a version that this one does not read."""
 
 
 class PlainStateAdapter(StateDictCheckpointAdapter):
@@ -61,9 +49,6 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
     TorchRL writes through memory maps. When the disk is full, that kills the process by SIGBUS;
     an ordinary write raises ``OSError``. Its reader would also unpickle a file that somebody put
     into the folder; this one takes JSON and arrays, nothing else.
-
-    Raises:
-        CheckpointError: on loading, if there is a file of another kind.
     """
 
     def save(
@@ -97,7 +82,6 @@ class PlainStateAdapter(StateDictCheckpointAdapter):
                     f"the checkpoint holds {file.name!r}, and only JSON and plain arrays are "
                     "read: other files could execute code. It was not written by this package."
                 )
-        check_lengths(path / self.state_directory)
         super().load(component, path, map_location=map_location, **options)
 
 
@@ -107,12 +91,10 @@ class _PlainCheckpoint(Checkpoint):
     def save(
         self, path: str | Path, *, metadata: Mapping[str, Any] | None = None, **kwargs: Any
     ) -> Path:
-        if (kwargs.pop("format", None) or self.format) != "archive":
-            return super().save(path, metadata=metadata, format="directory", **kwargs)
         return _write(self, Path(path).expanduser(), metadata or {}, **kwargs)
 
     def load(self, path: str | Path, **kwargs: Any) -> Any:
-        _check_whole(Path(path).expanduser())
+        newest_checkpoint(Path(path).expanduser())  # whole
         return super().load(path, **kwargs)
 
 
@@ -136,15 +118,7 @@ def plain_checkpoint(**components: Any) -> Checkpoint:
 
 
 def read_state(path: str | Path, name: str) -> Any:
-    """Return the saved state of a component, without building the component.
-
-    Args:
-        path (path): of a checkpoint.
-        name (str): of the component.
-
-    Raises:
-        CheckpointError: if the checkpoint is damaged, or has no such component.
-    """
+    """Return the saved state of a component, without building the component."""
     held = _Held()
     plain_checkpoint(**{name: held}).load(path, map_location="cpu")
     return held.state
@@ -208,6 +182,13 @@ class DurableRotation(CheckpointRotation):
         """Note that the run continues from a checkpoint, perhaps one of those in this folder."""
         self._began = self._began or path.resolve().parent == self.directory.resolve()
 
+    @contextlib.contextmanager
+    def taken(self) -> Iterator[None]:
+        """Keep others from writing to the folder; the first signal only asks for the end."""
+        self.begin()
+        with folder_locked(self.directory), patient():
+            yield
+
     def begin(self) -> None:
         """Refuse the checkpoints of another run, before the first of this one is written.
 
@@ -230,34 +211,37 @@ class DurableRotation(CheckpointRotation):
         *,
         step: int,
         metadata: Mapping[str, Any] | None = None,
-        components: Collection[str] | None = None,
-        component_options: Mapping[str, CheckpointOptions] | None = None,
+        **chosen: Any,
     ) -> Path:
         """Write a checkpoint; its name exists only once it is whole and on the disk.
 
-        Raises:
-            OSError: if it cannot be written, e.g. to a full disk. What was there is still there.
+        Those of later steps are removed then: the run has continued from an older one.
         """
         final = self.directory / f"{_PREFIX}-{step:012d}.torchrl"
-        serial = 1 + max((number for number, _ in _ordered(self.directory)), default=0)
-        ours = {"settings": self.settings, "serial": serial}
-        chosen = {"components": components, "component_options": component_options}
+        noted = {**(metadata or {}), "torchrl_hmcts": {"settings": self.settings}}
         try:
-            _write(checkpoint, final, {**(metadata or {}), "torchrl_hmcts": ours}, **chosen)
+            _write(checkpoint, final, noted, **chosen)
         except OSError as error:
-            raise OSError(error.errno, self._not_written(step, error)) from error
-        for path in set(self._others) - {final}:
-            remove(path)
+            free = "unknown"
+            with contextlib.suppress(OSError):
+                free = f"{shutil.disk_usage(self.directory).free / 2**20:,.1f} MiB"
+            kept = ", ".join(path.name for path in self.checkpoints()) or "none"
+            raise OSError(
+                error.errno,
+                f"the checkpoint of step {step} could not be written to {str(self.directory)!r} "
+                f"({error.strerror or error}; {free} free). Kept: {kept}. Make room there, load "
+                "the newest and continue; or choose another folder for checkpoints",
+            ) from error
+        for path in {*self._others, *(p for p in self.checkpoints() if p.name > final.name)}:
+            if path != final:
+                remove(path)
         self._others = ()
         self.prune()
         return final
 
     def checkpoints(self) -> tuple[Path, ...]:
-        """Return all checkpoints, damaged ones too, in the order in which they were written.
-
-        Each has a number one above those that it found. No clock is read: it may be set back.
-        """
-        return tuple(path for _, path in _ordered(self.directory))
+        """Return all checkpoints, damaged ones too, in the order of their steps."""
+        return _ordered(self.directory)
 
     def latest(self) -> Path | None:
         """Return the newest checkpoint that is whole; a line on stderr names damaged ones."""
@@ -270,44 +254,111 @@ class DurableRotation(CheckpointRotation):
             if whole == self.keep_last:
                 remove(path)
                 removed.append(path)
-            else:
-                whole += _is_good(path, _identity(path))
+                continue
+            with contextlib.suppress(NewerCheckpointError):  # not ours to judge, nor to remove
+                whole += find_damage(path) is None
         return tuple(removed)
-
-    def _not_written(self, step: int, error: OSError) -> str:
-        kept = [path.name for path in self.checkpoints()]
-        free = "unknown"
-        with contextlib.suppress(OSError):
-            free = f"{shutil.disk_usage(self.directory).free / 2**20:,.1f} MiB"
-        return (
-            f"the checkpoint of step {step} could not be written to {str(self.directory)!r} "
-            f"({error.strerror or error}; {free} free). Kept: {', '.join(kept) or 'none'}. Make "
-            "room there, load the newest and continue; or choose another folder for checkpoints"
-        )
 
 
 def newest_checkpoint(path: str | Path) -> Path:
-    """Return the checkpoint that a path names.
+    """Return a checkpoint if it is whole, or the newest whole one in a folder, which is only read.
 
-    Args:
-        path (path): a checkpoint, or a folder of checkpoints, which may be read-only, of which the
-            newest whole one is taken; a line on stderr names damaged ones.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        CheckpointError: if none is whole, or a newer version wrote it.
+    A line on stderr names damaged ones.
     """
     path = Path(path)
-    if path.is_file() or (path / "manifest.json").exists():
-        _check_whole(path)
-        return path
-    found = _newest_whole(path)
-    if found is None:
+    found = _newest_whole(path) if path.is_dir() else path
+    if found is None or not found.exists():
         raise FileNotFoundError(
             f"There is no checkpoint in {str(path)!r}. Pass the save_dir of the run to continue, "
             "or one of the checkpoints in it."
         )
+    damage = None if path.is_dir() else find_damage(found)
+    if damage is not None:
+        raise CheckpointError(
+            f"The checkpoint {str(path)!r} is damaged ({damage}). Pass its folder to continue from "
+            "the newest one that is whole."
+        )
     return found
+
+
+def find_damage(path: str | Path) -> str | None:
+    """Return what is damaged in a checkpoint, or ``None`` if it is whole.
+
+    Those that older versions wrote have no seal; in them, each file has a checksum of its own.
+    """
+    path = Path(path)
+    if not zipfile.is_zipfile(path):
+        return "it is cut off, or no checkpoint"
+    content = memoryview(path.read_bytes())
+    sealed = bytes(content[:-_HEX][-len(_SEAL) :]) == _SEAL
+    if sealed and hashlib.sha256(content[:-_HEX]).hexdigest().encode() != content[-_HEX:]:
+        return "it differs from its checksum"
+    try:
+        ours = read_manifest(path)
+        if ours.get("sealed") and not sealed:
+            return "its checksum is damaged"
+        with zipfile.ZipFile(path) as archive:
+            bad = None if sealed else archive.testzip()
+            twice = len(set(archive.namelist())) < len(archive.namelist())
+    except NewerCheckpointError:
+        raise
+    except CheckpointError as error:
+        return str(error).rstrip(".")
+    except Exception as error:  # damage takes any form
+        return f"{type(error).__name__}: {error}"
+    return "it has a file twice" if twice else bad and f"{bad} differs from its checksum"
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Return what this package has noted in a checkpoint."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
+                raise CheckpointError("it would unpack to more than its size")
+        ours = dict(Checkpoint.manifest(path).get("metadata", {}).get("torchrl_hmcts", {}))
+        version = int(ours.get("checkpoint_version", 0))
+        ours["settings"] = dict(ours.get("settings", {}))
+    except CheckpointError as error:
+        newer = re.match("Unsupported (newer|older)", str(error))
+        raise NewerCheckpointError(str(error)) if newer else error from None
+    except Exception as error:  # damage takes any form
+        raise CheckpointError(
+            f"The manifest of {str(path)!r} is damaged ({type(error).__name__}: {error})."
+        ) from error
+    if version > CHECKPOINT_VERSION:
+        raise NewerCheckpointError(
+            f"The checkpoint {str(path)!r} was written by torchrl_hmcts {ours.get('version')}, "
+            f"whose checkpoints have version {version}; {__version__} reads versions up to "
+            f"{CHECKPOINT_VERSION}. Install the newer one to continue with it."
+        )
+    return ours
+
+
+def to_continue(
+    path: str | Path, settings: Mapping[str, Any], rotation: DurableRotation | None
+) -> Path:
+    """Return the checkpoint that a run of these settings continues from, and note it."""
+    found = newest_checkpoint(path)
+    check_settings(found, settings)
+    if rotation is not None:
+        rotation.continue_from(found)
+    return found
+
+
+def check_settings(path: str | Path, settings: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint of a run with other settings; names that one lacks are skipped."""
+    other = read_manifest(Path(path))["settings"]
+    here = json.loads(json.dumps(dict(settings)))
+    differing = [
+        f"{name} was {other[name]!r} and is {value!r} here"
+        for name, value in here.items()
+        if name in other and other[name] != value
+    ]
+    if differing:
+        raise CheckpointError(
+            f"The checkpoint {str(path)!r} is of a run with other settings: "
+            f"{'; '.join(differing)}. Build it as it was, or choose another folder to start again."
+        )
 
 
 def _write(checkpoint: Checkpoint, path: Path, metadata: Mapping[str, Any], **kwargs: Any) -> Path:
@@ -319,29 +370,19 @@ def _write(checkpoint: Checkpoint, path: Path, metadata: Mapping[str, Any], **kw
     with replacing(path) as temporary:
         content = {**metadata, "torchrl_hmcts": ours}
         Checkpoint.save(checkpoint, temporary, format="archive", metadata=content, **kwargs)
-        seal(temporary)
+        bare = temporary.read_bytes()[:-2]  # then the comment's length: there is none yet
+        sealed = bare + (len(_SEAL) + _HEX).to_bytes(2, "little") + _SEAL
+        temporary.write_bytes(sealed + hashlib.sha256(sealed).hexdigest().encode())
     return path
 
 
-def _ordered(directory: Path) -> list[tuple[int, Path]]:
-    """Number and path of each checkpoint; one that cannot be read has that of the step before."""
-    name = re.compile(rf"{_PREFIX}-(\d+)(\.torchrl)?")
-    steps = {
-        path: int(match[1])
-        for path in (directory.iterdir() if directory.is_dir() else ())
-        if (match := name.fullmatch(path.name))
-    }
-    found, before = [], 0
-    for path in sorted(steps, key=lambda path: (steps[path], path.name)):
-        with contextlib.suppress(CheckpointError):
-            before = read_manifest(path)["metadata"]["torchrl_hmcts"].get("serial", 0)
-        found.append((before, path))
-    return sorted(found, key=lambda entry: entry[0])  # stable: by step where numbers are equal
+def _ordered(directory: Path) -> tuple[Path, ...]:
+    return tuple(sorted(directory.glob(f"{_PREFIX}-*.torchrl")))
 
 
 def _newest_whole(directory: Path) -> Path | None:
     damaged: list[str] = []
-    for _, path in reversed(_ordered(directory)):
+    for path in reversed(_ordered(directory)):
         damage = find_damage(path)
         if damage is None:
             if damaged:
@@ -354,26 +395,3 @@ def _newest_whole(directory: Path) -> Path | None:
             "another folder, or restore one from a backup."
         )
     return None
-
-
-def _check_whole(path: Path) -> None:
-    damage = find_damage(path)
-    if damage is not None:
-        raise CheckpointError(
-            f"The checkpoint {str(path)!r} is damaged ({damage}). Pass its folder to continue from "
-            "the newest one that is whole."
-        )
-
-
-@functools.lru_cache(maxsize=64)
-def _is_good(path: Path, identity: tuple[int, ...]) -> bool:
-    try:
-        return find_damage(path) is None
-    except NewerCheckpointError:  # not ours to judge, and not to remove
-        return False
-
-
-def _identity(path: Path) -> tuple[int, ...]:
-    """Tells a file from the one that takes its place; times are compared for equality only."""
-    status = path.stat()
-    return status.st_ino, status.st_size, status.st_mtime_ns

@@ -1,8 +1,4 @@
-"""Files that are written in one move, and files that a run can do without.
-
-Whoever reads a file finds the old content or the new one, never half of it. A picture that cannot
-be drawn or written is left out, with a line on stderr; the run continues.
-"""
+"""Files that are written in one move, and files that a run can do without."""
 
 from __future__ import annotations
 
@@ -25,24 +21,7 @@ _CHECKSUM = "checksum"
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Hand out a path to write to; the file there takes its place in one move at the end.
-
-    Args:
-        path (path): of the file that is written, or written again.
-
-    Yields:
-        Path: in the same folder, with the same ending. After an error it is removed, and the old
-        file is as it was.
-
-    Raises:
-        OSError: if the file cannot be written, e.g. to a full disk.
-
-    Example:
-        >>> with replacing("numbers.txt") as temporary:
-        ...     _ = temporary.write_text("1 2 3", encoding="utf-8")
-        >>> temporary.exists(), Path("numbers.txt").exists()
-        (False, True)
-    """
+    """Hand out a path to write to; the file there takes its place in one move at the end."""
     path = Path(path)
     remove_leftovers(path.parent, path.name)
     temporary = path.with_name(f".writing-{os.getpid()}.{path.name}")
@@ -65,19 +44,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_json(path: str | Path, content: Any, *, checksum: bool = False) -> None:
-    """Write numbers and texts as JSON in one move; a number that is not finite becomes null.
-
-    Args:
-        path (path): file.
-        content: dicts, lists, texts and numbers.
-        checksum (bool): add the entry ``"checksum"`` to a dict, so that :func:`read_json` notices
-            damage. Default ``False``.
-
-    Example:
-        >>> write_json("trials.json", {"seed": 1, "frames": float("nan")}, checksum=True)
-        >>> read_json("trials.json")
-        {'seed': 1, 'frames': None}
-    """
+    """Write numbers and texts as JSON in one move; a number that is not finite becomes null."""
     content = finite(content)
     if checksum:
         content = {**content, _CHECKSUM: digest(content)}
@@ -85,14 +52,7 @@ def write_json(path: str | Path, content: Any, *, checksum: bool = False) -> Non
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
-    """Return the content of a JSON file that holds a dict; its checksum is compared, if it has one.
-
-    Args:
-        path (path): file.
-
-    Raises:
-        ValueError: if it is cut off, no JSON, no dict, or differs from its checksum.
-    """
+    """Return the content of a JSON file that holds a dict, once its checksum is compared."""
     try:
         content = json.loads(Path(path).read_bytes().decode("utf-8"))
     except (ValueError, RecursionError) as error:
@@ -105,12 +65,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 
 def digest(content: Any) -> str:
-    """Return the SHA-256 of numbers and texts as they come back from JSON, in any layout.
-
-    Example:
-        >>> digest({"a": 1, "b": (2,)}) == digest({"b": [2], "a": 1})
-        True
-    """
+    """Return the SHA-256 of numbers and texts as they come back from JSON, in any layout."""
     plain = json.loads(json.dumps(content))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
@@ -123,19 +78,16 @@ def write_csv(path: str | Path, head: Sequence[str], rows: Iterable[Sequence[Any
 
 
 @contextlib.contextmanager
-def left_out(name: str) -> Iterator[None]:
+def left_out(name: str) -> Iterator[list[str]]:
     """Continue after an error in the block, without the file it was to write; a line says so.
 
-    Args:
-        name (str): of the picture, video or page.
-
-    Example:
-        >>> with left_out("episode.mp4"):  # stderr: Left out episode.mp4: no ffmpeg
-        ...     raise RuntimeError("no ffmpeg")
+    The list that is yielded has the name then.
     """
+    missing: list[str] = []
     try:
-        yield
+        yield missing
     except Exception as error:
+        missing.append(name)
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         with contextlib.suppress(OSError):  # of a stderr on the same full disk
             print(f"Left out {name}: {reason}", file=sys.stderr, flush=True)
@@ -150,12 +102,7 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path, name: str = "") -> None:
-    """Remove what processes that were killed while writing have left.
-
-    Args:
-        folder (path): to look into.
-        name (str): of the file that was being written. Default: every one.
-    """
+    """Remove what processes that were killed while writing have left."""
     for path in folder.glob(".*writing-*"):
         process = int((re.findall(r"writing-(\d+)", path.name) or [0])[-1])
         if name in path.name and (process == os.getpid() or not _is_running(process)):
@@ -164,12 +111,7 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
 
 
 def finite(content: Any) -> Any:
-    """Return content with None in place of a number that is not finite: JSON has no other.
-
-    Example:
-        >>> finite({"frames": [float("inf"), 2]})
-        {'frames': [None, 2]}
-    """
+    """Return content with None in place of a number that is not finite: JSON has no other."""
     if isinstance(content, Mapping):
         return {key: finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):

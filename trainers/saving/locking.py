@@ -46,19 +46,6 @@ def folder_locked(
 
     The lock is the operating system's (``flock``): it vanishes with the process, however that ends,
     and children do not inherit it. Where a file system has no such locks, a line on stderr says so.
-
-    Args:
-        folder: that exists.
-        name: of the lock's file.
-        wait: wait for the other's end instead of refusing; for what takes a moment.
-
-    Raises:
-        FolderInUse: if another holds it.
-
-    Example:
-        >>> with folder_locked("."):
-        ...     is_locked(".")
-        True
     """
     path = Path(folder, name)
     handle = _take(path, wait)
@@ -75,21 +62,15 @@ def folder_locked(
 
 def is_locked(folder: str | Path) -> bool:
     """Return whether a process holds the lock of a folder, which may not exist."""
-    if fcntl is None:
+    if fcntl is None or not Path(folder, LOCK_NAME).exists():
         return False
     try:
-        handle = os.open(Path(folder) / LOCK_NAME, os.O_RDWR)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        with folder_locked(folder):
+            return False
+    except FolderInUse:
         return True
     except OSError:
         return False
-    finally:
-        os.close(handle)
-    return False
 
 
 def _take(path: Path, wait: bool) -> int | None:

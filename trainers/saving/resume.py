@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDictBase
-from torchrl.checkpoint import CheckpointError, GlobalRNGState
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
@@ -17,11 +16,9 @@ from torchrl_hmcts import notebook
 from torchrl_hmcts.checks import whole_number
 from torchrl_hmcts.trainers.saving.checkpoints import (
     DurableRotation,
-    check_settings,
-    newest_checkpoint,
     plain_checkpoint,
+    to_continue,
 )
-from torchrl_hmcts.trainers.saving.locking import folder_locked
 from torchrl_hmcts.trainers.saving.run_state import (
     BufferAdapter,
     GeneratorStates,
@@ -42,25 +39,21 @@ class ResumableTrainer(Trainer):
     written so that a crash cannot damage one (:class:`DurableRotation`), and read without pickle.
 
     Ctrl-C and SIGTERM stop a training after the batch under way, which is saved; then
-    ``KeyboardInterrupt`` is raised. A second Ctrl-C, a second later or more, stops it at once. One
-    trainer at a time writes to a ``save_dir``.
+    ``KeyboardInterrupt`` is raised. A second Ctrl-C, a second later or more, stops it at once.
 
     Args:
         save_dir (path, optional): folder of the checkpoints; one is written after 5 seconds of
             training, whenever ``save_trainer_interval`` base steps or a minute have passed, and at
-            the end. Default ``None``: no checkpoints.
-        keep_last (int): checkpoints kept. Default ``2``.
-        overwrite (bool): replace the checkpoints of another run in ``save_dir``; they are removed
-            once this run has written one. Default ``False``: ``train()`` refuses such a folder.
+            the end. One trainer at a time writes to it.
+        keep_last, overwrite: see :class:`DurableRotation`.
         **trainer_kwargs: passed to ``torchrl.trainers.Trainer``.
 
     Attributes:
-        run_settings (dict): values that a run must keep when it continues, by name (JSON). They are
-            written into its checkpoints; :meth:`load` refuses others.
+        run_settings (dict): values that a run must keep when it continues, by name (JSON).
 
     Raises:
-        ValueError: if ``save_dir`` is given together with TorchRL's ``checkpoint_rotation`` or
-            ``save_trainer_file``.
+        ValueError: if TorchRL's ``checkpoint``, ``checkpoint_rotation`` or ``save_trainer_file`` is
+            given.
         OSError: if ``save_dir`` cannot be written to.
         FolderInUse: on training, if another run writes to ``save_dir``.
 
@@ -98,30 +91,25 @@ class ResumableTrainer(Trainer):
         for part in ("loss_module", "optimizer"):
             if trainer_kwargs.get(part) is not None:
                 self.run_settings[part] = type(trainer_kwargs[part]).__name__
+        for other in ("checkpoint", "checkpoint_rotation", "save_trainer_file"):
+            if trainer_kwargs.get(other) is not None:
+                raise ValueError(
+                    f"{type(self).__name__} writes its checkpoints to save_dir; leave {other} out."
+                )
+        self.rotation = None
         if save_dir is not None:
-            for other in ("checkpoint_rotation", "save_trainer_file"):
-                if trainer_kwargs.get(other) is not None:
-                    raise ValueError(
-                        f"save_dir={str(save_dir)!r} and {other} both say where checkpoints go. "
-                        "Pass one of them."
-                    )
-            rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
-            rotation.settings = self.run_settings
-            trainer_kwargs["checkpoint_rotation"] = rotation
-        if trainer_kwargs.get("checkpoint") is None and not trainer_kwargs.get("save_trainer_file"):
-            trainer_kwargs["checkpoint"] = plain_checkpoint()
-        trainer_kwargs.setdefault("optimization_stepper", DetachedStepper())
-        checkpoint, buffer = (trainer_kwargs.get(k) for k in ("checkpoint", "replay_buffer"))
-        if checkpoint is not None and buffer is not None and "replay_buffer" not in checkpoint:
+            self.rotation = DurableRotation(save_dir, keep_last=keep_last, overwrite=overwrite)
+            self.rotation.settings = self.run_settings
+        checkpoint = plain_checkpoint(rng=GlobalRNGState())
+        if (buffer := trainer_kwargs.get("replay_buffer")) is not None:
             # A buffer's own dump() writes a pickle beside the tensors; its state dict needs none.
             checkpoint.register("replay_buffer", buffer, adapter=BufferAdapter())
-        super().__init__(**trainer_kwargs)
+        trainer_kwargs.setdefault("optimization_stepper", DetachedStepper())
+        super().__init__(checkpoint=checkpoint, checkpoint_rotation=self.rotation, **trainer_kwargs)
         self._save_at = math.inf  # time at which a checkpoint is due
         # TorchRL keeps this dict on the class, where the next trainer built would empty it.
         self._last_log: dict[str, Any] = {}
         self._saved_frames = -1  # base steps at the newest checkpoint
-        if self.checkpoint is not None and "rng" not in self.checkpoint:
-            self.checkpoint.register("rng", GlobalRNGState())
         collector = self.collector
         self.register_module("history", HistoryState(self))
         self._episodes: RunningEpisodes | None = None
@@ -146,7 +134,7 @@ class ResumableTrainer(Trainer):
 
     def _shutdown_hook(self) -> None:
         # A collector that ends by itself leaves TorchRL's loop without the checkpoint of the end.
-        if self.checkpoint_rotation is not None and self._saved_frames != self.collected_frames:
+        if self.rotation is not None and self._saved_frames != self.collected_frames:
             self.save_trainer(force_save=True)
         super()._shutdown_hook()
 
@@ -157,31 +145,18 @@ class ResumableTrainer(Trainer):
             path (path): a checkpoint, or a folder of checkpoints (``save_dir``), of which the
                 newest whole one is taken.
             new_episodes (bool, optional): leave the episodes that were under way out, and begin
-                new ones. Default ``None``: only in an env that cannot be set to a state (e.g.
-                ``GymEnv``), and a line on stderr says so; all else continues exactly. False:
-                refuse such an env.
-
-        Returns:
-            ResumableTrainer: itself.
+                new ones. Default: only in an env that cannot be set to a state (e.g. ``GymEnv``),
+                and a line on stderr says so. False: refuse such an env.
 
         Raises:
             FileNotFoundError: if there is no checkpoint.
-            CheckpointError: if the checkpoint is damaged, of a newer version or of other settings,
-                or does not fit, e.g. another number of copies.
+            CheckpointError: if it is damaged, of a newer version or of other settings, or does not
+                fit.
         """
-        found = newest_checkpoint(path)
-        check_settings(found, self.run_settings)
+        found = to_continue(path, self.run_settings, self.rotation)
         if self._episodes is not None:
             self._episodes.new_episodes = new_episodes
         self.load_from_file(found)
-        frames, updates = self.collected_frames, self._num_updates()
-        if not all(type(n) is int and n >= 0 for n in (frames, updates)):
-            raise CheckpointError(
-                f"The checkpoint {str(found)!r} has {frames!r} base steps and {updates!r} updates, "
-                "which are not counts. Load an older one."
-            )
-        if isinstance(self.checkpoint_rotation, DurableRotation):
-            self.checkpoint_rotation.continue_from(found)
         return self
 
     def _num_updates(self) -> int:
@@ -189,19 +164,9 @@ class ResumableTrainer(Trainer):
         return count
 
     def train(self) -> None:
-        """Train until ``total_frames`` are collected.
-
-        Raises:
-            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
-            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
-                unless ``overwrite`` is true.
-            FolderInUse: if another run writes to ``save_dir``.
-        """
-        if isinstance(self.checkpoint_rotation, DurableRotation):
-            self.checkpoint_rotation.begin()
-        self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
-        folder = getattr(self.checkpoint_rotation, "directory", None)
-        with folder_locked(folder) if folder else nullcontext(), patient():
+        """Train until ``total_frames`` are collected."""
+        with self.rotation.taken() if self.rotation else patient():
+            self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
             try:
                 if self.collected_frames < self.total_frames:
                     super().train()
@@ -215,11 +180,7 @@ class ResumableTrainer(Trainer):
                 raise
 
     def save_trainer(self, force_save: bool = False) -> None:
-        """Write a checkpoint if one is due; stops here if a signal has asked for it.
-
-        Args:
-            force_save: write one in any case.
-        """
+        """Write a checkpoint if one is due; stops here if a signal has asked for it."""
         due = stop_asked() or time.monotonic() >= self._save_at
         super().save_trainer(force_save or due)
         raise_if_asked()
@@ -231,11 +192,7 @@ class ResumableTrainer(Trainer):
         self._save_at = time.monotonic() + SAVE_SECONDS
 
     def compute_loss(self, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Return the losses of a batch.
-
-        Raises:
-            FloatingPointError: if one is not finite; nothing has been changed by it.
-        """
+        """Return the losses of a batch; one that is not finite is refused."""
         losses = super().compute_loss(sub_batch)
         for name in losses.keys():
             if name.startswith("loss") and not math.isfinite(losses.get(name).detach().sum()):
@@ -244,8 +201,7 @@ class ResumableTrainer(Trainer):
 
     def last_good_checkpoint(self) -> str:
         """Return a sentence that says how to continue after an error."""
-        rotation = self.checkpoint_rotation
-        saved = None if rotation is None else rotation.latest()
+        saved = None if self.rotation is None else self.rotation.latest()
         if saved is None:
             return "There is no checkpoint: pass save_dir to have some."
         return f"The last good checkpoint is {str(saved)!r}: trainer.load() continues from it."

@@ -39,12 +39,7 @@ _STEP_LABELS = {
 
 @dataclass(frozen=True)
 class RunCurve:
-    """A logged value against steps; entries that are not finite are left out.
-
-    Example:
-        >>> RunCurve("entropy", [64, 128], [1.3, 1.1], "base steps").values[-1]
-        1.1
-    """
+    """A logged value against steps; entries that are not finite are left out."""
 
     name: str
     steps: list[float]
@@ -54,12 +49,7 @@ class RunCurve:
 
 @dataclass
 class RunFolder:
-    """A run as its folder tells it; fields of what is missing are empty.
-
-    Example:
-        >>> RunFolder(Path("runs/one"), {"config": {"seed": 3}}).seed
-        3
-    """
+    """A run as its folder tells it; fields of what is missing are empty."""
 
     path: Path
     record: dict[str, Any] = field(default_factory=dict)  # run.json
@@ -108,15 +98,7 @@ class RunFolder:
 
 
 def read_run(path: str | Path) -> RunFolder:
-    """Read a run's folder.
-
-    Args:
-        path: folder that a command wrote; the run may be unfinished. Of a file that is damaged,
-            ``damage`` says so, and all else is read.
-
-    Raises:
-        ValueError: if it is no folder of a run.
-    """
+    """Read a run's folder."""
     path = Path(path)
     damage: list[str] = []
     record = _json(path / "run.json", damage, config=dict, commands=list, versions=dict)
@@ -155,12 +137,7 @@ def read_run(path: str | Path) -> RunFolder:
 
 
 def is_run(path: str | Path) -> bool:
-    """Return whether a folder is that of a run or of a sweep.
-
-    Example:
-        >>> is_run("nowhere")
-        False
-    """
+    """Return whether a folder is that of a run or of a sweep."""
     return any(Path(path, name).is_file() for name in ("run.json", "metrics.json", "sweep.json"))
 
 
@@ -194,9 +171,7 @@ def read_curves(path: Path) -> dict[str, RunCurve]:
     return curves
 
 
-def start_record(
-    experiment: str, config: Any, command: Sequence[str], facts: Mapping[str, Any]
-) -> None:
+def start_record(experiment: str, config: Any, command: Sequence[str]) -> None:
     """Write ``run.json`` into the folder of a run that begins or is resumed, without its path."""
     path = Path(config.out)
     path.mkdir(parents=True, exist_ok=True)
@@ -211,7 +186,8 @@ def start_record(
         "experiment": experiment,
         "config": values,
         "commands": [line for line in commands if line],
-        **facts,
+        "versions": versions(),
+        "machine": machine(),
         "status": "running",
     }
     write_json(path / "run.json", record, checksum=True)
@@ -238,12 +214,7 @@ def add_evaluation(path: str | Path, evaluation: Mapping[str, Any]) -> Path:
 
 
 def flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return nested figures as one list, names joined by dots.
-
-    Example:
-        >>> flat({"seed": 1, "test": {"solved": 3}})
-        [('seed', 1), ('test.solved', 3)]
-    """
+    """Return nested figures as one list, names joined by dots."""
     rows: list[tuple[str, Any]] = []
     for name, value in metrics.items():
         inside = isinstance(value, Mapping)
@@ -252,23 +223,13 @@ def flat(metrics: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that a run's figures depend on, by package.
-
-    Example:
-        >>> sorted(versions())
-        ['numpy', 'python', 'tensordict', 'torch', 'torchrl', 'torchrl_hmcts']
-    """
+    """Return the versions that a run's figures depend on, by package."""
     found = {name: metadata.version(name) for name in _PACKAGES}
     return {"torchrl_hmcts": __version__, **found, "python": platform.python_version()}
 
 
 def machine() -> dict[str, Any]:
-    """Return what a run's times depend on; nothing that names the machine or its folders.
-
-    Example:
-        >>> sorted(machine())
-        ['cpus', 'platform']
-    """
+    """Return what a run's times depend on; nothing that names the machine or its folders."""
     kind = f"{platform.system()} {platform.machine()}".strip()
     return {"cpus": os.cpu_count(), "platform": kind}
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
-from torchrl.collectors import BaseCollector, Collector
+from torchrl.collectors import Collector
 from torchrl.envs import GymLikeEnv, TransformedEnv
 from torchrl.trainers import Trainer
 
@@ -25,45 +25,16 @@ Generator = torch.Generator | np.random.Generator | random.Random
 
 
 class RunningEpisodes:
-    """State of the episodes that a collector is in the middle of.
+    """State of the episodes that a collector is in the middle of, which its state dict lacks.
 
-    A collector's own state dict lacks the tensordict from which it takes its next step, so that a
-    resumed run would begin new episodes. This adds it. The env's whole state must be in the
-    tensordict: ``_supports_set_state`` is True or ``batch_locked`` False, as in
-    ``torchrl_hmcts.envs``. In other envs, e.g. ``GymEnv``, new episodes begin on loading.
-
-    Args:
-        collector (Collector): single-process collector.
-
-    Attributes:
-        new_episodes (bool, optional): whether loading leaves the saved episodes out and begins new
-            ones. Default ``None``: only where the env cannot be set to their states; a line on
-            stderr says so.
-
-    Raises:
-        TypeError: if the collector runs its envs in other processes.
-
-    Examples:
-        >>> from torchrl.collectors import Collector
-        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
-        >>> from torchrl_hmcts.trainers.saving.run_state import RunningEpisodes
-        >>> collector = Collector(
-        ...     WaterworldMazeEnv(batch_size=[2], observation=False),
-        ...     frames_per_batch=4, total_frames=8, auto_register_policy_transforms=False)
-        >>> RunningEpisodes(collector).state_dict()["entries"]["position"].shape
-        torch.Size([2, 2])
-        >>> collector.shutdown()
+    Where the env cannot be set to their states, loading begins new ones and says so on stderr,
+    unless ``new_episodes`` is False.
     """
 
-    def __init__(self, collector: BaseCollector) -> None:
-        if not isinstance(collector, Collector):
-            raise TypeError(
-                "RunningEpisodes saves the episodes of a Collector, which runs in this process; "
-                f"{type(collector).__name__} keeps them in other processes. Collect with "
-                "torchrl.collectors.Collector, or give up exact resume."
-            )
+    new_episodes: bool | None = None
+
+    def __init__(self, collector: Collector) -> None:
         self.collector = collector
-        self.new_episodes: bool | None = None
 
     @property
     def complete(self) -> bool:
@@ -84,12 +55,7 @@ class RunningEpisodes:
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Let the collector continue the episodes that :meth:`state_dict` returned.
-
-        Raises:
-            ValueError: if the env has another batch size; or if it cannot be set to a state and
-                ``new_episodes`` is False.
-        """
+        """Let the collector continue the episodes that :meth:`state_dict` returned."""
         env = getattr(self.collector.env, "base_env", self.collector.env)
         if self.new_episodes or (self.new_episodes is None and not self.complete):
             if self.new_episodes is None:
@@ -127,30 +93,7 @@ class RunningEpisodes:
 
 
 class GeneratorStates:
-    """States of all random number generators that objects own.
-
-    Looks through the attributes of the owners and of every ``nn.Module`` (env, transform, policy)
-    and list, tuple or dict below them for ``torch.Generator``, ``numpy.random.Generator`` and
-    ``random.Random``. The global generators are ``torchrl.checkpoint.GlobalRNGState``'s.
-
-    Args:
-        **owners: objects to look through, by the names their states get. After loading, owners of
-            the same names must have the same generators.
-
-    Raises:
-        ValueError: on loading, if a generator of the checkpoint is missing here.
-
-    Examples:
-        >>> from torchrl_hmcts.envs import WaterworldMazeEnv
-        >>> from torchrl_hmcts.trainers.saving.run_state import GeneratorStates
-        >>> env = WaterworldMazeEnv(seed=0)
-        >>> states = GeneratorStates(env=env)
-        >>> before = states.state_dict()
-        >>> first = env.reset()["position"]
-        >>> states.load_state_dict(before)
-        >>> bool((env.reset()["position"] == first).all())
-        True
-    """
+    """States of all random number generators below objects: in attributes, lists and dicts."""
 
     def __init__(self, **owners: Any) -> None:
         self.owners = owners
@@ -158,10 +101,7 @@ class GeneratorStates:
         self.generators()
 
     def generators(self) -> dict[str, Generator]:
-        """Return the generators by their path, e.g. ``"env._generator"``.
-
-        Those of an env that was closed since, as a ``SerialEnv`` is when a collector ends, too.
-        """
+        """Return the generators by their path, e.g. ``"env._generator"``, also of closed envs."""
         seen: set[int] = set()
         for name, owner in self.owners.items():
             self._known.update(_find(name, owner, seen, True))

@@ -24,15 +24,7 @@ _DEAF_SECONDS = 10.0  # after Stopped was raised; then it is raised again, shoul
 
 
 class Stopped(KeyboardInterrupt):
-    """A run was asked to stop, by Ctrl-C or by SIGTERM as batch systems send it.
-
-    Args:
-        signum: number of the signal.
-
-    Example:
-        >>> Stopped(15).status
-        143
-    """
+    """A run was asked to stop, by Ctrl-C or by SIGTERM as batch systems send it."""
 
     def __init__(self, signum: int = signal.SIGINT) -> None:
         super().__init__(f"stopped by {signal.Signals(signum).name}")

@@ -25,16 +25,7 @@ _NAME = re.compile(r"worker-(\d+)\.torchrl")
 
 
 def save_worker(run: str | Path, loss_module: LossModule, step: int) -> Path:
-    """Write a run's networks as ``worker/worker-STEP.torchrl``, the only one there.
-
-    Args:
-        run: the run's folder.
-        loss_module: holds the networks.
-        step: base steps of training that they have seen.
-
-    Returns:
-        The file.
-    """
+    """Write a run's networks as ``worker/worker-STEP.torchrl``, the only one there."""
     folder = Path(run) / "worker"
     folder.mkdir(exist_ok=True)
     path = folder / f"worker-{step:012d}.torchrl"
@@ -52,12 +43,6 @@ def find_worker(run: str | Path) -> Path:
 
     A run that has not finished, or is of an older version, has no worker file. A line on stderr
     names one that is damaged.
-
-    Args:
-        run: the run's folder.
-
-    Raises:
-        FileNotFoundError: if the run has written no checkpoint yet.
     """
     run = Path(run)
     try:
@@ -78,19 +63,7 @@ def find_worker(run: str | Path) -> Path:
 
 
 def load_networks(loss_module: LossModule, run: str | Path) -> Path:
-    """Give a loss's networks the weights of a run's worker, and nothing else of it.
-
-    Args:
-        loss_module: built as in the run; changed in place.
-        run: the run's folder.
-
-    Returns:
-        The file they are from.
-
-    Raises:
-        FileNotFoundError: if the run has written none yet.
-        ValueError: if the networks are other ones.
-    """
+    """Give a loss's networks the weights of a run's worker, and nothing else of it."""
     path = find_worker(run)
     try:
         plain_checkpoint(loss_module=loss_module).load(path)

@@ -28,11 +28,8 @@ class Controllability:
             the action.
         num_values: int64 ``[F]``, values that a feature takes.
         motion: float64 ``[F]``, share of the states in which the neutral action changes a feature.
-        min_dependence: share of states in which a controllable feature must depend on the action.
-            Default 0.15.
-        min_values: values that a controllable or moving feature must take. Default 16.
-        min_effect: mean change that counts as raising or lowering. Default 0.5.
-        min_motion: share of states in which a moving feature must change. Default 0.15.
+        min_dependence, min_values, min_motion: of a controllable or moving feature, at least.
+        min_effect: mean change that counts as raising or lowering.
 
     Example:
         >>> import numpy as np
@@ -86,16 +83,7 @@ class Controllability:
 
 
 def random_states(pool: Any, count: int, seed: int) -> TensorDictBase:
-    """Return states on the way of random options, of as many episodes as it takes.
-
-    Args:
-        pool: of options, e.g. an :class:`OptionPool`.
-        count: of the states.
-        seed: of the options.
-
-    Returns:
-        The states ``[count]``, without rewards and flags.
-    """
+    """Return states on the way of random options, of as many episodes as it takes."""
     generator = torch.Generator().manual_seed(seed)
     states: list[TensorDictBase] = []
     td = pool.reset(TensorDict(batch_size=[1]))
@@ -126,16 +114,11 @@ def probe_controllability(
     feature is controllable if one action raises it and another lowers it.
 
     Args:
-        env (EnvBase): any macro environment: with a discrete action, stateless or to be set to a
-            state. An action should be held for some base steps, e.g. options that repeat one.
+        env (EnvBase): any macro environment whose actions are held for some base steps.
         states (TensorDictBase): ``[S]``, what to try the actions from.
         key (NestedKey): features, integer or float ``[S, F]``; differences of uint8 wrap around.
-        neutral (int): the action that changes least. Default 0.
-        **thresholds: ``min_dependence``, ``min_values``, ``min_effect``, ``min_motion`` of
-            :class:`Controllability`.
-
-    Returns:
-        Controllability: effects and what follows from them.
+        neutral (int): the action that changes least.
+        **thresholds: of :class:`Controllability`.
 
     Raises:
         ValueError: if the env cannot be set to a state, there is no state, or ``neutral`` is no

@@ -26,17 +26,13 @@ class StateCoverage(TrainerHookBase):
 
         C_t = \bigl|\{\lfloor x_i / h \rfloor : t - w < i \le t\}\bigr|
 
-    with the watched entry :math:`x_i` after base step i, the side :math:`h` of a cell and the
-    window :math:`w`. Coverage of the window falls when skills forget where they went; that since
-    the start only grows. A hook of any TorchRL ``Trainer``, and usable alone: call it with batches.
+    with the watched entry :math:`x_i` after base step i. Coverage of the window falls when skills
+    forget where they went. A hook of any TorchRL ``Trainer``, and usable alone.
 
     Args:
-        key (NestedKey): entry ``[*B, D]`` to watch, read under ``"next"``. Default
-            ``"displacement"``: how far and in which directions the skills carry.
-        cell_side (float): side of a cell in the units of the entry. Default ``0.5``: half a
-            tile, the diameter of Waterworld's disc.
-        window (int): base steps that count as late, in whole batches. Default ``4_000``: a tenth of
-            the default training.
+        key (NestedKey): entry ``[*B, D]`` to watch, read under ``"next"``.
+        cell_side (float): h, in the units of the entry; 0.5 is the diameter of Waterworld's disc.
+        window (int): w, base steps that count as late, in whole batches.
 
     Returns:
         From ``coverage(batch)``: ``{"state_coverage": C of the window, "state_coverage_total": C

@@ -15,23 +15,7 @@ from torchrl.data import ReplayBuffer
 def load_dataset(
     dataset: ReplayBuffer | TensorDictBase | str | Path | None, keys: Sequence[NestedKey]
 ) -> TensorDictBase:
-    """Return the transitions of a dataset in one batch dimension, mapped from disk if they are.
-
-    Args:
-        dataset: transitions: a ``ReplayBuffer`` (e.g. one of ``torchrl.data.datasets``), a
-            TensorDict of any batch shape, or a folder written by ``replay_buffer.dumps(folder)``,
-            by ``storage.dumps(folder)`` or by ``tensordict.memmap(folder)``. (In the bare folder of
-            a ``LazyMemmapStorage`` nothing says how much of it is filled.) ``None``: none.
-        keys: entries that each transition must have; others are left out.
-
-    Returns:
-        Transitions ``[n]`` with the ``keys``; ``[0]`` without entries for an empty dataset.
-
-    Raises:
-        FileNotFoundError: if the folder holds no dataset.
-        ValueError: if an entry is missing.
-        TypeError: if it is none of these.
-    """
+    """Return the transitions of a dataset in one batch dimension, mapped from disk if they are."""
     data: TensorDictBase = TensorDict(batch_size=[0])
     if isinstance(dataset, (str, Path)):
         data = _load_folder(Path(dataset))

@@ -6,7 +6,6 @@ Letters: B searches, Z skills there is room for.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,6 +18,7 @@ from torchrl_hmcts.modules import GrowingSkillPrior, SkillPrior
 from torchrl_hmcts.planners import MCTSPlanner, Search
 from torchrl_hmcts.planners.tree import PRUNED
 
+_MIN_RISE = 0.01  # of the accuracy, below which it has stopped to rise
 _COLUMNS = ("base_steps", "num_active", "accuracy", "coverage", "gain", "better")
 
 
@@ -28,18 +28,16 @@ class SearchCoverage:
     .. math:: C = \frac{1}{B} \sum_{b < B} \bigl|\{\text{nodes of tree } b
         \text{ that its novelty test accepted}\}\bigr|
 
-    Nodes that the novelty test accepts are apart by its radius, so that C measures the area within
-    reach. Give the planner a budget of simulated base steps: every skill costs some in every
-    expansion, so that a skill which leads nowhere new lowers C.
+    C measures the area within reach. Give the planner a budget of simulated base steps: every skill
+    costs some in every expansion, so that a skill which leads nowhere new lowers C.
 
     Args:
         planner (MCTSPlanner): over the worker's skills, with a novelty test that keeps its radius
             (``max_relaxations=0``) and a budget that does not end at the first plan
             (``until_plan=False``).
-        starts (TensorDictBase): states ``[B]`` to search from, in training mazes. Every call
-            searches from all of them, with the same random numbers.
+        starts (TensorDictBase): states ``[B]`` to search from, all of them in every call.
         prior (SkillPrior, optional): which skills are on, written into the starts under the
-            planner's mask key. Default ``None``: the starts are used as they are.
+            planner's mask key.
 
     Returns:
         From ``coverage()``: C, a float. The attribute ``base_steps`` adds up what was simulated.
@@ -100,43 +98,30 @@ class GrowSkills(TrainerHookBase):
 
     .. math:: C_n \ge (1 + g_{\min})\, C_{n^*} \;\Rightarrow\; n^* \leftarrow n
 
-    :math:`C_n` is the coverage with n skills, measured once they are learned: as soon as the
-    discriminator's accuracy has stopped to rise over a window, but not before ``min_base_steps``
-    and not later than ``max_base_steps`` after the last change. When ``patience`` skills in a row
-    have added nothing, after one that did, they are switched off again, the networks get back the
-    weights with which :math:`n^*` was measured, and the rest of training is spent on these skills.
-    With ``prune``, a skill without which coverage is no smaller (two that do the same) is dropped
-    before, the most useless first.
+    :math:`C_n` is the coverage with n skills, measured once the discriminator's accuracy has
+    stopped to rise, between ``min_base_steps`` and ``max_base_steps`` after the last change. When
+    ``patience`` skills in a row have added nothing, after one that did, they are switched off
+    again, the networks get back the weights with which :math:`n^*` was measured, and the rest of
+    training is spent on these skills. With ``prune``, a skill without which coverage is no smaller
+    is dropped before. The replay buffer is emptied at every change: it holds the new skill hardly
+    at all, so that the new skill would do what an old one does.
 
-    A skill that is switched on starts from the fresh weights its heads were built with, and the
-    replay buffer is emptied: it holds the new skill hardly at all, so that the discriminator
-    would hold it to be rare and the new skill would do what an old one does.
-
-    A hook of any TorchRL ``Trainer`` (of one process) whose loss has the prior. No loss or env
-    saves the prior, so this does.
+    A hook of any TorchRL ``Trainer`` (of one process) whose loss has the prior, which it saves.
 
     Args:
-        prior (GrowingSkillPrior): the prior that the env's ``SkillTransform``, the skill objective
-            and the planner's ``SkillMaskTransform`` read.
-        coverage (callable): ``coverage() -> float`` with the skills that are on: a
-            :class:`SearchCoverage`, or your own. More is better.
-        min_gain (float): :math:`g_{\min}`, the share of coverage that more skills must add. Default
-            ``0.05``.
-        patience (int): skills in a row that may add nothing before growing ends, once a skill has
-            added something. Default ``2``: a third skill on a plane often has to wait for the
-            fourth.
-        prune (bool): drop useless skills among the :math:`n^*` when growing ends. Default ``True``.
-        enough (float, optional): coverage from which on no skill is added. Default ``None``: only
-            the gain counts.
+        prior (GrowingSkillPrior): that ``SkillTransform``, skill objective and
+            ``SkillMaskTransform`` read.
+        coverage (callable): ``coverage() -> float`` with the skills that are on, more is better: a
+            :class:`SearchCoverage`, or your own.
+        min_gain (float): :math:`g_{\min}`, the share of coverage that more skills must add.
+        patience (int): skills in a row that may add nothing before growing ends. A third skill on a
+            plane often has to wait for the fourth.
+        prune (bool): drop useless skills among the :math:`n^*` when growing ends.
         min_base_steps, max_base_steps (int): base steps that a number of skills is trained before
-            it is judged, at least and at most. Defaults ``3_200`` and ``4_800``.
-        until (int, optional): base steps of training after which no skill is switched on, so that
-            the last ones are trained long enough. Default ``None``: as long as training lasts.
-        window (int): batches over which the accuracy must have stopped to rise. Default ``40``.
-        min_rise (float): rise of the mean accuracy, from the first half of the window to the
-            second, below which it has stopped. Default ``0.01``.
-        accuracy_key (str): entry of the losses that is watched. Default
-            ``"discriminator_accuracy"``; where a loss has none, ``max_base_steps`` decides.
+            it is judged, at least and at most.
+        window (int): batches over which the mean ``discriminator_accuracy`` must have stopped to
+            rise, from the first half to the second; where a loss has none, ``max_base_steps``
+            decides.
 
     Attributes:
         history: dict of lists, one entry per judgement: ``base_steps`` of training, ``num_active``
@@ -185,33 +170,24 @@ class GrowSkills(TrainerHookBase):
         min_gain: float = 0.05,
         patience: int = 2,
         prune: bool = True,
-        enough: float | None = None,
         min_base_steps: int = 3_200,
         max_base_steps: int = 4_800,
-        until: int | None = None,
         window: int = 40,
-        min_rise: float = 0.01,
-        accuracy_key: str = "discriminator_accuracy",
     ) -> None:
         owner = "GrowSkills"
         instance(owner, "prior", prior, GrowingSkillPrior)
         instance(owner, "coverage", coverage, Callable)
         instance(owner, "prune", prune, bool)
-        instance(owner, "accuracy_key", accuracy_key, str)
         self.prior = prior
         self.coverage = coverage
         self.min_gain = real_number(owner, "min_gain", min_gain, least=0.0)
         self.patience = whole_number(owner, "patience", patience, least=1)
         self.prune = prune
-        self.enough = math.inf if enough is None else real_number(owner, "enough", enough)
         self.min_base_steps = whole_number(owner, "min_base_steps", min_base_steps, least=1)
         self.max_base_steps = whole_number(
             owner, "max_base_steps", max_base_steps, least=self.min_base_steps
         )
-        self.until = math.inf if until is None else whole_number(owner, "until", until)
         self.window = whole_number(owner, "window", window, least=2)
-        self.min_rise = real_number(owner, "min_rise", min_rise)
-        self.accuracy_key = accuracy_key
         self.finished = False
         self.history: dict[str, list[Any]] = {key: [] for key in _COLUMNS}
         self.dropped: list[int] = []
@@ -229,7 +205,7 @@ class GrowSkills(TrainerHookBase):
 
     def watch(self, optim_steps: int, losses: TensorDictBase | None) -> dict[str, float]:
         """Notes a batch's accuracy; returns what to log."""
-        accuracy = None if losses is None else losses.get(self.accuracy_key, None)
+        accuracy = None if losses is None else losses.get("discriminator_accuracy", None)
         if accuracy is not None:
             self._accuracies = [*self._accuracies, float(accuracy)][-self.window :]
         return {"num_active_skills": float(self.prior.active().sum())}
@@ -240,7 +216,7 @@ class GrowSkills(TrainerHookBase):
             return False
         half = self.window // 2
         first, second = self._accuracies[:half], self._accuracies[half:]
-        return float(np.mean(second) - np.mean(first)) < self.min_rise
+        return float(np.mean(second) - np.mean(first)) < _MIN_RISE
 
     def __call__(self) -> None:
         if self._trainer is None:
@@ -270,12 +246,8 @@ class GrowSkills(TrainerHookBase):
             self._best = {"number": number, "coverage": coverage, "weights": weights}
         self._fruitless = 0 if better else self._fruitless + 1
         helped = any(self.history["better"][1:])
-        self.finished = (
-            (helped and self._fruitless >= self.patience)
-            or number == self.prior.num_skills
-            or base_steps >= self.until
-            or coverage >= self.enough
-        )
+        ripe = helped and self._fruitless >= self.patience
+        self.finished = ripe or number == self.prior.num_skills
         if not self.finished:
             self.prior.set_num_active(number + 1)
         else:

@@ -22,22 +22,7 @@ RECORDED = ("round", "training_steps", "solved", "found", "simulated_steps", "ex
 
 
 class RoundRecords:
-    """Costs of each round of planning and acting, in the order in which they were played.
-
-    Args:
-        columns: int64 ``[rounds]``: ``round`` its number t; ``training_steps`` base steps its
-            worker had been trained on; ``solved`` and plan ``found`` (0 or 1); ``simulated_steps``
-            of the search and ``executed_steps`` of the episode, in base steps. Default: no rounds.
-
-    Example:
-        >>> import numpy as np
-        >>> from torchrl_hmcts.trainers.evaluation import Results
-        >>> yes, two = np.ones(2, dtype=bool), np.full(2, 7)
-        >>> records = RoundRecords()
-        >>> _ = records.add(Results(yes, yes, two, two, two, two, two + 1), np.arange(2), 640)
-        >>> records.curve()["base_steps"].tolist()
-        [15.0]
-    """
+    """Costs of each round of planning and acting, in the order in which they were played."""
 
     def __init__(self, columns: Mapping[str, np.ndarray] | None = None) -> None:
         self.columns = {
@@ -105,16 +90,6 @@ class PlanningRounds(LocalCollector):
 
     Random numbers are a function of ``seed`` and of the round, so that a resumed run needs to know
     no more than its round.
-
-    Args:
-        env: in which plans are executed: stateless, under an ``OptionTransform`` and an
-            ``OptionRecorder``.
-        simulator: in which they are searched, of the same kind.
-        make_planner: ``make_planner(simulator, seed=...)`` builds the planner for some rounds.
-        num_init_samples: options executed at first.
-        interval: rounds of a batch, planned side by side.
-        rounds: after which the iteration ends.
-        seed: of all random numbers.
     """
 
     def __init__(
@@ -191,18 +166,7 @@ class PlanningRounds(LocalCollector):
 
 @contextmanager
 def seeded(seed: int, phase: str, index: int) -> Iterator[int]:
-    """Make torch's global generator a function of the arguments, and leave it as it was.
-
-    Yields:
-        A further seed below 2^31, for what has a generator of its own.
-
-    Example:
-        >>> with seeded(0, "round", 3):
-        ...     first = torch.rand(())
-        >>> with seeded(0, "round", 3):
-        ...     bool(torch.rand(()) == first)
-        True
-    """
+    """Make torch's global generator a function of the arguments, and leave it as it was."""
     entropy = [seed, *phase.encode(), index]
     own, other = np.random.SeedSequence(entropy).generate_state(2, np.uint32).tolist()
     with torch.random.fork_rng(devices=[]):
@@ -216,23 +180,6 @@ def frames_curve(
     """Return the mean frames of an episode against the frames of training; Figure 4.10's curve.
 
     An episode without a plan, or whose plan fails, counts with its whole length.
-
-    Args:
-        records: of test rounds.
-        frames_per_step: frames of a base step.
-        max_frames: of an episode.
-
-    Returns:
-        ``"training_steps"`` and ``"frames"`` (both in frames), ``"solved"`` (share) and
-        ``"solved_frames"``, the mean over those that were solved (NaN if none was).
-
-    Example:
-        >>> import numpy as np
-        >>> columns = dict.fromkeys(RoundRecords().columns, np.array([0, 1]))
-        >>> columns = {**columns, "training_steps": np.array([8, 8])}
-        >>> columns = {**columns, "executed_steps": np.array([0, 50])}
-        >>> frames_curve(RoundRecords(columns), 4, 10_000)
-        {'training_steps': [32.0], 'frames': [5100.0], 'solved': [0.5], 'solved_frames': [200.0]}
     """
     columns = records.columns
     out: dict[str, list[float]] = {}

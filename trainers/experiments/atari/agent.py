@@ -5,7 +5,7 @@ Letters: L base steps of an option, ρ simulated base steps per real one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -179,6 +179,7 @@ class AtariAgent:
         self.guide = guide
         self.seed = seed
         self.greatest_reward = 0.0
+        self.guided = guide is not None
         self.state: TensorDictBase | None = None
         self.last_option = -1  # executed by the latest decision
         self._tree: Search | None = None
@@ -191,11 +192,13 @@ class AtariAgent:
 
     def _make_planner(self) -> None:
         """Make the planner; under UCT exploration is worth what there is to gain."""
-        self._scale = self._wanted_scale
+        self._scale, search = self._wanted_scale, self.search
+        if self.guided and isinstance(self.guide, ReactiveManager):
+            search = replace(search, rollout_options=0)  # its values take their place
         self.planner = MCTSPlanner(
             self.pool,
-            **vars(self.search.settings(self._scale)),
-            leaf_evaluator=self.guide,
+            **vars(search.settings(self._scale)),
+            leaf_evaluator=self.guide if self.guided else None,
             final_choice=HighestValue(random_ties=True),
             budget=SearchBudget(
                 base_steps=self.search.budget(self.pool.max_steps), until_plan=False
@@ -222,8 +225,15 @@ class AtariAgent:
         if self.real is not self.pool:
             self.real.close()
 
-    def begin(self) -> None:
-        """Begin an episode."""
+    def begin(self, guided: bool = True) -> None:
+        """Begin an episode.
+
+        Args:
+            guided: whether the guide has a say; it learns from the searches in either case.
+        """
+        if self.guide is not None and guided != self.guided:
+            self.guided = guided
+            self._make_planner()
         self.state = self.real.reset(TensorDict(batch_size=[1]))
         self._tree = None
         self._new_episode()
@@ -293,6 +303,7 @@ class AtariAgent:
                 "options": list(self.options_taken),
             },
             "greatest_reward": self.greatest_reward,
+            "guided": self.guided,
             "state": None if self.state is None else self.state["emulator_state"].clone(),
             "guide": None if self.guide is None else self.guide.state_dict(),
             "num_calls": self.real._num_calls,  # sticky actions are drawn by their number
@@ -307,6 +318,8 @@ class AtariAgent:
         for name, value in episode.items():
             setattr(self, name, value)
         self.greatest_reward = float(state_dict["greatest_reward"])
+        self.guided = bool(state_dict.get("guided", self.guided))
+        self._make_planner()
         rows, self.state, self._tree = state_dict["state"], None, None
         if rows is not None:
             td = TensorDict({"emulator_state": rows}, [1])

@@ -81,12 +81,11 @@ class AtariConfig(RunConfig):
     """Test episodes of such a point."""
     curve_steps: int = 0
     """Base steps after which such an episode is ended; 0: it is played to its end."""
-    ratio: float = -1.0
-    """Simulated base steps per real one, after which a search selects no new leaves; -1: 25, or 10
-    where the guide is reactive; 0: a reactive guide plays without search."""
-    rollout_options: int = -1
-    """Options of the rollouts that stay in the tree; -1: 5, or none where the guide is reactive,
-    whose values take their place."""
+    ratio: float = 25.0
+    """Simulated base steps per real one, after which a search selects no new leaves; 0: a reactive
+    guide plays without search."""
+    rollout_options: int = 5
+    """Options of the rollouts that stay in the tree; none where a reactive guide values leaves."""
     tree_policy: str = "puct"
     """"puct" (values scaled to [0, 1]) or "uct", e.g. to compare with."""
     backup: str = "default"
@@ -94,7 +93,8 @@ class AtariConfig(RunConfig):
     guide: str = "auto"
     """Network that learns from the searches and guides those after them: "none", "prior",
     "prior_value", or "reactive", a manager that also practises and can play without search
-    (`ratio=0`). "auto": "reactive" with sticky actions, else "none"."""
+    (`ratio=0`). It has a say in the episodes in which a bandit expects more of it than of search
+    alone. "auto": "reactive" with sticky actions, else "none"."""
     practice: float = 0.5
     """Share of the frames in which a manager that practises does so."""
     c: float = 2.0
@@ -132,7 +132,7 @@ class AtariConfig(RunConfig):
         "guide": ("auto", "none", "prior", "prior_value", "reactive"),
     }  # fmt: skip
     LEAST = {
-        "option_steps": 0, "rollout_options": -1, "num_processes": -1, "num_skills": 0,
+        "option_steps": 0, "rollout_options": 0, "num_processes": -1, "num_skills": 0,
         "curve_every": 0, "curve_steps": 0,
     }  # fmt: skip
     ABOVE_ZERO = ("c", "trial_ratio")
@@ -147,7 +147,7 @@ class AtariConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ratio != -1.0 and not self.ratio >= (0.0 if self._guide == "reactive" else 1e-9):
+        if not self.ratio >= 0.0 or (self.ratio == 0.0 and self._guide != "reactive"):
             raise ValueError(
                 f"ratio must be above 0; got {self.ratio}. With guide=reactive ratio=0 plays "
                 f"without search; here it is guide={self.guide}."
@@ -173,13 +173,7 @@ class AtariConfig(RunConfig):
         source = self.source
         if source == "auto":
             source = "screened" if guide == "reactive" else "best"
-        options = self.rollout_options
-        if options < 0:
-            options = 0 if guide == "reactive" else 5
-        ratio = self.ratio
-        if ratio < 0.0:
-            ratio = 10.0 if guide == "reactive" else 25.0
-        return replace(self, guide=guide, source=source, rollout_options=options, ratio=ratio)
+        return replace(self, guide=guide, source=source)
 
     def check_inputs(self) -> None:
         """Check what the run needs from outside, before anything is written.

@@ -291,7 +291,17 @@ class AtariRun:
 
     def _begin_episode(self, agent: AtariAgent) -> None:
         self._seed_episode(agent)
-        agent.begin()
+        agent.begin(self._guides_next())
+
+    def _guides_next(self) -> bool:
+        """Return whether a manager that practises guides the next episode: a bandit's choice."""
+        if self.config.guide != "reactive" or self.config.ratio == 0.0:
+            return True
+        arms = {
+            guided: [r["score"] for r in self.scores if r.get("guided", True) == guided]
+            for guided in (False, True)
+        }
+        return choose_arm(arms[False], arms[True]) == 1
 
     def _note(self, agent: AtariAgent) -> None:
         """Note the decision, and the running score at every 1,000th base step and at the end."""
@@ -313,6 +323,7 @@ class AtariRun:
             "score": agent.score,
             "real_frames": agent.real_steps * FRAMES_PER_STEP,
             "decisions": agent.decisions,
+            "guided": agent.guided,
         }
         self.scores.append(row)
         console.note(
@@ -401,6 +412,35 @@ class AtariRun:
             setattr(self, name, copy.copy(state_dict.get(name, getattr(self, name))))
         self._frames_before = int(state_dict["frames"])
         self._resumed = state_dict["agent"]
+
+
+def choose_arm(*scores: Sequence[float], last: int = 10) -> int:
+    r"""Return the arm that UCB1 pulls next, an untried one first.
+
+    .. math:: \arg\max_i \frac{\bar x_i - \min x}{\max x - \min x} + \sqrt{\frac{\ln n}{2 n_i}}
+
+    with the mean of the ``last`` scores of an arm, since what it plays with learns meanwhile.
+
+    Reference:
+        Auer, Cesa-Bianchi and Fischer, "Finite-time analysis of the multiarmed bandit problem",
+        2002.
+
+    Example:
+        >>> choose_arm([1.0, 2.0], []), choose_arm([1.0] * 9, [5.0] * 9)
+        (1, 1)
+    """
+    for arm, own in enumerate(scores):
+        if not own:
+            return arm
+    every = [x for own in scores for x in own]
+    low, spread = min(every), max(max(every) - min(every), 1e-9)
+
+    def bound(arm: int) -> float:
+        own = scores[arm]
+        mean = (sum(own[-last:]) / len(own[-last:]) - low) / spread
+        return mean + math.sqrt(math.log(len(every)) / (2 * len(own)))
+
+    return max(range(len(scores)), key=bound)
 
 
 def score_at(episodes: Sequence[Mapping[str, float]], last: int = 10) -> dict[str, float]:

@@ -1,9 +1,7 @@
 """Kits: each is all that an experiment must know of an environment.
 
-A kit has an env to learn skills in, base envs to act in by split, a simulator to plan in, starts,
-the keys of what is read of a state, the planner at its defaults, and what its pages show. The
-recipe :mod:`~torchrl_hmcts.trainers.experiments.skills` does the rest with any kit; a kit of your
-own is a subclass of :class:`Kit` with the first four methods.
+The recipe :mod:`~torchrl_hmcts.trainers.experiments.skills` does the rest with any kit; one of your
+own is a subclass of :class:`Kit` with ``make_training_env``, ``make_env``, ``starts``.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.objectives import LossModule
 
 from torchrl_hmcts.checks import instance
@@ -153,15 +151,20 @@ class Kit:
         ``trajectory_keys`` are base transitions to hand out, see ``OptionTransform``; ``gamma``,
         the discount per base step of its rewards, is by default the configuration's.
         """
-        config = self.config
+        config, stall = self.config, self.stall(env)
         options = OptionTransform(
             worker,
             config.num_skills,
             config.option_steps,
             config.gamma if gamma is None else gamma,
+            None if stall is None else stall[1],
             trajectory_keys=trajectory_keys,
         )
-        return TransformedEnv(env, options)
+        return TransformedEnv(env, options if stall is None else Compose(stall[0], options))
+
+    def stall(self, env: EnvBase) -> tuple[Any, Any] | None:
+        """Return what notices, and what ends, an option at a standstill; None for none."""
+        return None
 
     def given_worker(self) -> TensorDictModuleBase | None:
         """Return the worker of options that need no learning; None where they are learned.

@@ -34,7 +34,7 @@ from torchrl_hmcts.envs.gym.ant import (
     up_of,
 )
 from torchrl_hmcts.envs.gym.mujoco import find_physics
-from torchrl_hmcts.envs.gym.mujoco_tasks import RoboticsAntMaze, task_of
+from torchrl_hmcts.envs.gym.mujoco_batch import RoboticsAntMaze, task_of
 from torchrl_hmcts.envs.gym.option_run import OptionWorker
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.modules import (

@@ -34,7 +34,6 @@ from torchrl_hmcts.trainers.saving.files import replacing
 from torchrl_hmcts.trainers.skills.rounds import RoundRecords, frames_curve
 from torchrl_hmcts.transforms import (
     DisplacementTransform,
-    OptionTransform,
     SkillTransform,
     StallTransform,
 )
@@ -154,27 +153,9 @@ class LabMazeKit(Kit):
         seeds = held_out_seeds(config.mazes if num_mazes is None else num_mazes, size)
         return make_lab_env(seeds, rows=size, columns=size, **kwargs)
 
-    def make_options(
-        self,
-        env: EnvBase,
-        worker: TensorDictModuleBase,
-        trajectory_keys: Any = None,
-        *,
-        gamma: float | None = None,
-    ) -> TransformedEnv:
-        config = self.config
-        stalled = StallTermination(config.stall_steps) if config.stall_steps else None
-        options = OptionTransform(
-            worker,
-            config.num_skills,
-            config.option_steps,
-            config.gamma if gamma is None else gamma,
-            stalled,
-            trajectory_keys=trajectory_keys,
-        )
-        if stalled is None:
-            return TransformedEnv(env, options)
-        return TransformedEnv(env, Compose(stall_transform(env), options))
+    def stall(self, env: EnvBase) -> tuple[Any, Any] | None:
+        steps = self.config.stall_steps
+        return (stall_transform(env), StallTermination(steps)) if steps else None  # type: ignore[arg-type]
 
     def starts(self, split: str, num_starts: int) -> TensorDictBase:
         if split != "test":

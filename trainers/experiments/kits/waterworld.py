@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from operator import index
 from typing import Any
@@ -74,8 +73,6 @@ def make_option_env(
     *,
     num_skills: int = 4,
     option_steps: int = 25,
-    gamma: float = 0.99,
-    trajectory_keys: Sequence[str] | None = None,
     seed: int | None = None,
 ) -> TransformedEnv:
     """Build a Waterworld whose actions are the worker's skills, for planning and for acting.
@@ -85,8 +82,6 @@ def make_option_env(
         mazes: bool ``[M, H, W]``. Default: the training split.
         num_skills: number of skills, the options.
         option_steps: base steps of an option.
-        gamma: discount per base step.
-        trajectory_keys: base transitions to hand out, see ``OptionTransform``.
         seed: of the env.
 
     Returns:
@@ -98,9 +93,7 @@ def make_option_env(
         >>> make_option_env(worker).rollout(2)["next", "duration"].shape
         torch.Size([2, 1])
     """
-    options = OptionTransform(
-        worker, num_skills, option_steps, gamma, trajectory_keys=trajectory_keys
-    )
+    options = OptionTransform(worker, num_skills, option_steps, 0.99)
     return TransformedEnv(WaterworldMazeEnv(mazes, observation=False, seed=seed), options)
 
 

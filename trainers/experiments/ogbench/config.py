@@ -83,7 +83,6 @@ class OGBenchConfig(RunConfig):
     """Recorded episodes: a folder of `hmcts data`, or OGBench's own NAME.npz. Default:
     data/ogbench/NAME, recorded there (minutes; puzzles an hour) if it is not yet."""
     out: str = "runs/ogbench"
-    """Folder that receives metrics, pictures, checkpoints and the page; made if absent."""
     radius: float = 1.5
     """Least distance of two landmarks, in units of the maze, whose corridors are 4 wide; the unit
     of distances that the worker sees."""

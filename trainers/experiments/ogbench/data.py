@@ -6,7 +6,6 @@ Letters: T recorded steps.
 from __future__ import annotations
 
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_hmcts.checks import whole_number
+from torchrl_hmcts.envs import shortest_path_lengths
 from torchrl_hmcts.envs.gym.settable import make_gym
 from torchrl_hmcts.trainers.experiments.ogbench.config import Recipe, split_name
 from torchrl_hmcts.trainers.saving.files import replacing
@@ -109,7 +109,9 @@ class _Walks:
         free = env.maze_map == 0
         self.cells = [(int(i), int(j)) for i, j in np.argwhere(free)]
         self.corners = [cell for cell in self.cells if not _is_hallway(free, cell)]
-        self.steps = {cell: _steps_from(free, cell) for cell in self.cells}
+        walls = torch.from_numpy(~free)
+        self.steps = {cell: shortest_path_lengths(walls, cell).numpy() for cell in self.cells}
+        """Cells of the shortest way from a cell to each; -1: none."""
         self.centres: dict[tuple[Cell, Cell], np.ndarray] = {}
         self.walk: Callable[[np.ndarray, np.ndarray], np.ndarray] = lambda seen, way: way
         if walker:
@@ -178,20 +180,6 @@ def _is_hallway(free: np.ndarray, cell: Cell) -> bool:
     """Whether a cell has nothing but two free sides, opposite ones."""
     up, left, down, right = (bool(free[cell[0] + i, cell[1] + j]) for i, j in _SIDES)
     return (up, left, down, right) in ((True, False, True, False), (False, True, False, True))
-
-
-def _steps_from(free: np.ndarray, cell: Cell) -> np.ndarray:
-    """Cells of the shortest way from a cell to each; -1: none."""
-    steps = np.full(free.shape, -1)
-    steps[cell], waiting = 0, deque([cell])
-    while waiting:
-        here = waiting.popleft()
-        for i, j in _SIDES:
-            near = (here[0] + i, here[1] + j)
-            if free[near] and steps[near] < 0:
-                steps[near] = steps[here] + 1
-                waiting.append(near)
-    return steps
 
 
 def load(path: str | Path) -> TensorDictBase:

@@ -70,7 +70,7 @@ def run_ogbench(config: OGBenchConfig) -> dict[str, Any]:
             "test": summary(episodes),
         }
         with run.finish(metrics, config, title=f"Offline: {config.id}") as pictures:
-            from torchrl_hmcts.trainers.figures.landmarks import plot_ways
+            from torchrl_hmcts.trainers.figures.maps import plot_ways
 
             words = "Where options lead (grey; stars: before jumps), and an episode of each task."
             with pictures.one("search.png", words) as path:

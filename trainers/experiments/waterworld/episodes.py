@@ -41,15 +41,7 @@ class GoalTrack:
     solved: bool
 
     def plan_at(self, step: int) -> np.ndarray:
-        """Return the goals of the plan that was followed at a base step, ``[G, 2]``.
-
-        Example:
-            >>> import numpy as np
-            >>> plans = {0: np.zeros((2, 2)), 7: np.ones((1, 2))}
-            >>> track = GoalTrack(np.zeros((9, 2)), plans, np.zeros(9, int), solved=False)
-            >>> len(track.plan_at(6)), len(track.plan_at(7))
-            (2, 1)
-        """
+        """Return the goals of the plan that was followed at a base step, ``[G, 2]``."""
         return self.plans[max(made for made in self.plans if made <= step)]
 
 

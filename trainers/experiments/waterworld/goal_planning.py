@@ -209,9 +209,6 @@ class TilePlanner:
         shortest: np.ndarray = np.where(is_open, bound, np.iinfo(np.int64).max).min(-1) >= best
         return shortest
 
-    def __repr__(self) -> str:
-        return f"TilePlanner(mazes={len(self.moves)})"
-
 
 def tile_moves(mazes: Tensor) -> np.ndarray:
     """Read off the Gridworld of ``[M, H, W]`` where actions lead, int16 ``[M, T, A]``."""
