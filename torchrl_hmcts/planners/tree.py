@@ -20,7 +20,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_hmcts.checks import whole_number
-from torchrl_hmcts.direct_calls import entry, put
+from torchrl_hmcts.direct_calls import entry
 
 NODE = np.dtype(
     [
@@ -215,15 +215,17 @@ class TreeArrays:
         """Return the states ``[m]`` of nodes ``[m]``."""
         assert self.states is not None
         rows, columns = roots * self.capacity + nodes, self._columns()
-        found = TensorDict(batch_size=[len(roots)], device=self.states.device)
+        entries = {}
         for key in keys:
             column = columns[key]
             if isinstance(column, np.ndarray):
-                put(found, key, torch.from_numpy(column[rows]))
+                entries[key] = torch.from_numpy(column[rows])
             else:
-                index = torch.from_numpy(rows).to(column.device)
-                put(found, key, column.index_select(0, index))
-        return found
+                entries[key] = column.index_select(0, torch.from_numpy(rows).to(column.device))
+        size = torch.Size([len(roots)])
+        if all(isinstance(key, str) for key in keys):  # the constructor's checks cost more
+            return TensorDict._new_unsafe(entries, size, device=self.states.device)
+        return TensorDict(entries, size, device=self.states.device)
 
     def _columns(self) -> dict[NestedKey, Tensor | np.ndarray]:
         """The states' entries ``[B * N, ...]``; NumPy arrays are indexed at half the cost."""
