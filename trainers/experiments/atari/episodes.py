@@ -323,8 +323,9 @@ class AtariRun:
             "score": agent.score,
             "real_frames": agent.real_steps * FRAMES_PER_STEP,
             "decisions": agent.decisions,
-            "guided": agent.guided,
         }
+        if self.config.guide == "reactive":
+            row["guided"] = agent.guided
         self.scores.append(row)
         console.note(
             f"Episode {len(self.scores)}: score {agent.score:g} in {row['real_frames']:,} frames, "
@@ -352,7 +353,7 @@ class AtariRun:
             "score_min": min(scores),
             "score_final": scores[-1],
             "score_mean": sum(scores) / len(scores),
-            "score_at": score_at(self.scores, config.episodes),
+            **({"score_at": score_at(self.scores, config.episodes)} if self.sticky else {}),
             "episodes": self.scores,
             "frames": self.num_frames,
             "base_steps": self.num_frames // FRAMES_PER_STEP,
