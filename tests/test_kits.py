@@ -121,7 +121,7 @@ def test_the_atari_agent_is_found_as_a_kit(tmp_path: Path, monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["kit=atari", "options=luck"], "source is one of best, goals"),
+        (["kit=atari", "options=luck"], "source is one of auto, best, goals"),
         (["kit=labmase"], "Unknown kit 'labmase'. Did you mean: labmaze"),
         (["kit=labmaze", "experiment=labmaze"], "say which experiment"),
         (["kit=waterworld", "objective=dayn"], "Did you mean: diayn"),

@@ -73,17 +73,15 @@ def legal_options(num_options: int, mask_key: Any = "action_mask", **kwargs: Any
 
 @pytest.mark.parametrize("batch_size", [(), (2,)])
 @pytest.mark.parametrize("mask_key", ["action_mask", ("group", "action_mask"), "legal"])
-@pytest.mark.parametrize("one_hot", [False, True])
 @pytest.mark.parametrize("num_options", [2, 3])
 def test_a_mask_of_base_actions_forbids_no_option(
-    num_options: int, one_hot: bool, mask_key: Any, batch_size: tuple[int, ...]
+    num_options: int, mask_key: Any, batch_size: tuple[int, ...]
 ) -> None:
-    env = legal_options(num_options, mask_key, one_hot=one_hot)
+    env = legal_options(num_options, mask_key)
     planner = MCTSPlanner(env, seed=0, budget=ALL, final_choice=HighestValue())
     td = planner(env.reset(TensorDict(batch_size=batch_size)))
     assert planner.last_search.allowed().all()
-    option = td["option"].int().argmax(-1) if one_hot else td["option"]
-    assert not option.any()
+    assert not td["option"].any()
     q = planner.last_search.tree.view().children_values[:, 0, 0]
     assert q.flatten().tolist() == pytest.approx([0.9] * q.numel())
 
@@ -535,18 +533,17 @@ def test_a_frozen_normaliser_and_counts_in_the_tensordict_are_planned_with() -> 
 
 
 @pytest.mark.parametrize("num_steps", [1, 3])
-@pytest.mark.parametrize("one_hot", [False, True])
 @pytest.mark.parametrize("with_end", [False, True])
 @pytest.mark.parametrize("counted", [False, True])
 def test_an_env_of_one_state_gives_the_tree_of_a_stateless_one(
-    counted: bool, with_end: bool, one_hot: bool, num_steps: int
+    counted: bool, with_end: bool, num_steps: int
 ) -> None:
     trees = []
     for base in (ChainEnv(length=6, reward_per_step=-0.1), LockedChain(6, reward_per_step=-0.1)):
         env = TransformedEnv(base, StepCounter(7) if counted else Compose())
         worker = TensorDictModule(lambda skill: skill, ["skill"], ["action"])
         ends = (lambda td: td["state"] == 2) if with_end else None
-        env.append_transform(OptionTransform(worker, 2, num_steps, 0.9, ends, one_hot=one_hot))
+        env.append_transform(OptionTransform(worker, 2, num_steps, 0.9, ends))
         planner = MCTSPlanner(env, budget=expansions(30), seed=0)
         trees.append(planner.search(env.reset()).tree)
     num_nodes = int(trees[0].num_nodes[0])

@@ -102,7 +102,7 @@ def plot_sticky(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes.plot(frames, scores, ".", color=color, alpha=0.4)
             means = [np.mean(scores[max(0, i - 9) : i + 1]) for i in range(len(scores))]
             axes.plot(frames, means, color=color)
-        axes.axhline(HUMAN_AND_RANDOM[game][0], color="#71717a", linestyle=":")
+        axes.axhline(HUMAN_AND_RANDOM[game][0], color="#9ca3af", linestyle=":")
         style(axes, game, short=True)
     for axes in panels[len(games) :]:
         axes.set_axis_off()
