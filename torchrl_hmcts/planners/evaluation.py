@@ -69,13 +69,14 @@ class NodeEvaluator:
     def describe(
         self,
         td: TensorDictBase,
+        terminated: np.ndarray,
         simulator: Simulator,
         settings: SearchSettings,
         seeds: Callable[[], np.ndarray],
     ) -> RootStates:
         """Return all that a search knows of states ``[m]`` before it is in them."""
         novelty, transpositions = settings.novelty, settings.transpositions
-        priors, values = self(td, simulator.terminated(td), seeds)
+        priors, values = self(td, terminated, seeds)
         return RootStates(
             values=values,
             done=simulator.done(td),

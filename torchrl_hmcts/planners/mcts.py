@@ -415,7 +415,8 @@ class MCTSPlanner(TensorDictModuleBase):
         with torch.no_grad(), simulator.searching():
             check_masks(simulator.masks(root), simulator.done(root), where)
             seeds = lambda: search.seeds[where]  # noqa: E731
-            known = self.evaluate.describe(root, simulator, settings, seeds)
+            ended = simulator.terminated(root)
+            known = self.evaluate.describe(root, ended, simulator, settings, seeds)
         search.plant(known, rows)
         search.tree.set_states(where, np.zeros_like(where), simulator.state(root))
         if self.root_noise is not None:

@@ -168,7 +168,7 @@ class SearchLoop:
             counted = search.num_simulations[wave.roots]
             return wave_seeds(search.seeds[wave.roots], counted, wave.nodes, options)
 
-        known = self.evaluate.describe(after, simulator, settings, seeds)
+        known = self.evaluate.describe(after, terminated, simulator, settings, seeds)
         outcomes = Outcomes(simulator.rewards(after), discounts, durations, *known)
         merges = None
         if settings.chance is not None:

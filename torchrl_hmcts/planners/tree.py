@@ -203,7 +203,7 @@ class TreeArrays:
             )
         rows = roots * self.capacity + nodes
         for key, column in self._columns().items():
-            value = entry(states, key)
+            value: Any = entry(states, key)
             if isinstance(column, np.ndarray):
                 column[rows] = value.detach().numpy()
             else:

@@ -173,7 +173,7 @@ def figures_table(figures: Mapping[str, Any]) -> str:
     rows = []
     for name, value in flat(figures):
         if isinstance(value, numbers.Real) and math.isfinite(value):
-            exact = isinstance(value, numbers.Integral) or abs(value) >= 1e4
+            exact = isinstance(value, numbers.Integral) or abs(float(value)) >= 1e4
             value = f"{float(value):,.0f}" if exact else f"{float(value):,.4g}"
         if isinstance(value, str):
             rows.append((name.replace(".", ": ").replace("_", " "), value))

@@ -167,8 +167,8 @@ class RuleSearch:
         rules = self.repeats()
         if candidates == "screened":
             ranked, states = self.probe(report)
-            best = self.screen(ranked, states[:1], report)
-            return [rule for rule in best if not isinstance(rule.worker, RepeatActions)] + rules
+            kept = self.screen(ranked, states[:1], report)
+            return [rule for rule in kept if not isinstance(rule.worker, RepeatActions)] + rules
         if candidates == "actions":
             return self.grow(rules, report)
         if candidates == "action_sets":
