@@ -57,18 +57,21 @@ def read(folder: Path) -> dict[str, Any]:
     row["practised"] = state["agent"]["guide"]["practised"]
     row["finished"] = (folder / "metrics.json").is_file()
     row["score_at"] = score_at(episodes)
-    row["episodes"] = [{k: e[k] for k in ("frames", "score", "real_frames")} for e in episodes]
+    kept = ("frames", "score", "real_frames", "guided")
+    row["episodes"] = [{key: e[key] for key in kept} for e in episodes]
     for protocol in ("sticky", "deterministic"):
         metrics = folder.with_name(f"{folder.name}_reactive_{protocol}") / "metrics.json"
         if metrics.is_file():
             scores = [e["score"] for e in json.loads(metrics.read_text())["episodes"]]
-            row[f"reactive_{protocol}"] = scores
+            row[f"reactive_{protocol}"] = sum(scores) / len(scores)
+            row[f"reactive_{protocol}_scores"] = scores
     return row
 
 
 def collect(args: argparse.Namespace) -> None:
     """Write what there is."""
-    folders = sorted(path.parent for path in args.runs.glob("*_[0-9]/checkpoints"))
+    files = args.runs.glob("*_[0-9]/checkpoints/checkpoint-*")
+    folders = sorted({path.parents[1] for path in files})
     rows = [read(folder) for folder in folders]
     summary = []
     for frames in map(str, CHECKPOINTS):
