@@ -72,7 +72,6 @@ class ReactiveManager:
         seed (int): of weights, batches and draws. Default 0.
 
     Attributes:
-        scale (float): the game's score that a value of 1 is worth.
         practised (int): frames of practice so far.
         num_labels (int): learned from searches so far.
         scores (list of float): of the latest 100 practice episodes.
