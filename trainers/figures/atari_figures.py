@@ -92,6 +92,7 @@ def plot_sticky(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
     The dotted line is a human's score; rows of a game are its seeds.
     """
+    rows = [row for row in rows if row["episodes"]]
     games = [game for game in TABLE_5_1 if any(row["game"] == game for row in rows)]
     figure = Figure(figsize=(10.0, 5.2), layout="constrained")
     panels = figure.subplots(2, 4).flatten()
@@ -104,6 +105,8 @@ def plot_sticky(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes.plot(frames, means, color=color)
         axes.axhline(HUMAN_AND_RANDOM[game][0], color="#9ca3af", linestyle=":")
         style(axes, game, short=True)
+        axes.set_xlim(left=0)
+        axes.locator_params(axis="x", nbins=4)
     for axes in panels[len(games) :]:
         axes.set_axis_off()
     figure.supxlabel("emulated frames, all kinds", fontsize=10)

@@ -454,7 +454,7 @@ def score_at(episodes: Sequence[Mapping[str, float]], last: int = 10) -> dict[st
     found = {}
     for frames in CHECKPOINTS:
         scores = [row["score"] for row in episodes if row["frames"] <= frames][-last:]
-        if scores and episodes[-1]["frames"] >= 0.8 * frames:  # the run went so far
+        if scores and episodes[-1]["frames"] >= 0.8 * frames:  # at least nearly there
             found[str(frames)] = sum(scores) / len(scores)
     return found
 
