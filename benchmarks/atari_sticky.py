@@ -52,7 +52,7 @@ def read(folder: Path) -> dict[str, Any]:
     config, episodes = state["config"], state["scores"]
     row: dict[str, Any] = {name: config[name] for name in ("game", "seed", "ratio", "practice")}
     row["frames"] = state["frames"]
-    row["frames_before_first_episode"] = state["options"]["num_frames"]
+    row["frames_finding_options"] = state["options"]["num_frames"]
     row["options"], row["option_steps"] = state["options"]["names"], state["tuned"]["option_steps"]
     row["practised"] = state["agent"]["guide"]["practised"]
     row["finished"] = (folder / "metrics.json").is_file()

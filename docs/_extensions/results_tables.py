@@ -332,7 +332,7 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             "Sticky actions, whole episodes",
             "atari/sticky.json",
             "game seed score_at.2000000 score_at.5000000 score_at.10000000 score_at.40000000 "
-            "reactive_sticky reactive_deterministic frames_before_first_episode frames",
+            "reactive_sticky reactive_deterministic frames_finding_options frames",
             rows="rows",
             note="A score is the mean of the last ten planned episodes that were over at that many "
             "emulated frames, all kinds; reactive is without search. **The simulator is set** to "
