@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_hmcts.envs import WaterworldMazeEnv, maze_pool
 from torchrl_hmcts.planners import MCTSPlanner, RadiusNovelty, SearchBudget
@@ -96,6 +97,14 @@ def test_a_trainer_that_is_gone_frees_its_memory() -> None:
 
     grown, _ = growth(build, 8, warm_up=3)
     assert grown < 16.0, f"{grown:.1f} MiB more"
+
+
+def test_the_check_notices_a_leak() -> None:
+    kept: list[Any] = []
+    # Blocks so large that each is asked of the system, though other tests have given some back.
+    grown, _ = growth(lambda: kept.append(torch.ones(2**24)), 6, warm_up=1)
+    assert grown > 200.0
+    assert growth(lambda: kept.append(TensorDict(a=torch.ones(1))), 400, 2)[1] > 500
 
 
 if __name__ == "__main__":

@@ -97,3 +97,13 @@ def test_no_file_that_draws_names_two_colors_that_are_close(vision: str) -> None
         for path in (ROOT / folder).rglob("*.py"):
             colors = {from_hex(color) for color in HEX.findall(path.read_text(encoding="utf-8"))}
             assert len(colors) < 2 or closest(list(colors), vision) >= 25, path
+
+
+def test_the_simulation_finds_red_and_green_to_be_one_colour() -> None:
+    red_and_green = [(200, 80, 60), (140, 120, 40)]
+    assert closest(red_and_green, "normal") > 40
+    assert closest(red_and_green, "deuteranopia") < 15
+
+
+def test_white_and_black_are_as_far_apart_as_can_be() -> None:
+    assert closest([(0, 0, 0), (255, 255, 255)], "normal") == pytest.approx(100, abs=0.1)

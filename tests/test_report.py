@@ -5,12 +5,15 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from torchrl_hmcts.trainers import HMCTS
 from torchrl_hmcts.trainers.cli import main
 from torchrl_hmcts.trainers.experiments.registry import load_config
 from torchrl_hmcts.trainers.figures.intervals import bootstrap, interquartile_mean
@@ -259,3 +262,80 @@ def test_the_interquartile_mean_leaves_a_quarter_out_at_each_end() -> None:
 )
 def test_values_are_written_as_people_read_them(value, shown) -> None:
     assert plain(value) == shown
+
+
+CHROMIUM = next(
+    (p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None
+)
+
+
+FRAME = """<html><body><iframe id="f" width="{width}" height="844" style="border:0" src="{page}">
+</iframe><pre id="out"></pre><script>
+const f = document.getElementById("f");
+const errors = [];
+f.onload = () => {{
+  f.contentWindow.onerror = (e) => errors.push(String(e));
+  const d = f.contentDocument;
+  const size = (e) => parseFloat(getComputedStyle(e).fontSize);
+  setTimeout(() => {{
+    document.getElementById("out").textContent = JSON.stringify({{
+      errors,
+      images: [...d.images].map((i) => i.naturalWidth),
+      width: d.documentElement.scrollWidth,
+      font: Math.min(...[...d.querySelectorAll("p,td,figcaption,h2")].map(size)) }});
+  }}, 300);
+}};</script></body></html>"""
+BROWSER = [
+    *(str(CHROMIUM), "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
+    "--allow-file-access-from-files",  # the frame looks into the page
+    *("--virtual-time-budget=8000", "--enable-logging=stderr", "--dump-dom"),
+]
+
+
+def rendered(file: Path, folder: Path, width: int) -> dict:
+    """Open a page in a frame of a phone's width; return what the browser says about it."""
+    frame = folder / "frame.html"
+    frame.write_text(FRAME.format(width=width, page=file.as_uri()))
+    words = [*BROWSER, f"--user-data-dir={folder}/profile", frame.as_uri()]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert "CONSOLE" not in done.stderr, done.stderr
+    found = re.search(r'<pre id="out">(.+?)</pre>', done.stdout, re.S)
+    assert found, done.stdout[-2000:] + done.stderr[-2000:]
+    return json.loads(found[1])
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+@pytest.mark.parametrize(("kind", "width"), [("run", 390), ("comparison", 390), ("run", 1280)])
+def test_a_page_opens_with_all_pictures_and_nothing_cut_off(tmp_path, kind, width) -> None:
+    runs = [write_run(tmp_path / f"a{s}", s) for s in (0, 1)]
+    runs.append(write_run(tmp_path / "b", 0, total_frames=9))
+    file = runs[0] / "index.html"
+    if kind == "run":
+        add_evaluation(runs[0], {"changes": {"seed": 7}, "results": {"solved": 1}, "command": "x"})
+        write_run_page(read_run(runs[0]))
+    else:
+        file = tmp_path / "cmp.html"
+        assert main(["report", *map(str, runs), f"out={file}"]) == 0
+    told = rendered(file, tmp_path, width)
+    assert told["errors"] == []
+    assert len(told["images"]) >= 3
+    assert min(told["images"]) > 0  # all pictures have loaded
+    assert told["width"] <= width  # no scrolling to the side
+    assert told["font"] >= 14
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+def test_the_page_of_an_episode_opens_and_its_film_moves(tmp_path, monkeypatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    HMCTS("MountainCar-v0", option_steps=14, improve_expansions=1).save(tmp_path / "agent")
+    assert main(["play", f"run={tmp_path / 'agent'}"]) == 0
+    page = tmp_path / "agent/play/index.html"
+    told = rendered(page, tmp_path, 390)
+    assert told["errors"] == []
+    assert len(told["images"]) == 2  # film and search
+    assert min(told["images"]) > 0
+    assert told["width"] <= 390
+    (film,) = page.parent.glob("*.gif")
+    first, *_, last = iio.imread(film)
+    assert (first != last).any()

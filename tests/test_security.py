@@ -14,6 +14,7 @@ import pytest
 import torch
 from tensordict import NonTensorData, TensorDict
 
+from torchrl_hmcts.trainers.figures.run_page import write_page
 from torchrl_hmcts.trainers.skills.dataset import load_dataset
 
 if sys.version_info >= (3, 11):
@@ -120,6 +121,24 @@ def test_a_dataset_with_a_pickle_is_refused_and_not_opened(tmp_path: Path) -> No
     with pytest.raises(Exception, match="(?i)refusing to load pickled"):
         load_dataset(tmp_path / "data", ["skill"])
     assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("where", ["title", "metric", "value", "picture", "caption", "nested"])
+def test_the_page_escapes_every_place(where: str, tmp_path: Path) -> None:
+    evil = "\"'><script>alert(1)</script>"
+    at = dict.fromkeys(("title", "metric", "value", "picture", "caption", "nested"), "plain")
+    at[where] = evil
+    write_page(
+        tmp_path / "index.html",
+        title=at["title"],
+        metrics={at["metric"]: at["value"], "group": {at["nested"]: [at["value"]]}},
+        pictures={at["picture"]: at["caption"]},
+    )
+    page = (tmp_path / "index.html").read_text()
+    assert "<script" not in page
+    if where != "picture":  # a picture that is not there is left out
+        assert "&lt;script&gt;alert(1)" in page
+    assert "http" not in page  # it loads nothing from elsewhere
 
 
 OFFLINE = """

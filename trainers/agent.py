@@ -190,6 +190,9 @@ class HMCTS:
             base_steps: of training. Default: 50,000, or what the kit names.
             progress: show a bar; False prints nothing.
             save_dir: folder of checkpoints.
+
+        Raises:
+            ValueError: if the agent is none of a Gymnasium env.
         """
         if not isinstance(self._asked, GymConfig):
             raise ValueError(
@@ -225,6 +228,9 @@ class HMCTS:
             iterations: in all.
             updates: of the network, in each iteration.
             progress: show a bar; False prints nothing.
+
+        Raises:
+            ValueError: if the planner sees nothing but a snapshot of the state.
 
         Reference:
             Anthony, Tian and Barber, "Thinking fast and slow with deep learning and tree search",
@@ -312,6 +318,10 @@ class HMCTS:
         Args:
             folder: made if absent; ``hmcts play run=FOLDER`` shows the agent.
             overwrite: replace the agent or the run that is in the folder.
+
+        Raises:
+            ValueError: if the env is a function, which cannot be written, or the folder holds an
+                agent or a run already.
         """
         if isinstance(self.kit, GymKit) and not self.kit.config.id:
             raise ValueError(

@@ -29,6 +29,9 @@ class GridMoves:
         ValueError: if ``num_actions`` is not from 3 to 7; when acting, if the observation is not
             MiniGrid's own.
 
+    Reference:
+        This project's.
+
     Example:
         >>> from torchrl_hmcts.envs import GridMoves, OptionPool
         >>> pool = OptionPool("MiniGrid-Empty-5x5-v0", GridMoves(), max_steps=3, num_processes=0)
@@ -92,6 +95,9 @@ class GridView(gymnasium.Wrapper):
     Raises:
         SnapshotError: if it is another env.
         TypeError: if ``moves`` is not a bool.
+
+    Reference:
+        This project's.
 
     Example:
         >>> from torchrl_hmcts.envs import GridView

@@ -41,6 +41,9 @@ class MujocoTask:
         derived (tuple of str): fields of ``MjData`` that an observation holds beside positions and
             velocities.
 
+    Reference:
+        This project's.
+
     Example:
         >>> from torchrl_hmcts.envs import MujocoBatch, MujocoTask
         >>> class Forward(MujocoTask):  # no maze: the speed of a cheetah

@@ -48,6 +48,9 @@ class SkillWorker:
         ValueError: if ``skills`` does not fit the actor.
         OSError: if there is too little shared memory.
 
+    Reference:
+        This project's; the actors are those of :mod:`torchrl_hmcts.modules`.
+
     Example:
         >>> from torchrl.data import Categorical
         >>> from torchrl_hmcts.envs import OptionPool, SkillWorker
@@ -89,7 +92,11 @@ class SkillWorker:
         self.load(actor)
 
     def load(self, actor: SkillActor) -> None:
-        """Take over the weights of an actor of the same shape, in the processes too."""
+        """Take over the weights of an actor of the same shape, in the processes too.
+
+        Raises:
+            ValueError: if its network has other sizes.
+        """
         if self._weights is not None:
             self._weights.load(actor.network.parameters())
             return
@@ -189,6 +196,9 @@ class PolicyWorker:
     Raises:
         ValueError: if ``num_options`` is below 1.
         OSError: if there is too little shared memory.
+
+    Reference:
+        This project's; recurrent modules are those of ``torchrl.modules``.
 
     Example:
         >>> from tensordict.nn import TensorDictModule, TensorDictSequential

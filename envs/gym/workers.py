@@ -77,6 +77,9 @@ class FeatureGoal:
         raising, lowering: actions that raise the feature and lower it.
         dead_zone: the goal is reached where :math:`|x_c - v|` is at most this.
 
+    Reference:
+        This project's; goals of a worker as in chapter 3 of the dissertation.
+
     Example:
         >>> import numpy as np
         >>> from torchrl_hmcts.envs import FeatureGoal
@@ -111,6 +114,9 @@ class FollowGoals:
 
     Raises:
         ValueError: if there is no goal.
+
+    Reference:
+        This project's; goals of a worker as in chapter 3 of the dissertation.
 
     Example:
         >>> from torchrl_hmcts.envs import ByteGoal, FollowGoals
@@ -156,6 +162,9 @@ class OccasionalAction:
     Raises:
         ValueError: if the probability is not from 0 to 1.
 
+    Reference:
+        This project's.
+
     Example:
         >>> import numpy as np
         >>> from torchrl_hmcts.envs import OccasionalAction, RepeatActions
@@ -196,6 +205,9 @@ class JoinedWorkers:
 
     Raises:
         ValueError: if there is no worker.
+
+    Reference:
+        This project's.
 
     Example:
         >>> from torchrl_hmcts.envs import JoinedWorkers, RepeatActions

@@ -32,6 +32,9 @@ class MazeItems:
     Raises:
         ValueError: if a number is out of range, or there is neither an apple nor a key.
 
+    Reference:
+        This project's; the dissertation's mazes have no reward but the target's.
+
     Example:
         >>> MazeItems(apples=3, key=True).count
         4

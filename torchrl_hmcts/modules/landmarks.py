@@ -254,6 +254,9 @@ def find_jumps(places: Tensor, ends: Tensor, jump_factor: float = 10.0) -> Tenso
     Returns:
         bool ``[T]``.
 
+    Reference:
+        This project's.
+
     Example:
         >>> places = torch.tensor([[0.0], [1.0], [2.0], [30.0]])
         >>> find_jumps(places, torch.zeros(4, dtype=torch.bool))
@@ -324,6 +327,12 @@ class LandmarkEnv(EnvBase):
         model (LandmarkModel or EffectModel): read live.
         gamma (float): discount per base step; the planner takes it over. Default 0.99.
         seed (int, optional): of the draws. Default: from torch's global generator.
+
+    Raises:
+        ValueError: if ``gamma`` is out of range.
+
+    Reference:
+        This project's.
 
     Example:
         >>> from torchrl_hmcts.planners import MCTSPlanner

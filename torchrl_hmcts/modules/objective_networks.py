@@ -203,6 +203,9 @@ class SkillDynamics(TensorDictModuleBase):
         skill_key (NestedKey): entry of a skill that is a vector. Default ``"skill"``.
         hidden, activation, network: as :class:`SkillActor`'s; the network needs ``all_skills``.
 
+    Raises:
+        ValueError: if a size is not positive, or not ``0 < min_std < std``.
+
     Reference:
         Sharma et al., "Dynamics-Aware Unsupervised Discovery of Skills", 2019, arXiv 1907.01657
         (with a mixture of experts of fixed variance on normalised changes).

@@ -279,6 +279,9 @@ class OptionMemory:
         option_key (NestedKey): int64 ``[*B]``. Default ``"option"``.
         capacity (int): N; the oldest outcome makes room. Default 64.
 
+    Raises:
+        ValueError: if a number is not positive.
+
     Reference:
         Outcomes kept as they were, for cases that return: Lengyel and Dayan, "Hippocampal
         Contributions to Control: The Third Way", 2007.

@@ -283,6 +283,9 @@ class SkillPolicy(TensorDictModuleBase):
         From ``forward(tensordict)``: the same, with the action of each row: int64 ``[*B]``
         (one-hot: ``[*B, A]``; continuous: ``[*B, D]``).
 
+    Reference:
+        This project's.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical

@@ -113,6 +113,9 @@ class GrowingSkillPrior(SkillPrior):
         num_active (int): number of skills switched on at first. Default ``2``, the fewest that can
             be told apart.
 
+    Reference:
+        This project's.
+
     Examples:
         >>> from torchrl_hmcts.modules import GrowingSkillPrior
         >>> prior = GrowingSkillPrior(4, num_active=2)

@@ -83,6 +83,9 @@ class TerminationNetwork(SkillNetwork):
         termination_logits_key (NestedKey): entry written, ``[*B, 1]``.
         initial_probability (float): where :math:`\beta` begins, about, 0.001 to 0.999. Default 0.5.
 
+    Raises:
+        ValueError: if a size is not positive or the probability is out of its range.
+
     Reference:
         Bacon, Harb and Precup, "The option-critic architecture", 2017, arXiv 1609.05140.
 

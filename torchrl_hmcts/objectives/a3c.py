@@ -181,6 +181,9 @@ class A3CLoss(A2CLoss):
         TensorDict with ``loss_objective``, ``loss_critic`` and ``loss_entropy``, and the detached
         ``entropy``, nats. With ``reduction="none"`` the losses are ``[*B, T]``.
 
+    Raises:
+        ValueError: if gamma, a coefficient or the reduction is out of range.
+
     Keys (``set_keys``): those of ``A2CLoss``, and ``duration`` (int64 ``[*B, T, 1]``, base steps,
     default ``("next", "duration")``; 1 if absent).
 

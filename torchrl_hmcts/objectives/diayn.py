@@ -35,6 +35,9 @@ class DIAYNLoss(DiscreteSkillSACLoss):
         TensorDict with the entries of :class:`DiscreteSkillSACLoss`, among them
         ``loss_discriminator`` and the detached ``discriminator_accuracy``.
 
+    Raises:
+        ValueError, TypeError: as :class:`DiscreteSkillSACLoss`.
+
     Keys (``set_keys``): those of ``DiscreteSACLoss`` and of :class:`SkillDiscriminatorLoss`
     (``skill``, ``skill_logits``).
 

@@ -178,6 +178,10 @@ class METRAEncoderLoss(EncoderObjective):
         TensorDict with ``loss_encoder``, ``loss_dual`` and the detached ``latent_distance`` (the
         mean of :math:`\|\phi(s') - \phi(s)\|`) and ``dual`` (:math:`\lambda`).
 
+    Raises:
+        ValueError: if ``dual_init`` is not positive or ``slack`` is negative; see also
+            :class:`SkillObjective`.
+
     Keys (``set_keys``): those of :class:`SkillObjective` and ``representation``.
 
     Reference:
@@ -301,6 +305,9 @@ class SkillDynamicsLoss(SkillObjective):
     Returns:
         TensorDict with ``loss_dynamics`` (nats) and the detached ``dynamics_accuracy`` (fraction
         of transitions for which the skill is the most probable one given the change).
+
+    Raises:
+        AttributeError: if the dynamics have no ``target_key``.
 
     Keys (``set_keys``): those of :class:`SkillObjective`, ``skill_loc`` and ``skill_scale``.
 

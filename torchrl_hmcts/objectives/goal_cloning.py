@@ -39,6 +39,9 @@ class GoalCloningLoss(Loss):
         TensorDict with ``loss_actor`` and the detached ``action_error`` (mean absolute, without
         weights). With ``reduction="none"`` both are ``[*B]``.
 
+    Raises:
+        ValueError: if ``progress_coeff`` is negative.
+
     Keys (``set_keys``): ``action`` (float ``[*B, D]``), ``position`` (float ``[*B, F]``, read
     before the step and from ``"next"``), ``goal`` (float ``[*B, F]``), ``priority_weight``; each by
     its own name by default.

@@ -48,6 +48,9 @@ class OptionModelLoss(Loss):
         and detached ``delta_error`` (mean absolute error of the normalised changes, over members)
         and ``terminated_accuracy``; with ``reduction="none"`` all ``[*B]``.
 
+    Raises:
+        ValueError: if the reduction or a weight is not usable.
+
     Keys (``set_keys``): ``reward``, ``duration``, ``terminated`` (under ``"next"``; defaults: the
     model's), ``bootstrap_mask`` (``[*B, K]``, any number >= 0, if it is there),
     ``priority_weight``.

@@ -53,6 +53,10 @@ class ExpertIterationLoss(Loss):
         logit), ``policy_divergence`` (nats above the target's entropy) and ``value_error`` (mean
         absolute). With ``reduction="none"`` all are ``[*B]``.
 
+    Raises:
+        ValueError: if ``value_coeff`` is negative, or a name is none of those above.
+        KeyError: at the call, if the examples have no targets.
+
     Keys (``set_keys``): ``logits``, ``state_value``, ``policy_target`` (float ``[*B, A]``),
     ``policy_weight`` (float ``[*B]``, 1 if absent), ``value_target`` (float ``[*B, 1]``),
     ``value_weight`` (float ``[*B]``, 1 if absent), ``action_mask`` (bool ``[*B, A]``, all True if

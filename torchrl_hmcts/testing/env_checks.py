@@ -112,6 +112,9 @@ def check_macro_env(
         tolerance (float): difference that is allowed, relative and absolute, e.g. 1e-6 where a
             network runs on batches of several sizes. Default 0.
 
+    Raises:
+        ContractError: if it is not.
+
     Examples:
         >>> from torchrl_hmcts.testing import ChainEnv, check_macro_env
         >>> check_macro_env(ChainEnv(length=4))
@@ -183,6 +186,9 @@ def check_parallel_env(
         num_workers (int): processes. Default 2.
         num_steps (int): steps of the rollouts. Default 4.
         seed (int): of the envs. Default 0.
+
+    Raises:
+        ContractError: if it does not.
 
     Examples:
         >>> from torchrl_hmcts.testing import ChainEnv, check_parallel_env

@@ -44,6 +44,9 @@ def check_tree_policy(tree_policy: TreePolicy) -> None:
         tree_policy: :class:`~torchrl_hmcts.planners.UCT` and its like, or a callable over
             :class:`~torchrl_hmcts.planners.NodeStatistics`.
 
+    Raises:
+        ContractError: if it cannot.
+
     Examples:
         >>> from torchrl_hmcts.testing import check_tree_policy
         >>> check_tree_policy(lambda nodes: nodes.option_values + 1 / (1 + nodes.option_visits))
@@ -131,6 +134,9 @@ def check_evaluator(evaluator: Callable[[TensorDictBase], Tensor], states: Tenso
         evaluator (callable): ``evaluator(td) -> values [m]`` or ``[m, 1]``.
         states (TensorDictBase): states ``[m]``.
 
+    Raises:
+        ContractError: if it cannot.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -153,6 +159,9 @@ def check_option_prior(
         option_prior (callable): ``option_prior(td) -> probabilities [m, A]``.
         states (TensorDictBase): states ``[m]``.
         num_options (int): A.
+
+    Raises:
+        ContractError: if it cannot.
 
     Examples:
         >>> import torch
@@ -214,6 +223,9 @@ def check_planner(planner: TensorDictModuleBase, env: EnvBase) -> None:
         planner (TensorDictModuleBase): e.g. an :class:`~torchrl_hmcts.planners.MCTSPlanner`.
         env (EnvBase): the env to act in. If it is stateless (``batch_locked`` is False), batches
             are tried.
+
+    Raises:
+        ContractError: if it cannot.
 
     Examples:
         >>> from torchrl_hmcts.planners import MCTSPlanner

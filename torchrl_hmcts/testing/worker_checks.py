@@ -63,6 +63,9 @@ def check_worker(
         tolerance (float): difference between a float action alone and among others that is allowed,
             relative and absolute; discrete actions must agree. Default 1e-6.
 
+    Raises:
+        ContractError: if it cannot.
+
     Examples:
         >>> from tensordict.nn import TensorDictModule
         >>> from torchrl_hmcts.testing import ChainEnv, check_worker
@@ -260,6 +263,9 @@ def check_skill_objective(
         tensordict (TensorDictBase): transitions ``[n]`` with the objective's ``in_keys``.
         **kwargs: of :func:`check_loss`.
 
+    Raises:
+        ContractError: if it cannot.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -313,6 +319,9 @@ def check_skill_prior(prior: SkillPrior) -> None:
 
     Args:
         prior (SkillPrior): the prior.
+
+    Raises:
+        ContractError: if it is not.
 
     Examples:
         >>> from torchrl_hmcts.modules import GrowingSkillPrior

@@ -133,6 +133,9 @@ class StallTransform(EnvTransform):
     Raises:
         KeyError: when the specs are made, if the env has no ``in_key``.
 
+    Reference:
+        This project's.
+
     Examples:
         >>> import torch
         >>> from tensordict.nn import TensorDictModule

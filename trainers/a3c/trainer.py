@@ -250,7 +250,15 @@ class A3CTrainer:
         return cloudpickle.loads(cloudpickle.dumps(self.loss_module))
 
     def train(self) -> dict[str, list[float]]:
-        """Trains until T reaches ``total_frames`` or ``stop_when`` is true; returns the history."""
+        """Trains until T reaches ``total_frames`` or ``stop_when`` is true; returns the history.
+
+        Raises:
+            LearnerError: if a learner ended before its time; a checkpoint has been written.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
+            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
+                unless ``overwrite`` is true.
+            FolderInUse: if another run writes to ``save_dir``.
+        """
         with self.rotation.taken() if self.rotation else patient():
             return self._train()
 
@@ -298,6 +306,11 @@ class A3CTrainer:
 
         The optimiser's settings are the checkpoint's, the learning rate at the start included; the
         schedule and all else are this trainer's. ``path`` may be a folder of checkpoints.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+            CheckpointError: if it is damaged, of a newer version or another loss, or does not fit,
+                e.g. other networks or optimiser.
         """
         self._checkpoint.load(to_continue(path, self.run_settings, self.rotation))
         return self

@@ -216,6 +216,9 @@ class DurableRotation(CheckpointRotation):
         """Write a checkpoint; its name exists only once it is whole and on the disk.
 
         Those of later steps are removed then: the run has continued from an older one.
+
+        Raises:
+            OSError: if it cannot be written, e.g. to a full disk. What was there is still there.
         """
         final = self.directory / f"{_PREFIX}-{step:012d}.torchrl"
         noted = {**(metadata or {}), "torchrl_hmcts": {"settings": self.settings}}

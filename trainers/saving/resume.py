@@ -164,7 +164,14 @@ class ResumableTrainer(Trainer):
         return count
 
     def train(self) -> None:
-        """Train until ``total_frames`` are collected."""
+        """Train until ``total_frames`` are collected.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C or SIGTERM; a checkpoint has been written.
+            FileExistsError: if ``save_dir`` holds the checkpoints of a run that was not loaded,
+                unless ``overwrite`` is true.
+            FolderInUse: if another run writes to ``save_dir``.
+        """
         with self.rotation.taken() if self.rotation else patient():
             self._save_at = time.monotonic() + FIRST_SAVE_SECONDS
             try:
@@ -192,7 +199,11 @@ class ResumableTrainer(Trainer):
         self._save_at = time.monotonic() + SAVE_SECONDS
 
     def compute_loss(self, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Return the losses of a batch; one that is not finite is refused."""
+        """Return the losses of a batch; one that is not finite is refused.
+
+        Raises:
+            FloatingPointError: if one is not finite; nothing has been changed by it.
+        """
         losses = super().compute_loss(sub_batch)
         for name in losses.keys():
             if name.startswith("loss") and not math.isfinite(losses.get(name).detach().sum()):

@@ -170,6 +170,9 @@ class Kit:
         """Return the worker of options that need no learning; None where they are learned.
 
         With ``options="actions"`` an option repeats one action.
+
+        Raises:
+            ExperimentError: if the actions cannot be counted.
         """
         if self.config.options == "learned":
             return None
@@ -314,6 +317,9 @@ class Kit:
         """Return an untrained network for the manager: logits of the options, value of a state.
 
         With ``scale`` its inputs are scaled by the states that a few searches meet.
+
+        Raises:
+            ExperimentError: if the states have nothing of which a network can learn.
         """
         if not self.manager_keys:
             raise ExperimentError(
