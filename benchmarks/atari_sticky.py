@@ -90,7 +90,7 @@ def collect(args: argparse.Namespace) -> None:
         )
         print(json.dumps(summary[-1]))
     content = {
-        "command": "python benchmarks/atari_sticky.py --seeds 0 --frames 10_000_000, in pieces",
+        "command": "python benchmarks/atari_sticky.py --seeds 0 --frames N, N as `frames` of a row",
         "dopamine": {"frames": CHECKPOINTS, "interquartile_mean": DOPAMINE},
         "summary": summary,
         "rows": rows,

@@ -335,7 +335,8 @@ SECTIONS: dict[str, tuple[Section, ...]] = {
             "reactive_sticky reactive_deterministic frames_finding_options frames",
             rows="rows",
             note="A score is the mean of the last ten planned episodes that were over at that many "
-            "emulated frames, all kinds; reactive is without search. **The simulator is set** to "
+            "emulated frames, all kinds; reactive is without search, ten episodes, after 2 to 5 "
+            "million frames. **The simulator is set** to "
             "plan; Dopamine's agents never set theirs.",
         ),
         Section("Interquartile means, human-normalised", "atari/sticky.json", write=sticky_means),

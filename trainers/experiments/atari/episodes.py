@@ -77,7 +77,6 @@ class AtariRun:
         self._resumed: dict[str, Any] | None = None
         self._learned: dict[str, Any] | None = None  # what another run's guide knew
         self._practice: AtariOptionPool | None = None
-        self._practised = 0  # frames before the pool was made
 
     @property
     def search(self) -> AtariSearch:
@@ -447,14 +446,16 @@ def choose_arm(*scores: Sequence[float], last: int = 10) -> int:
 def score_at(episodes: Sequence[Mapping[str, float]], last: int = 10) -> dict[str, float]:
     """Return the mean score of the ``last`` episodes over by 2, 5, 10 and 40 million frames.
 
+    A number of frames that the run has not reached is left out.
+
     Example:
         >>> score_at([{"frames": 1e6, "score": 2.0}, {"frames": 4e6, "score": 6.0}], last=1)
-        {'2000000': 2.0, '5000000': 6.0}
+        {'2000000': 2.0}
     """
     found = {}
     for frames in CHECKPOINTS:
         scores = [row["score"] for row in episodes if row["frames"] <= frames][-last:]
-        if scores and episodes[-1]["frames"] >= 0.8 * frames:  # at least nearly there
+        if scores and episodes[-1]["frames"] >= frames:  # the run went so far
             found[str(frames)] = sum(scores) / len(scores)
     return found
 

@@ -47,15 +47,13 @@ class ReactiveManager:
     **Practice**: N emulators play options drawn from the policy, and TorchRL's ``ClipPPOLoss``
     improves it, with GAE over the options' durations. Rewards are in units of the mean reward of
     an option that earns any, ``scale``; a lost life ends the return. **Searches**: the option that
-    an :class:`AtariAgent` chose becomes a label of the state, which the policy itself has reached
-    (DAgger); each update of PPO adds
+    an :class:`AtariAgent` executes becomes a label of the state it was in; each update of PPO adds
 
     .. math:: -\lambda\, \mathbb{E}_{s, o} \log \pi_\theta(o \mid s)
 
     over such labels. As the agent's ``guide`` it is called with the RAM, uint8 ``[K, 128]``, and
-    gives the prior of PUCT ``[K, Z]``, a share of it uniform, and the values of leaves ``[K, 1]``.
-    It plays alone by :meth:`act`, or in an agent with
-    ``AtariSearch(ratio=0)``.
+    gives the prior of PUCT ``[K, Z]``, a share of it uniform, and the values of leaves ``[K, 1]``,
+    in the game's score. It plays alone by :meth:`act`, or under ``AtariSearch(ratio=0)``.
 
     Args:
         num_options (int): Z.
@@ -82,7 +80,7 @@ class ReactiveManager:
     Reference:
         Schulman et al., "Proximal policy optimization algorithms", 2017, arXiv 1707.06347; Guo et
         al., "Deep learning for real-time Atari game play using offline Monte-Carlo tree search
-        planning", 2014; Ross, Gordon and Bagnell 2011, arXiv 1011.0686, for DAgger.
+        planning", 2014, for the labels.
 
     Example:
         >>> from torchrl_hmcts.envs import AtariOptionPool, RepeatActions
